@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bodies in clouds, meshes and calibrated cameras: hulls, fits, correspondence."""

@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line `flowing-puppet <verb>`: one module a verb, imported only when that verb is used."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from importlib import import_module
+
+from flowing_puppet_ros import __version__
+from flowing_puppet_ros.errors import PuppetError
+
+VERBS = {
+    "fit": "fit the 3D Stitched Puppet to meshes and clouds",
+    "correspond": "map scan to scan through two fits",
+    "track": "track people in a video, a frame folder or a bag with flowing puppets",
+    "replay": "run the nodes' algorithms over a bag, losslessly and reproducibly",
+    "report": "make the HTML report of a replayed bag",
+    "learn": "learn the 2D and 3D body models",
+    "sample": "draw samples of the learned body models",
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one verb and return the exit status: 0 done, 1 the work failed, 2 unusable arguments or input."""
+    parser = argparse.ArgumentParser(
+        prog="flowing-puppet",
+        description="People's pose and body shape from images, clouds and bags.",
+        epilog="verbs:\n" + "\n".join(f"  {verb:<11} {text}" for verb, text in VERBS.items()),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
+    parser.add_argument("verb", choices=VERBS, metavar="VERB", help="what to do; VERB --help says more")
+    parser.add_argument("arguments", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
+    chosen = parser.parse_args(argv)
+    module = import_module(f"flowing_puppet_ros.cli.{chosen.verb}")
+    verb_parser = argparse.ArgumentParser(prog=f"flowing-puppet {chosen.verb}", description=module.__doc__)
+    module.add_arguments(verb_parser)
+    arguments = verb_parser.parse_args(chosen.arguments)
+    try:
+        return module.run(arguments)
+    except PuppetError as error:
+        print(f"flowing-puppet {chosen.verb}: {error}", file=sys.stderr)
+        return error.exit_status
+    except KeyboardInterrupt:
+        print(f"flowing-puppet {chosen.verb}: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        return 1

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Dense optical flow, robust affine motion per part, and the puppet flow."""
