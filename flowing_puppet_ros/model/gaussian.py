@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Multivariate Gaussians: conditioning, marginals, sampling, density and product (thesis Eqs. 12-14 and 25-30)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gaussian:
+    """N(x; mean (D,), covariance (D,D)), in the units of x."""
+
+    mean: Array
+    covariance: Array
+
+    def __post_init__(self) -> None:
+        """Store float64 arrays; raise ValueError when their shapes do not belong together."""
+        mean = np.asarray(self.mean, dtype=np.float64)
+        covariance = np.asarray(self.covariance, dtype=np.float64)
+        if mean.ndim != 1 or covariance.shape != (mean.size, mean.size):
+            raise ValueError(f"a mean of shape {mean.shape} has no covariance of shape {covariance.shape}")
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "covariance", covariance)
+
+    def __len__(self) -> int:
+        return int(self.mean.size)
+
+    @classmethod
+    def from_samples(cls, samples: Array, ridge: float = 0.0) -> Gaussian:
+        """Fit mean and (n - 1)-normalised covariance to samples (n,D), with `ridge` added to the variances."""
+        centred = samples - samples.mean(axis=0)
+        covariance = centred.T @ centred / max(len(samples) - 1, 1)
+        return cls(samples.mean(axis=0), covariance + ridge * np.eye(samples.shape[1]))
+
+    def marginal(self, indices: Sequence[int] | Array) -> Gaussian:
+        """The distribution of the variables `indices`, in that order."""
+        kept = np.asarray(indices, dtype=np.intp)
+        return Gaussian(self.mean[kept], self.covariance[np.ix_(kept, kept)])
+
+    def condition(self, kept: Sequence[int] | Array, given: Sequence[int] | Array, values: Array) -> Gaussian:
+        """The distribution of the variables `kept` when the variables `given` have `values` (Eqs. 13 and 14).
+
+        Variables in neither list are marginalised out.
+        """
+        a, b = np.asarray(kept, dtype=np.intp), np.asarray(given, dtype=np.intp)
+        gain = np.linalg.solve(self.covariance[np.ix_(b, b)], self.covariance[np.ix_(b, a)]).T
+        mean = self.mean[a] + gain @ (np.asarray(values, dtype=np.float64) - self.mean[b])
+        covariance = self.covariance[np.ix_(a, a)] - gain @ self.covariance[np.ix_(b, a)]
+        return Gaussian(mean, (covariance + covariance.T) / 2)
+
+    def sample(self, rng: np.random.Generator, n: int) -> Array:
+        """Draw (n,D) samples; a singular covariance is allowed."""
+        variances, axes = np.linalg.eigh(self.covariance)
+        scaled = axes * np.sqrt(np.maximum(variances, 0.0))
+        return np.asarray(self.mean + rng.standard_normal((n, len(self))) @ scaled.T)
+
+    def log_density(self, x: Array) -> Array:
+        """Log density at x (...,D); LinAlgError when the covariance is not positive definite."""
+        factor = np.linalg.cholesky(self.covariance)
+        deviation = np.asarray(x, dtype=np.float64) - self.mean
+        whitened = np.linalg.solve(factor, deviation[..., None])[..., 0]
+        log_volume = np.log(np.diag(factor)).sum() + 0.5 * len(self) * np.log(2 * np.pi)
+        return np.asarray(-0.5 * (whitened**2).sum(axis=-1) - log_volume)
+
+
+def product(gaussians: Sequence[Gaussian]) -> Gaussian:
+    """The normalised product of Gaussians over the same variables (Eqs. 25-30).
+
+    Information vectors are precision times mean; Eq. 30 as printed has the covariance there.
+    """
+    precisions = [np.linalg.inv(gaussian.covariance) for gaussian in gaussians]
+    information = np.sum([p @ g.mean for p, g in zip(precisions, gaussians, strict=True)], axis=0)
+    covariance = np.linalg.inv(np.sum(precisions, axis=0))
+    return Gaussian(covariance @ information, (covariance + covariance.T) / 2)

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rotations of space: Rodrigues vectors, matrices and the orthogonal Procrustes problem, all batched."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+
+
+def exp(r: Array) -> Array:
+    """Rotation matrices (...,3,3) of Rodrigues vectors r (...,3) in radians; they act on column vectors."""
+    r = np.asarray(r, dtype=np.float64)
+    angle = np.linalg.norm(r, axis=-1)[..., None, None]
+    zero = np.zeros(r.shape[:-1])
+    x, y, z = r[..., 0], r[..., 1], r[..., 2]
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape((*r.shape[:-1], 3, 3))
+    # numpy's sinc is sin(pi x) / (pi x), exact through 0; 1 - cos is written with the half angle to keep its digits.
+    first = np.sinc(angle / np.pi)
+    second = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.asarray(np.eye(3) + first * cross + second * (cross @ cross))
+
+
+def quaternion(matrix: Array) -> Array:
+    """Unit quaternions (...,4) as (w,x,y,z), w >= 0, of rotation matrices (...,3,3)."""
+    matrix = np.asarray(matrix, dtype=np.float64)
+    m = matrix.reshape((-1, 3, 3))
+    # Rows of 4 q q^T: the row with the largest diagonal entry is the numerically safe multiple of q (Shepperd 1978).
+    outer = np.empty((len(m), 4, 4))
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    outer[:, 0, 0] = 1 + trace
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        outer[:, i + 1, i + 1] = 1 + 2 * m[:, i, i] - trace
+        outer[:, 0, i + 1] = outer[:, i + 1, 0] = m[:, k, j] - m[:, j, k]
+        outer[:, j + 1, k + 1] = outer[:, k + 1, j + 1] = m[:, k, j] + m[:, j, k]
+    best = np.argmax(np.diagonal(outer, axis1=1, axis2=2), axis=1)
+    rows = outer[np.arange(len(m)), best]
+    rows = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    rows = np.where(rows[:, :1] < 0, -rows, rows)
+    return np.asarray(rows.reshape((*matrix.shape[:-2], 4)))
+
+
+def log(matrix: Array) -> Array:
+    """Rodrigues vectors (...,3), angle in [0, pi], of rotation matrices (...,3,3); accurate near 0 and near pi."""
+    q = quaternion(matrix)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    scale = np.where(sine > 1e-12, angle / np.where(sine > 1e-12, sine, 1.0), 2.0)
+    return np.asarray(q[..., 1:] * scale)
+
+
+def nearest_rotation(matrix: Array) -> Array:
+    """The rotation (...,3,3) with the largest trace(R^T M) for M (...,3,3)."""
+    u, _, vt = np.linalg.svd(matrix)
+    sign = np.ones(u.shape[:-1])
+    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return np.asarray((u * sign[..., None, :]) @ vt)
+
+
+def procrustes(a: Array, b: Array, w: Array | None = None) -> tuple[Array, Array]:
+    """Rotation R (...,3,3) and translation t (...,3) that minimise sum_k w_k |R a_k + t - b_k|^2.
+
+    a, b: (...,K,3) points, w: (K,) or (...,K) weights >= 0 (uniform when left out).
+    """
+    a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
+    weight = np.ones(a.shape[-2]) if w is None else np.asarray(w, dtype=np.float64)
+    weight = (weight / weight.sum(axis=-1, keepdims=True))[..., None]
+    centre_a, centre_b = (weight * a).sum(axis=-2), (weight * b).sum(axis=-2)
+    moment = np.swapaxes(weight * (b - centre_b[..., None, :]), -1, -2) @ (a - centre_a[..., None, :])
+    rotation = nearest_rotation(moment)
+    translation = centre_b - np.squeeze(rotation @ centre_a[..., None], axis=-1)
+    return rotation, np.asarray(translation)
