@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The voxel grid and the data term against brute force."""
+
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.evidence.cloud import CloudGrid
+
+CENTRE = np.array([1.0, 2.0, -0.5])
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(3000, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return CloudGrid.build(0.3 * normals + CENTRE, normals)
+
+
+def test_closest_is_within_a_cell_of_brute_force(sphere):
+    queries = np.random.default_rng(1).uniform(-0.5, 0.5, (500, 3)) + CENTRE
+    index, distance = sphere.closest(queries)
+    exact = np.linalg.norm(queries[:, None] - sphere.points, axis=2)
+    np.testing.assert_allclose(distance, exact[np.arange(500), index])
+    slack = np.sqrt(3) * sphere.cell
+    assert np.all(distance <= exact.min(axis=1) + slack)
+    assert np.mean(distance - exact.min(axis=1)) < 0.1 * sphere.cell
+
+
+def test_far_queries_are_answered_at_the_border(sphere):
+    index, distance = sphere.closest(np.array([[100.0, 2.0, -0.5], [-100.0, 2.0, -0.5]]))
+    assert sphere.points[index[0], 0] > 1.25
+    assert sphere.points[index[1], 0] < 0.75
+    assert distance[0] == pytest.approx(98.7, abs=0.05)
+
+
+def test_data_cost_equals_the_formula(sphere):
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-0.4, 0.4, (4, 50, 3)) + CENTRE
+    normals = rng.normal(size=(4, 50, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    cost, mismatch = sphere.data_cost(points, normals)
+    index, distance = sphere.closest(points.reshape(-1, 3))
+    index, distance = index.reshape(4, 50), distance.reshape(4, 50)
+    np.testing.assert_allclose(cost, ((distance**2 + 0.001) ** 0.45).mean(axis=1))
+    angle = np.arccos(np.clip((normals * sphere.normals[index]).sum(axis=2), -1, 1))
+    np.testing.assert_allclose(mismatch, (angle > 0.75 * np.pi).mean(axis=1))
+
+
+def test_inside_out_surface_pays_for_its_normals_only(sphere):
+    points, normals = sphere.points[None, :200], sphere.normals[None, :200]
+    right, wrong = sphere.data_cost(points, normals), sphere.data_cost(points, -normals)
+    assert right[0] == wrong[0]
+    assert right[1] == 0.0
+    assert wrong[1] == 1.0
+
+
+def test_wide_clouds_get_larger_cells():
+    points = np.array([[0.0, 0.0, 0.0], [100.0, 100.0, 100.0]])
+    grid = CloudGrid.build(points, np.eye(3)[:2])
+    assert grid.nearest.size < 3_000_000
+    assert grid.closest(points)[0].tolist() == [0, 1]
