@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Affine motion of each labelled region, fitted robustly to dense flow.
+
+A motion is a (2, 3) array A that takes a point of the first image to the second: p' = A [x, y, 1]^T. The thesis fits
+one to the flow inside every visible part (flowing puppets, section 2); here by iteratively reweighted least squares
+with a Geman-McClure weight, from a median translation on, each flow vector weighted by its round trip through the
+backward flow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.flow.estimate import Flow
+
+type Floats = NDArray[np.float64]
+
+SAMPLES_PER_REGION = 2000
+ITERATIONS = 8
+LEAST_FOR_AFFINE = 40
+LEAST_FOR_TRANSLATION = 8
+RESIDUAL_FLOOR = 1.0  # px; flow noise that no fit should try to beat
+DEFORMATION = 0.3  # expected size of A's linear part beside the identity
+CORRELATED_PIXELS = 50.0  # neighbouring flow vectors err together: this many count as one
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RegionMotions:
+    """Motions of R regions: `affine` (R, 2, 3), `residual` (R,) px, `support` (R,) in [0, 1], `pixels` (R,).
+
+    `residual` is the root mean square of the inliers' misfit (infinite without any), `support` the share of the
+    region's sampled vectors that agree with the motion, `pixels` the number of visible pixels with known flow.
+    """
+
+    affine: Floats
+    residual: Floats
+    support: Floats
+    pixels: NDArray[np.int64]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """(R,) whether the region had enough pixels for a motion of its own."""
+        return self.pixels >= LEAST_FOR_TRANSLATION
+
+
+def identity_motion() -> Floats:
+    """The (2, 3) motion that leaves every point where it is."""
+    return np.eye(2, 3)
+
+
+def transform(affine: Floats, points: Floats) -> Floats:
+    """Apply motions (..., 2, 3) to points (..., N, 2)."""
+    moved: Floats = points @ np.swapaxes(affine[..., :2], -1, -2) + affine[..., None, :, 2]
+    return moved
+
+
+def fit_affine(points: Floats, vectors: Floats, weights: Floats | None = None) -> tuple[Floats, float, float]:
+    """Robust affine motion (2, 3) of flow `vectors` (N, 2) at `points` (N, 2), its residual in px and its support."""
+    if weights is None:
+        weights = np.ones(len(points))
+    samples = np.column_stack([points, vectors, weights])
+    affine = np.empty((2, 3))
+    residual, support = _fit(np.ascontiguousarray(samples, dtype=np.float64), affine)
+    return affine, residual, support
+
+
+def fit_regions(labels: NDArray[np.unsignedinteger], count: int, forward: Flow, backward: Flow | None) -> RegionMotions:
+    """Fit one motion to each of the labels 0 .. count - 1 of `labels` (H, W), over the pixels with known flow.
+
+    Regions of few pixels get a translation, those of fewer still the identity and `known` False.
+    """
+    back = backward if backward is not None else np.empty((0, 0, 2), np.float32)
+    regions = np.ascontiguousarray(labels, dtype=np.uint16)
+    samples, starts, pixels = _gather(regions, count, np.ascontiguousarray(forward), np.ascontiguousarray(back))
+    affine = np.empty((count, 2, 3))
+    residual, support = np.empty(count), np.empty(count)
+    _fit_all(samples, starts, affine, residual, support)
+    return RegionMotions(affine, residual, support, pixels)
+
+
+@njit(cache=True)
+def _round_trip_weight(x: int, y: int, u: float, v: float, backward: Flow) -> float:
+    """Weight in (0, 1] of a flow vector: 1 when the backward flow returns to where it came from."""
+    height, width = backward.shape[:2]
+    if height == 0:
+        return 1.0
+    there_x, there_y = x + u, y + v
+    if not (0.0 <= there_x < width - 1 and 0.0 <= there_y < height - 1):
+        return 0.25
+    left, top = int(there_x), int(there_y)
+    a, b = there_x - left, there_y - top
+    error, magnitude = 0.0, u * u + v * v
+    for axis in range(2):
+        upper = (1 - a) * backward[top, left, axis] + a * backward[top, left + 1, axis]
+        lower = (1 - a) * backward[top + 1, left, axis] + a * backward[top + 1, left + 1, axis]
+        back = (1 - b) * upper + b * lower
+        magnitude += back * back
+        error += ((u if axis == 0 else v) + back) ** 2
+    if not np.isfinite(error):
+        return 0.25
+    tolerance = 0.01 * magnitude + 0.5  # Sundaram et al. 2010
+    return tolerance / (tolerance + error)
+
+
+@njit(cache=True)
+def _gather(
+    labels: NDArray[np.uint16], count: int, forward: Flow, backward: Flow
+) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
+    """Samples (M, 5) = x, y, u, v, weight sorted by label, start of each label (count + 1,), pixels of each label."""
+    height, width = labels.shape
+    pixels = np.zeros(count, np.int64)
+    for y in range(height):
+        for x in range(width):
+            if labels[y, x] < count and np.isfinite(forward[y, x, 0]) and np.isfinite(forward[y, x, 1]):
+                pixels[labels[y, x]] += 1
+    step = np.maximum(1, pixels // SAMPLES_PER_REGION)
+    starts = np.zeros(count + 1, np.int64)
+    for region in range(count):
+        starts[region + 1] = starts[region] + (pixels[region] + step[region] - 1) // step[region]
+    samples = np.empty((starts[count], 5))
+    seen = np.zeros(count, np.int64)
+    for y in range(height):
+        for x in range(width):
+            region = labels[y, x]
+            u, v = forward[y, x, 0], forward[y, x, 1]
+            if region >= count or not (np.isfinite(u) and np.isfinite(v)):
+                continue
+            if seen[region] % step[region] == 0:
+                row = samples[starts[region] + seen[region] // step[region]]
+                row[0], row[1], row[2], row[3] = x, y, u, v
+                row[4] = _round_trip_weight(x, y, u, v, backward)
+            seen[region] += 1
+    return samples, starts, pixels
+
+
+@njit(cache=True)
+def _fit_all(
+    samples: Floats, starts: NDArray[np.int64], affine: Floats, residual: Floats, support: Floats
+) -> None:
+    for region in range(len(starts) - 1):
+        residual[region], support[region] = _fit(samples[starts[region] : starts[region + 1]], affine[region])
+
+
+@njit(cache=True)
+def _fit(samples: Floats, affine: Floats) -> tuple[float, float]:
+    """Write the robust motion of `samples` (x, y, u, v, weight) into `affine`; return residual and support."""
+    affine[:] = 0.0
+    affine[0, 0] = affine[1, 1] = 1.0
+    if len(samples) < LEAST_FOR_TRANSLATION:
+        return np.inf, 0.0
+    centre_x, centre_y = np.mean(samples[:, 0]), np.mean(samples[:, 1])
+    radius = max(1.0, np.sqrt(np.var(samples[:, 0]) + np.var(samples[:, 1])))
+    # Columns: translation, then the linear part in units of the region's radius.
+    motion = np.zeros((2, 3))
+    motion[0, 0], motion[1, 0] = np.median(samples[:, 2]), np.median(samples[:, 3])
+    spread = np.median(np.abs(samples[:, 2] - motion[0, 0]) + np.abs(samples[:, 3] - motion[1, 0]))
+    scale = max(RESIDUAL_FLOOR, 1.5 * spread)
+    unknowns = 3 if len(samples) >= LEAST_FOR_AFFINE else 1
+    for _ in range(ITERATIONS):
+        _reweighted_step(samples, centre_x, centre_y, radius, scale, unknowns, motion)
+        scale = max(RESIDUAL_FLOOR, 0.7 * scale)
+    affine[:, :2] += motion[:, 1:] / radius
+    affine[:, 2] = motion[:, 0] - (motion[:, 1] * centre_x + motion[:, 2] * centre_y) / radius
+    return _agreement(samples, centre_x, centre_y, radius, scale, motion)
+
+
+@njit(cache=True)
+def _reweighted_step(
+    samples: Floats, centre_x: float, centre_y: float, radius: float, scale: float, unknowns: int, motion: Floats
+) -> None:
+    """One iteration: weigh every sample by its misfit to `motion` (2, 3), then solve for a new `motion`."""
+    normal, right = np.zeros((3, 3)), np.zeros((3, 2))
+    for k in range(len(samples)):
+        x, y = (samples[k, 0] - centre_x) / radius, (samples[k, 1] - centre_y) / radius
+        u, v = samples[k, 2], samples[k, 3]
+        misfit_x = u - motion[0, 0] - motion[0, 1] * x - motion[0, 2] * y
+        misfit_y = v - motion[1, 0] - motion[1, 1] * x - motion[1, 2] * y
+        weight = samples[k, 4] / (1.0 + (misfit_x * misfit_x + misfit_y * misfit_y) / (scale * scale)) ** 2
+        row = (1.0, x, y)
+        for i in range(unknowns):
+            for j in range(unknowns):
+                normal[i, j] += weight * row[i] * row[j]
+            right[i, 0] += weight * row[i] * u
+            right[i, 1] += weight * row[i] * v
+    prior = CORRELATED_PIXELS * (RESIDUAL_FLOOR / (DEFORMATION * radius)) ** 2
+    for i in range(1, 3):
+        normal[i, i] += prior
+    if normal[0, 0] > 1e-9:
+        motion[:] = np.linalg.solve(normal, right).T
+
+
+@njit(cache=True)
+def _agreement(
+    samples: Floats, centre_x: float, centre_y: float, radius: float, scale: float, motion: Floats
+) -> tuple[float, float]:
+    """Residual (px, root mean square over the inliers) and support (weighted share of inliers) of a motion."""
+    total, inlier, squares = 0.0, 0.0, 0.0
+    for k in range(len(samples)):
+        x, y = (samples[k, 0] - centre_x) / radius, (samples[k, 1] - centre_y) / radius
+        misfit_x = samples[k, 2] - motion[0, 0] - motion[0, 1] * x - motion[0, 2] * y
+        misfit_y = samples[k, 3] - motion[1, 0] - motion[1, 1] * x - motion[1, 2] * y
+        square = misfit_x * misfit_x + misfit_y * misfit_y
+        total += 1.0
+        if square < 9.0 * scale * scale:
+            inlier += samples[k, 4]
+            squares += samples[k, 4] * square
+    return np.sqrt(squares / inlier) if inlier > 0 else np.inf, inlier / total
