@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a still camera sees behind its people: a mean and a variance per pixel, learned only where nobody stands."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.settings import Settings, setting
+
+Images = NDArray[np.uint8]
+
+# A pixel that differs by this many spreads and grey levels counts as changed; more than this share changed: new scene.
+_CHANGED_SPREADS = 6.0
+_CHANGED_LEVELS = 25.0
+_NEW_SCENE_SHARE = 0.5
+_NEW_SCENE_FRAMES = 3
+
+
+@dataclass(frozen=True, slots=True)
+class BackgroundSettings(Settings):
+    """How the background of one camera is learned."""
+
+    min_frames: int = setting(3, "frames a pixel must have been seen bare to be known", unit="frames", low=2, high=1000)
+    memory: int = setting(200, "frames after which old appearance fades", unit="frames", low=2, high=100000)
+
+
+class Background:
+    """Running mean and variance of every pixel over the frames in which it lay outside the people (causal).
+
+    A person who never leaves a pixel keeps it unknown, so somebody who walks on the spot does not become background,
+    as happens with a plain median. When more than half of the bare pixels differ from what is known for three frames
+    on end (the camera moved, the light changed), everything is forgotten.
+    """
+
+    def __init__(self, settings: BackgroundSettings | None = None) -> None:
+        """Know nothing yet; the image size is taken from the first update."""
+        self.settings = settings or BackgroundSettings()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.count = np.zeros((0, 0), np.int32)
+        self.mean = np.zeros((0, 0, 3), np.float32)
+        self.variance = np.zeros((0, 0, 3), np.float32)
+        self._changed_frames = 0
+
+    def update(self, image: Images, bare: NDArray[np.bool_]) -> None:
+        """Learn from `image` (h,w,3) uint8 where `bare` (h,w) is true; another image size starts afresh."""
+        if self.count.shape != image.shape[:2]:
+            self.reset()
+            self.count = np.zeros(image.shape[:2], np.int32)
+            self.mean = np.zeros(image.shape, np.float32)
+            self.variance = np.zeros(image.shape, np.float32)
+        self._forget_other_scene(image, bare)
+        _update(self.count, self.mean, self.variance, np.ascontiguousarray(image), bare, self.settings.memory)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Pixels (h,w) that were seen bare often enough."""
+        return self.count >= self.settings.min_frames
+
+    def difference(self, image: Images) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Largest channel difference (h,w) in grey levels, and the spread (h,w) of the background in that channel."""
+        return _difference(self.mean, self.variance, np.ascontiguousarray(image))
+
+    def _forget_other_scene(self, image: Images, bare: NDArray[np.bool_]) -> None:
+        judged = bare & self.known
+        if not judged.any():
+            return
+        levels, spread = self.difference(image)
+        changed = (levels > _CHANGED_LEVELS) & (levels > _CHANGED_SPREADS * (spread + 1))
+        share = np.count_nonzero(changed & judged) / np.count_nonzero(judged)
+        self._changed_frames = self._changed_frames + 1 if share > _NEW_SCENE_SHARE else 0
+        if self._changed_frames >= _NEW_SCENE_FRAMES:
+            self.count[:] = 0
+            self._changed_frames = 0
+
+
+@njit(cache=True)
+def _update(count, mean, variance, image, bare, memory):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Welford's update with the count held at `memory`, which turns the mean into an exponential one."""
+    height, width, channels = image.shape
+    for y in range(height):
+        for x in range(width):
+            if not bare[y, x]:
+                continue
+            n = min(count[y, x] + 1, memory)
+            count[y, x] = n
+            for c in range(channels):
+                if n == 1:
+                    mean[y, x, c] = image[y, x, c]
+                    variance[y, x, c] = 0.0
+                    continue
+                delta = image[y, x, c] - mean[y, x, c]
+                mean[y, x, c] += delta / n
+                variance[y, x, c] += (delta * (image[y, x, c] - mean[y, x, c]) - variance[y, x, c]) / n
+
+
+@njit(cache=True)
+def _difference(mean, variance, image):  # type: ignore[no-untyped-def]  # pragma: no cover
+    height, width, channels = image.shape
+    levels = np.zeros((height, width), np.float32)
+    spread = np.zeros((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
+            for c in range(channels):
+                delta = abs(image[y, x, c] - mean[y, x, c])
+                if c == 0 or delta > levels[y, x]:
+                    levels[y, x] = delta
+                    spread[y, x] = np.sqrt(variance[y, x, c])
+    return levels, spread

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Silhouettes of tracked people: the puppet's labels and a learned background seed a GrabCut of the image.
+
+The puppet says roughly where the body is, the background says which pixels cannot be it; GrabCut (Rother et al. 2004)
+settles what lies between by colour. Everything is causal: a frame's mask uses that frame and earlier ones only.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.background import Background, BackgroundSettings
+from flowing_puppet_ros.settings import Settings, setting
+
+Mask = NDArray[np.uint8]
+
+# Lengths on the body in metres, from a trial on real recordings.
+_SURE_CORE = 0.03  # this far inside the puppet is body
+_POSSIBLE_FRINGE = 0.07  # this far outside the puppet may be body
+_BARE_DISTANCE = 0.10  # farther than this outside the puppet is background
+_CROP_MARGIN = 0.25  # surroundings that GrabCut learns the colours of the background from
+_SPECK = 0.006  # radius of the opening that removes specks and threads
+
+# Background differences: d in grey levels, z in spreads softened by the camera's noise.
+_NOISE_LEVELS = 3.0
+_SAME = (8.0, 1.5)  # below both: surely background
+_OTHER = (40.0, 6.0)  # above both: surely body
+_DOUBTFUL = (15.0, 3.0)  # above both: probably body
+_AREA_HISTORY = 31
+_AREA_MIN_HISTORY = 5
+
+
+@dataclass(frozen=True, slots=True)
+class SilhouetteSettings(Settings):
+    """How silhouettes are cut out."""
+
+    max_side: int = setting(480, "longest image side that silhouettes are cut at", unit="px", low=64, high=8192)
+    cut_rounds: int = setting(2, "GrabCut rounds", low=1, high=10)
+    area_change: float = setting(
+        0.35, "a mask whose area differs from its running median by more than this share is not used", low=0.05, high=10.0
+    )
+    min_frames: int = setting(3, "bare frames after which a background pixel is known", unit="frames", low=2, high=1000)
+    memory: int = setting(200, "frames after which old background fades", unit="frames", low=2, high=100000)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """One frame at working scale: image (h,w,3), puppet (h,w) bool, `scale` in working pixels per metre on the body."""
+
+    image: NDArray[np.uint8]
+    puppet: NDArray[np.bool_]
+    scale: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Silhouette:
+    """A mask (h,w) uint8, 255 on the body, at working scale; `problem` is a sentence when it should not be used."""
+
+    mask: Mask
+    problem: str = ""
+
+
+class SilhouetteEstimator:
+    """Silhouettes of the tracked people in one still camera's images.
+
+    `observe` is cheap and wants every frame, for the background; `cut` takes the observations whose mask is wanted.
+    """
+
+    def __init__(self, settings: SilhouetteSettings | None = None) -> None:
+        """Know no background yet."""
+        self.settings = settings or SilhouetteSettings()
+        self.background = Background(BackgroundSettings(self.settings.min_frames, self.settings.memory))
+        self._areas: deque[float] = deque(maxlen=_AREA_HISTORY)
+
+    def reset(self) -> None:
+        """Forget the background and the usual area."""
+        self.background.reset()
+        self._areas.clear()
+
+    def observe(self, image: NDArray[np.uint8], labels: NDArray[np.uint8], scale: float) -> Observation:
+        """Shrink `image` (H,W,3) RGB and the part `labels` (H,W), learn the background, return the frame to `cut`.
+
+        `labels` are positive on the puppets; `scale` is their size in pixels of `image` per metre. Frames without any
+        puppet teach nothing: that nobody was tracked is no proof that nobody stands there. Raises InputError for
+        images and labels that do not fit together and for a scale that is not positive.
+        """
+        _check(image, labels, scale)
+        height, width = image.shape[:2]
+        factor = min(1.0, self.settings.max_side / max(height, width))
+        size = (max(1, round(width * factor)), max(1, round(height * factor)))
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor < 1 else image
+        puppet = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST) > 0
+        observation = Observation(small, puppet, scale * factor)
+        if puppet.any():
+            self.background.update(small, ~_dilated(puppet, _BARE_DISTANCE * observation.scale))
+        return observation
+
+    def cut(self, observation: Observation) -> Silhouette:
+        """The silhouette of an observed frame; its `problem` says so when it is empty or much unlike recent ones."""
+        if not observation.puppet.any():
+            return Silhouette(np.zeros(observation.puppet.shape, np.uint8), "no puppet in the image")
+        rows, columns = _crop(observation.puppet, _CROP_MARGIN * observation.scale)
+        part = Observation(
+            np.ascontiguousarray(observation.image[rows, columns]), observation.puppet[rows, columns], observation.scale
+        )
+        seed = self._seed(part, observation.image, rows, columns)
+        body = _grab_cut(part.image, seed, self.settings.cut_rounds)
+        mask = np.zeros(observation.puppet.shape, np.uint8)
+        mask[rows, columns] = _cleaned(body, part)
+        return Silhouette(mask, self._alarm(mask, observation.scale))
+
+    def _seed(self, part: Observation, image: NDArray[np.uint8], rows: slice, columns: slice) -> Mask:
+        """GrabCut's seed (h,w) of the crop: what puppet and background together say of every pixel."""
+        core = _eroded(part.puppet, _SURE_CORE * part.scale)
+        fringe = _dilated(part.puppet, _POSSIBLE_FRINGE * part.scale)
+        seed = np.where(part.puppet, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+        known = self.background.known[rows, columns]
+        levels, spread = self.background.difference(image)
+        levels = cv2.blur(levels, (3, 3))[rows, columns]
+        ratio = levels / (spread[rows, columns] + _NOISE_LEVELS)
+        seed[known] = cv2.GC_PR_BGD
+        seed[known & (levels > _DOUBTFUL[0]) & (ratio > _DOUBTFUL[1])] = cv2.GC_PR_FGD
+        seed[known & (levels > _OTHER[0]) & (ratio > _OTHER[1])] = cv2.GC_FGD
+        seed[known & (levels < _SAME[0]) & (ratio < _SAME[1])] = cv2.GC_BGD
+        seed[~fringe] = cv2.GC_BGD
+        seed[core] = cv2.GC_FGD
+        return seed
+
+    def _alarm(self, mask: Mask, scale: float) -> str:
+        area = np.count_nonzero(mask) / scale**2
+        usual = float(np.median(self._areas)) if len(self._areas) >= _AREA_MIN_HISTORY else area
+        self._areas.append(area)
+        if area == 0:
+            return "the silhouette is empty"
+        if not 1 / (1 + self.settings.area_change) <= area / usual <= 1 + self.settings.area_change:
+            return f"the silhouette's area is {area / usual:.2f} of its running median"
+        return ""
+
+
+def _check(image: NDArray[np.uint8], labels: NDArray[np.uint8], scale: float) -> None:
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
+        raise InputError(f"a silhouette needs an RGB image (H, W, 3) of uint8, got {image.shape} of {image.dtype}")
+    if labels.shape != image.shape[:2] or labels.dtype != np.uint8:
+        raise InputError(f"part labels are {labels.shape} of {labels.dtype}, the image needs {image.shape[:2]} of uint8")
+    if not (np.isfinite(scale) and scale > 0):
+        raise InputError(f"the puppet's scale is {scale}; it must be a positive number of pixels per metre")
+
+
+def _disc(radius: float) -> Mask:
+    reach = max(1, round(radius))
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+
+
+def _distance_outside(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+
+
+def _dilated(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    return _distance_outside(mask) <= radius
+
+
+def _eroded(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
+    return _distance_outside(~mask) > radius
+
+
+def _crop(puppet: NDArray[np.bool_], margin: float) -> tuple[slice, slice]:
+    """Rows and columns of the puppet's box with a margin, within the image."""
+    slices = []
+    for axis in (1, 0):
+        covered = np.flatnonzero(puppet.any(axis=axis))
+        low, high = int(covered[0] - margin), int(np.ceil(covered[-1] + margin)) + 1
+        slices.append(slice(max(0, low), min(puppet.shape[1 - axis], high)))
+    return slices[0], slices[1]
+
+
+def _grab_cut(image: NDArray[np.uint8], seed: Mask, rounds: int) -> NDArray[np.bool_]:
+    """GrabCut with fixed randomness; a seed that leaves nothing to decide is the answer itself."""
+    body = (seed == cv2.GC_FGD) | (seed == cv2.GC_PR_FGD)
+    if body.all() or not body.any():
+        return body
+    cv2.setNumThreads(1)  # the result depends on the number of threads otherwise
+    cv2.setRNGSeed(0)
+    labels = seed.copy()
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.grabCut(image, labels, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+    return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
+
+
+def _cleaned(body: NDArray[np.bool_], part: Observation) -> Mask:
+    """Open away specks, and keep only what hangs together with the core of the puppet; 255 on the body."""
+    opened = cv2.morphologyEx(body.astype(np.uint8), cv2.MORPH_OPEN, _disc(_SPECK * part.scale))
+    count, components = cv2.connectedComponents(opened, connectivity=8)
+    kept = np.zeros(count, bool)
+    kept[components[_eroded(part.puppet, _SURE_CORE * part.scale)]] = True
+    kept[0] = False
+    return np.where(kept[components], 255, 0).astype(np.uint8)
