@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far joints are from a reference: 2D tracks against keypoints, 3D bodies against triangulated joints.
+
+Distances are in the unit of the points (pixels or metres) and NaN where either side does not know the joint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.keypoints import normalise_name
+from flowing_puppet_ros.model.tree import mirrored_name
+
+ARM_JOINTS = ("shoulder", "elbow", "wrist")
+LEG_JOINTS = ("hip", "knee", "ankle")
+LIMB_JOINTS = tuple(f"{side}_{joint}" for joint in ARM_JOINTS + LEG_JOINTS for side in ("right", "left"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JointErrors:
+    """Distances (T,J) of J named joints in T frames; NaN where not both are known."""
+
+    names: tuple[str, ...]
+    distance: np.ndarray
+
+    @property
+    def known(self) -> np.ndarray:
+        """The known distances, (n,)."""
+        return self.distance[np.isfinite(self.distance)]
+
+    @property
+    def mean(self) -> float:
+        """Mean over all known joints; NaN without any."""
+        return float(self.known.mean()) if self.known.size else float("nan")
+
+    def percentile(self, percent: float) -> float:
+        """The distance that `percent` of the known joints do not exceed; 50 is the median; NaN without any."""
+        return float(np.percentile(self.known, percent)) if self.known.size else float("nan")
+
+    def fraction_within(self, threshold: float) -> float:
+        """Share of the known joints that are no farther than `threshold`; NaN without any."""
+        return float(np.mean(self.known <= threshold)) if self.known.size else float("nan")
+
+    def per_joint(self) -> dict[str, JointErrors]:
+        """The same figures for one joint each."""
+        return {name: JointErrors((name,), self.distance[:, [j]]) for j, name in enumerate(self.names)}
+
+    def per_frame(self) -> np.ndarray:
+        """Mean over the known joints of each frame, (T,); NaN in frames without any."""
+        known = np.isfinite(self.distance)
+        total = np.where(known, self.distance, 0).sum(axis=1)
+        return np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan)
+
+    def summary(self, thresholds: Sequence[float] = ()) -> dict[str, float]:
+        """Counts, mean, median, 90th percentile, maximum and the fractions within `thresholds`, JSON-ready."""
+        figures = {"joints": float(self.known.size), "frames": float(np.isfinite(self.distance).any(axis=1).sum())}
+        figures |= {"mean": self.mean, "median": self.percentile(50), "p90": self.percentile(90)}
+        figures["max"] = self.percentile(100)
+        return figures | {f"within {value:g}": self.fraction_within(value) for value in thresholds}
+
+
+def named_points(names: Sequence[str], points: np.ndarray) -> dict[str, np.ndarray]:
+    """The known ones of (K,D) points under our joint names; `names` (K) in any detector's spelling.
+
+    Raises InputError when the numbers of names and points differ.
+    """
+    points = np.asarray(points, float)
+    if points.ndim != 2 or len(names) != len(points):
+        raise InputError(f"{len(names)} joint names need as many points, these have shape {points.shape}")
+    pairs = ((normalise_name(name), point) for name, point in zip(names, points, strict=True))
+    return {name: point for name, point in pairs if name is not None and _finite(point)}
+
+
+def joint_errors(
+    frames: Mapping[int, Mapping[str, np.ndarray]],
+    reference: Mapping[int, Mapping[str, np.ndarray]],
+    names: Sequence[str] = LIMB_JOINTS,
+) -> JointErrors:
+    """Compare joints {stamp: {name: (D,) point}} with a reference of the same form at the stamps of `frames`.
+
+    A stamp that the reference lacks is a row of NaN, so that rows stay in step with `frames`.
+    """
+    rows = np.full((len(frames), len(names)), np.nan)
+    for row, (stamp, joints) in enumerate(frames.items()):
+        other = reference.get(stamp, {})
+        for column, name in enumerate(names):
+            if name in joints and name in other:
+                rows[row, column] = np.linalg.norm(np.asarray(joints[name], float) - np.asarray(other[name], float))
+    return JointErrors(tuple(names), rows)
+
+
+def swapped(joints: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray], limb: Sequence[str]) -> bool | None:
+    """Tell whether the joints of a pair of limbs lie nearer to the other side's reference than to their own side's.
+
+    `limb` is ARM_JOINTS or LEG_JOINTS, or both joined for the whole body. None when no joint of the limb is known on
+    both sides.
+    """
+    own = other = 0.0
+    count = 0
+    for joint in limb:
+        sides = (f"left_{joint}", f"right_{joint}")
+        if not all(_finite(points.get(side)) for points in (joints, reference) for side in sides):
+            continue
+        count += 1
+        for side in sides:
+            own += float(np.linalg.norm(joints[side] - reference[side]))
+            other += float(np.linalg.norm(joints[side] - reference[mirrored_name(side)]))
+    return other < own if count else None
+
+
+def swapped_share(
+    frames: Mapping[int, Mapping[str, np.ndarray]],
+    reference: Mapping[int, Mapping[str, np.ndarray]],
+    limb: Sequence[str],
+) -> tuple[int, int]:
+    """Count (swapped, comparable) frames of one pair of limbs, see `swapped`."""
+    answers = [swapped(joints, reference[stamp], limb) for stamp, joints in frames.items() if stamp in reference]
+    told = [answer for answer in answers if answer is not None]
+    return sum(told), len(told)
+
+
+def id_switches(ids: Sequence[Sequence[str]]) -> int:
+    """Count how often a person goes on under another id; `ids` are those of the people of each frame, in order.
+
+    A switch is an id that is gone while another one is new, against the last frame with people in it.
+    """
+    switches = 0
+    last: set[str] = set()
+    for names in ids:
+        now = set(names)
+        switches += min(len(last - now), len(now - last))
+        last = now or last
+    return switches
+
+
+def _finite(point: np.ndarray | None) -> bool:
+    return point is not None and bool(np.isfinite(point).all())
