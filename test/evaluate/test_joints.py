@@ -31,7 +31,7 @@ def body(dimensions: int = 3) -> dict[str, np.ndarray]:
     return points
 
 
-def test_distances_against_a_known_shift():
+def test_distances_against_a_known_shift() -> None:
     reference = {10: body(), 20: body()}
     frames = {stamp: {name: point + np.array([0, 0.03, 0.04]) for name, point in body().items()} for stamp in (10, 20)}
     errors = joint_errors(frames, reference)
@@ -40,7 +40,7 @@ def test_distances_against_a_known_shift():
     assert errors.fraction_within(0.051) == 1.0 and errors.fraction_within(0.049) == 0.0
 
 
-def test_unknown_joints_and_stamps_do_not_count():
+def test_unknown_joints_and_stamps_do_not_count() -> None:
     frames = {1: body(2), 2: body(2), 3: body(2)}
     del frames[1]["left_wrist"]
     reference = {1: body(2), 3: body(2) | {"right_knee": np.array([np.nan, 0.0])}}
@@ -51,7 +51,7 @@ def test_unknown_joints_and_stamps_do_not_count():
     assert errors.known.size == 22 and errors.summary()["frames"] == 2
 
 
-def test_summary_matches_numpy():
+def test_summary_matches_numpy() -> None:
     distance = RNG.uniform(0, 10, (7, 3))
     distance[2, 1] = np.nan
     errors = JointErrors(("a", "b", "c"), distance)
@@ -64,23 +64,21 @@ def test_summary_matches_numpy():
     assert errors.per_frame() == pytest.approx(np.nanmean(distance, axis=1))
 
 
-def test_nothing_known_is_nan_without_warnings():
+def test_nothing_known_is_nan_without_warnings() -> None:
     errors = JointErrors(("a",), np.full((2, 1), np.nan))
     assert all(math.isnan(errors.summary((1.0,))[key]) for key in ("mean", "median", "max", "within 1"))
     assert np.isnan(errors.per_frame()).all()
 
 
-def test_named_points_reads_detector_names():
+def test_named_points_reads_detector_names() -> None:
     points = np.array([[1, 2], [3, 4], [5, 6], [np.nan, 7]])
-    found = named_points(
-        ["LWrist", "right_wrist", "Something", "Neck"], points)
-    )
+    found = named_points(["LWrist", "right_wrist", "Something", "Neck"], points)
     assert set(found) == {"left_wrist", "right_wrist"} and found["left_wrist"].tolist() == [1, 2]
     with pytest.raises(InputError, match="2 joint names need as many points"):
         named_points(["LWrist", "RWrist"], np.zeros((3, 2)))
 
 
-def test_swapped_limbs_are_found_one_pair_at_a_time():
+def test_swapped_limbs_are_found_one_pair_at_a_time() -> None:
     reference = body()
     noisy = {name: point + RNG.normal(0, 0.03, 3) for name, point in reference.items()}
     assert swapped(noisy, reference, ARM_JOINTS) is False and swapped(noisy, reference, LEG_JOINTS) is False
@@ -104,5 +102,5 @@ def test_swapped_limbs_are_found_one_pair_at_a_time():
         ([], 0),
     ],
 )
-def test_id_switches(ids, expected):
+def test_id_switches(ids: list[list[str]], expected: int) -> None:
     assert id_switches(ids) == expected

@@ -20,7 +20,7 @@ class Pinhole:
         return np.stack([100 - 400 * y / x, 100 - 400 * z / x], axis=1), x
 
 
-def test_orthographic_view_has_the_size_of_the_box():
+def test_orthographic_view_has_the_size_of_the_box() -> None:
     size = (200, 220)
     camera = orthographic(BOX, looking=(-1, 0, 0), size=size, margin=0.05)
     picture = render(BOX, FACES, camera, size)
@@ -33,20 +33,20 @@ def test_orthographic_view_has_the_size_of_the_box():
     assert np.allclose(inside, 1.0, atol=1e-5)
 
 
-def test_front_view_shows_the_persons_left_on_the_right():
+def test_front_view_shows_the_persons_left_on_the_right() -> None:
     pixels, depth = orthographic(BOX, (-1, 0, 0), (100, 100)).project(np.array([[0, 0.3, 0], [0, 0, 0.4], [0.2, 0, 0]]))
     assert pixels[0, 0] > 60 and pixels[1, 1] < 30
     assert depth[2] < depth[0]
 
 
-def test_fixed_scale_is_kept():
+def test_fixed_scale_is_kept() -> None:
     camera = orthographic(BOX, (0, -1, 0), (300, 300), scale=123.0)
     pixels, _ = camera.project(np.array([[0, 0, 0], [0, 0, 1.0]]))
     assert np.linalg.norm(pixels[1] - pixels[0]) == pytest.approx(123)
 
 
 @pytest.mark.parametrize("near_first", [True, False])
-def test_nearest_surface_wins_in_any_order(near_first):
+def test_nearest_surface_wins_in_any_order(near_first: bool) -> None:
     near, far = BOX - np.array([1, 0, 0]), BOX * 2 + np.array([1.5, 0, 0])
     canvas = Canvas(Pinhole(), (200, 200))
     meshes = [(near, (255, 0, 0)), (far, (0, 0, 255))]
@@ -56,7 +56,7 @@ def test_nearest_surface_wins_in_any_order(near_first):
     assert rgb[100, 100, 0] > 100 and rgb[100, 100, 2] == 0
 
 
-def test_perspective_mesh_stands_where_its_projection_is():
+def test_perspective_mesh_stands_where_its_projection_is() -> None:
     picture = render(BOX, FACES, Pinhole(), (200, 200))
     pixels, _ = Pinhole().project(BOX)
     rows, columns = np.nonzero(picture.mask)
@@ -64,14 +64,14 @@ def test_perspective_mesh_stands_where_its_projection_is():
     assert [columns.max(), rows.max()] == pytest.approx(pixels.max(axis=0), abs=1)
 
 
-def test_inside_faces_are_darker():
+def test_inside_faces_are_darker() -> None:
     camera = orthographic(BOX, (-1, 0, 0), (80, 80))
     outside = render(BOX, FACES, camera, (80, 80), smooth=False).rgb[40, 40]
     inside = render(BOX, FACES[:, ::-1], camera, (80, 80), smooth=False).rgb[40, 40]
     assert (inside.astype(int) < outside.astype(int) - 60).all()
 
 
-def test_face_and_vertex_colours():
+def test_face_and_vertex_colours() -> None:
     camera = orthographic(BOX, (-1, 0, 0), (80, 80))
     per_face = np.zeros((len(FACES), 3))
     per_face[2:4] = (0, 200, 0)  # the side at +x, that the camera sees
@@ -81,7 +81,7 @@ def test_face_and_vertex_colours():
     assert rgb[40, 60, 0] > rgb[40, 60, 2] and rgb[40, 20, 2] > rgb[40, 20, 0]
 
 
-def test_faces_behind_the_camera_and_nan_are_left_out():
+def test_faces_behind_the_camera_and_nan_are_left_out() -> None:
     vertices = BOX.copy()
     vertices[0] = np.nan
     picture = render(vertices, FACES[:2], Pinhole(), (50, 50))
@@ -89,7 +89,7 @@ def test_faces_behind_the_camera_and_nan_are_left_out():
     assert not render(BOX - np.array([9, 0, 0]), FACES, Pinhole(), (50, 50)).mask.any()
 
 
-def test_points_are_discs_hidden_by_nearer_ones():
+def test_points_are_discs_hidden_by_nearer_ones() -> None:
     canvas = Canvas(Pinhole(), (200, 200), samples=1)
     canvas.points(np.array([[0, 0, 0], [1.0, 0, 0]]), np.array([[255, 0, 0], [0, 0, 255]]), radius=4)
     picture = canvas.picture()
@@ -98,7 +98,7 @@ def test_points_are_discs_hidden_by_nearer_ones():
     assert not (picture.rgb == (0, 0, 255)).all(axis=2).any()
 
 
-def test_opacity_blends_with_the_background_image():
+def test_opacity_blends_with_the_background_image() -> None:
     background = np.full((200, 200, 3), 100, np.uint8)
     canvas = Canvas(Pinhole(), (200, 200))
     canvas.mesh(BOX, FACES, (200, 0, 0))

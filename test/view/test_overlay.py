@@ -2,6 +2,7 @@
 """Puppets drawn over images."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ def square(x: float, y: float, side: float) -> np.ndarray:
     return np.array([(x, y), (x + side, y), (x + side, y + side), (x, y + side)], float)
 
 
-def puppet(**changes) -> DrawnPuppet:
+def puppet(**changes: Any) -> DrawnPuppet:
     values = {
         "id": "a1",
         "joint_names": ("left_wrist", "right_wrist"),
@@ -30,7 +31,7 @@ def puppet(**changes) -> DrawnPuppet:
 IMAGE = np.full((140, 200, 3), 50, np.uint8)
 
 
-def test_parts_are_filled_in_depth_order():
+def test_parts_are_filled_in_depth_order() -> None:
     front = draw_puppets(IMAGE, [puppet()], opacity=1.0, labels=False)
     behind = draw_puppets(IMAGE, [puppet(order=(1, 0))], opacity=1.0, labels=False)
     assert tuple(front[80, 90]) == PART_COLOURS["left_lower_arm"]
@@ -39,14 +40,14 @@ def test_parts_are_filled_in_depth_order():
     assert (IMAGE == 50).all()
 
 
-def test_opacity_mixes_the_part_with_the_image():
+def test_opacity_mixes_the_part_with_the_image() -> None:
     drawn = draw_puppets(IMAGE, [puppet()], opacity=0.5, labels=False)
     expected = (np.array(PART_COLOURS["torso"]) + 50) / 2
     assert np.abs(drawn[55, 60] - expected).max() <= 1
     assert tuple(drawn[130, 190]) == (50, 50, 50)
 
 
-def test_joints_show_side_and_confidence():
+def test_joints_show_side_and_confidence() -> None:
     sure = draw_puppets(IMAGE, [puppet()], labels=False)
     assert tuple(sure[30, 150]) == joint_colour("left_wrist")
     assert tuple(sure[30, 20]) == joint_colour("right_wrist")
@@ -54,32 +55,32 @@ def test_joints_show_side_and_confidence():
     assert (unsure[30, 150] < 60).all() and (unsure[30, 20] < 60).all()
 
 
-def test_unknown_joints_and_bad_contours_are_left_out():
+def test_unknown_joints_and_bad_contours_are_left_out() -> None:
     contours = (np.full((4, 2), np.nan), np.zeros((2, 2)))
     joints = np.array([[np.nan, 3.0], [np.inf, 2.0]])
     assert (draw_puppets(IMAGE, [puppet(contours=contours, joints=joints)]) == IMAGE).all()
 
 
-def test_puppets_outside_the_image_and_grey_images():
+def test_puppets_outside_the_image_and_grey_images() -> None:
     outside = puppet(contours=(square(-500, -500, 60), square(900, 900, 40)), joints=np.full((2, 2), -400.0))
     drawn = draw_puppets(IMAGE[..., 0], [outside], labels=False)
     assert drawn.shape == IMAGE.shape and (drawn == 50).all()
     assert (draw_puppets(IMAGE, []) == IMAGE).all()
 
 
-def test_labels_write_beside_the_puppet():
+def test_labels_write_beside_the_puppet() -> None:
     plain, labelled = (draw_puppets(IMAGE, [puppet()], labels=flag) for flag in (False, True))
     changed = (plain != labelled).any(axis=2)
     assert changed[:, 110:].any() and changed[:, :36].any() and changed[:38].any()
 
 
-def test_scaled_keeps_pixel_centres():
+def test_scaled_keeps_pixel_centres() -> None:
     half = puppet().scaled(0.5)
     assert half.joints[0] == pytest.approx([74.75, 14.75])  # (x + 0.5) / 2 - 0.5
     assert half.contours[0][0] == pytest.approx([19.75, 19.75])
 
 
-def test_from_message_sorts_the_parts_by_depth():
+def test_from_message_sorts_the_parts_by_depth() -> None:
     message = SimpleNamespace(
         id="b2",
         joints=[SimpleNamespace(name="neck", x=1.0, y=2.0, confidence=0.5)],
@@ -95,7 +96,7 @@ def test_from_message_sorts_the_parts_by_depth():
     assert (draw_puppets(IMAGE, [empty]) == IMAGE).all()
 
 
-def test_spread_keeps_order_gap_and_range():
+def test_spread_keeps_order_gap_and_range() -> None:
     places = spread([5, 6, 7, 95], gap=10, low=0, high=100)
     assert np.diff(places).min() >= 10 - 1e-9
     assert spread([5, 40, 80], gap=10, low=0, high=100) == [5, 40, 80]
