@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ament_python package flowing_puppet_ros; pip and colcon both build it from here."""
+
+import re
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = "flowing_puppet_ros"
+HERE = Path(__file__).resolve().parent
+NODES = ("optical_flow", "puppet_tracker", "visual_hull", "body_fitter")
+
+
+def requirements(name: str) -> list[str]:
+    """Return the requirements in requirements/`name`.txt without its comments."""
+    lines = (HERE / "requirements" / f"{name}.txt").read_text().splitlines()
+    return [line for line in lines if line and not line.startswith("#")]
+
+
+def files(pattern: str) -> list[str]:
+    """Return the files that match `pattern`, relative to this folder as setuptools wants them."""
+    return sorted(str(path.relative_to(HERE)) for path in HERE.glob(pattern))
+
+
+setup(
+    name=NAME,
+    version=re.findall(r'__version__ = "(.+)"', (HERE / NAME / "__init__.py").read_text())[0],
+    description="People's pose and body shape from images, clouds and bags, with puppets.",
+    long_description="See README.md.",
+    license="Apache-2.0",
+    maintainer="flowing_puppet_ros maintainers",
+    maintainer_email="maintainers@users.noreply.github.com",
+    packages=find_packages(include=[NAME, f"{NAME}.*"]),
+    package_data={
+        NAME: ["py.typed", "weights/*.npz", "weights/*.md", "interfaces/*/*/*.msg", "interfaces/*/*/*.action"]
+    },
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}/launch", files("launch/*.launch.py")),
+        (f"share/{NAME}/config", files("config/*.yaml")),
+    ],
+    python_requires=">=3.12",
+    install_requires=requirements("runtime"),
+    extras_require={"learn": requirements("learn")},
+    entry_points={
+        "console_scripts": [
+            "flowing-puppet = flowing_puppet_ros.cli:main",
+            *(f"{node} = {NAME}.node.{node}:main" for node in NODES),
+        ],
+    },
+    zip_safe=False,
+)
