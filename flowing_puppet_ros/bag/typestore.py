@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The `rosbags` type store of ROS 2 Jazzy with this package's messages, and a factory of its message objects.
+
+The message definitions are the `.msg` files of the interface packages: installed beside this package they lie in
+`flowing_puppet_ros/definitions/<package>/`, in a source tree in `msg_defs/` and `standins/`. Nothing of ROS is needed.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from flowing_puppet_ros.errors import PuppetError
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+_FOLDERS = {
+    "flowing_puppet_msgs": ("definitions/flowing_puppet_msgs", "../msg_defs/msg"),
+    "hri_msgs": ("definitions/hri_msgs", "../standins/hri_msgs/msg"),
+}
+
+
+def definition_files(package: str) -> tuple[Path, ...]:
+    """Return the `.msg` files of one of our interface packages, sorted by name."""
+    for folder in _FOLDERS[package]:
+        files = sorted((_PACKAGE / folder).glob("*.msg"))
+        if files:
+            return tuple(files)
+    raise PuppetError(f"the message definitions of {package} are missing beside {_PACKAGE}: reinstall the package")
+
+
+@cache
+def typestore() -> Typestore:
+    """Return the store of all types that this package reads or writes (made once)."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    definitions: dict[str, Any] = {}
+    for package in _FOLDERS:
+        for path in definition_files(package):
+            definitions.update(get_types_from_msg(path.read_text("utf8"), f"{package}/msg/{path.stem}"))
+    store.register(definitions)
+    return store
+
+
+class BagMessageFactory:
+    """Makes `rosbags` messages; the counterpart of the factory of rclpy messages in the nodes."""
+
+    def __init__(self) -> None:
+        self._store = typestore()
+
+    def make(self, type_name: str, **values: Any) -> Any:
+        """Make a message of type `package/msg/Name`; fields without a value are zero, empty or False."""
+        fields = dict(self._store.fielddefs[type_name][1])
+        for name in values:
+            if name not in fields:
+                raise TypeError(f"{type_name} has no field {name!r}")
+        filled = {name: self._value(kind, values.get(name)) for name, kind in fields.items()}
+        return self._store.types[type_name](**filled)
+
+    def _value(self, kind: tuple[int, Any], value: Any) -> Any:
+        node, detail = kind
+        if node == Nodetype.BASE:
+            return _scalar(detail[0], value)
+        if node == Nodetype.NAME:
+            return self.make(detail) if value is None else value
+        (element, element_detail), count = detail
+        if element == Nodetype.BASE and element_detail[0] != "string":
+            length = count if node == Nodetype.ARRAY else 0
+            dtype = np.dtype(element_detail[0])
+            return np.zeros(length, dtype) if value is None else np.ascontiguousarray(value, dtype).reshape(-1)
+        if value is None:
+            if node == Nodetype.ARRAY:
+                return [self._value((element, element_detail), None) for _ in range(count)]
+            return []
+        return list(value)
+
+
+def _scalar(name: str, value: Any) -> Any:
+    if name == "string":
+        return "" if value is None else str(value)
+    if name == "bool":
+        return bool(value)
+    if name.startswith("float"):
+        return 0.0 if value is None else float(value)
+    return 0 if value is None else int(value)

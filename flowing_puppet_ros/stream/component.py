@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What every stream component is: ports, settings, counters, and messages in and out.
+
+A live node wraps one component and so does the bag replay: a component converts messages, keeps what it must wait
+for, runs one algorithm object and returns the messages to publish. It knows no clock and no middleware, so the same
+messages give the same answers live and replayed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.settings import Settings
+from flowing_puppet_ros.stream.messages import MessageFactory
+
+Output = list[tuple[str, Any]]
+
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+PUPPETS = "flowing_puppet_msgs/msg/PuppetArray"
+BODIES = "flowing_puppet_msgs/msg/BodyArray"
+
+
+@dataclass(frozen=True, slots=True)
+class Port:
+    """One topic of a component: its name relative to the node's namespace, or global when it starts with a slash.
+
+    qos: "sensor" (best effort, what sensors publish), "reliable" or "latched" (transient local).
+    lazy: worth making only when somebody listens. compressed: the same image also travels as CompressedImage on
+    `<name>/compressed`. optional: an input the component works without.
+    """
+
+    name: str
+    type: str
+    qos: str = "reliable"
+    lazy: bool = False
+    compressed: bool = False
+    optional: bool = False
+
+
+class Component:
+    """Base of the stream components."""
+
+    settings_type: ClassVar[type[Settings]]
+    inputs: tuple[Port, ...]
+    outputs: tuple[Port, ...]
+
+    def __init__(self, factory: MessageFactory) -> None:
+        """Make a component whose messages `factory` makes; nobody listens to its lazy outputs yet."""
+        self.factory = factory
+        self.counters: Counter[str] = Counter()
+        self.warnings: list[str] = []
+        self._warned: set[str] = set()
+        self._expected: set[str] = set()
+        self._wanted: set[str] = set()
+
+    def handle(self, port: str, message: Any) -> Output:
+        """Take one message and return the messages that it made ready, in the order they should be published.
+
+        A message that cannot be used (an unknown encoding, an empty cloud) is counted under `unusable` and leaves
+        one sentence in `warnings` for every new reason; the run goes on.
+        """
+        self.counters[f"received {port}"] += 1
+        return self._guarded(port, message)
+
+    def flush(self) -> Output:
+        """Return what was still waiting for a partner when the input ended."""
+        return []
+
+    def reset(self) -> None:
+        """Forget the past: the next message starts a new recording."""
+
+    def expects(self, port: str, expected: bool) -> None:
+        """Say whether anybody publishes on an optional input, so that the component knows what to wait for."""
+        self._switch(self._expected, self.inputs, port, expected)
+
+    def wants(self, port: str, wanted: bool) -> None:
+        """Say whether anybody listens to a lazy output."""
+        self._switch(self._wanted, self.outputs, port, wanted)
+
+    def drain_warnings(self) -> list[str]:
+        """Return the sentences to log that arose since the last call."""
+        warnings, self.warnings = self.warnings, []
+        return warnings
+
+    def _process(self, port: str, message: Any) -> Output:
+        raise NotImplementedError
+
+    def _guarded(self, port: str, message: Any) -> Output:
+        try:
+            return self._process(port, message)
+        except InputError as error:
+            self._warn(str(error))
+            self.counters["unusable"] += 1
+            return []
+
+    def _warn(self, sentence: str) -> None:
+        """Log `sentence` once in the component's life; sentences that differ in their numbers only are the same."""
+        reason = re.sub(r"[0-9.]+", "#", sentence)
+        if reason not in self._warned:
+            self._warned.add(reason)
+            self.warnings.append(sentence)
+
+    @staticmethod
+    def _switch(switches: set[str], ports: Iterable[Port], port: str, on: bool) -> None:
+        if port not in {item.name for item in ports}:
+            raise ValueError(f"no port {port!r}")
+        (switches.add if on else switches.discard)(port)

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images to and from ROS messages: raw, compressed, label and flow images (REP-118 and sensor_msgs/image_encodings)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.stream.messages import MessageFactory
+
+JPEG_QUALITY = 85
+
+# encoding -> (channels, bytes a channel, OpenCV conversion to RGB)
+_RAW: dict[str, tuple[int, int, int | None]] = {
+    "rgb8": (3, 1, None),
+    "bgr8": (3, 1, cv2.COLOR_BGR2RGB),
+    "8uc3": (3, 1, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, 1, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, 1, cv2.COLOR_BGRA2RGB),
+    "8uc4": (4, 1, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, 1, cv2.COLOR_GRAY2RGB),
+    "8uc1": (1, 1, cv2.COLOR_GRAY2RGB),
+    "mono16": (1, 2, cv2.COLOR_GRAY2RGB),
+    "yuv422": (2, 1, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, 1, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (2, 1, cv2.COLOR_YUV2RGB_YUY2),
+    "bayer_rggb8": (1, 1, cv2.COLOR_BayerRGGB2RGB),
+    "bayer_bggr8": (1, 1, cv2.COLOR_BayerBGGR2RGB),
+    "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGBRG2RGB),
+    "bayer_grbg8": (1, 1, cv2.COLOR_BayerGRBG2RGB),
+}
+
+
+def message_bytes(data: Any) -> NDArray[np.uint8]:
+    """View the uint8[] field of any message flavour as an array, without a copy."""
+    return data.view(np.uint8) if isinstance(data, np.ndarray) else np.frombuffer(memoryview(data), np.uint8)
+
+
+def decode_image(message: Any) -> NDArray[np.uint8]:
+    """Return the (H,W,3) RGB image of an Image or a CompressedImage; InputError in one sentence when it has none."""
+    if hasattr(message, "format"):
+        return _decode_compressed(message)
+    encoding = message.encoding.lower()
+    if encoding not in _RAW:
+        raise InputError(f"the image encoding {message.encoding!r} is not one of {', '.join(_RAW)}")
+    channels, size, conversion = _RAW[encoding]
+    pixels = _rows(message, channels, np.dtype("u1" if size == 1 else ">u2" if message.is_bigendian else "<u2"))
+    if size == 2:
+        pixels = (pixels >> 8).astype(np.uint8)
+    if conversion is None:
+        return np.ascontiguousarray(pixels)
+    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
+
+
+def _decode_compressed(message: Any) -> NDArray[np.uint8]:
+    data = message_bytes(message.data)
+    if "compresseddepth" in message.format.lower().replace(" ", ""):
+        raise InputError(f"the compressed image format {message.format!r} is a depth image, not a picture")
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(data, flags) if len(data) else None
+    if image is None:
+        raise InputError(f"a compressed image of format {message.format!r} and {len(data)} bytes cannot be decoded")
+    return np.asarray(image, np.uint8)
+
+
+def _rows(message: Any, channels: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the pixels (H,W) or (H,W,channels) of a raw Image without the padding of its rows."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    data = message_bytes(message.data)
+    needed = width * channels * dtype.itemsize
+    if height < 1 or width < 1 or step < needed or len(data) < step * (height - 1) + needed:
+        raise InputError(f"an image of {width}x{height} {message.encoding} has step {step} and {len(data)} bytes")
+    rows = np.lib.stride_tricks.as_strided(data, (height, needed), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(rows).view(dtype)
+    return pixels if channels == 1 else pixels.reshape(height, width, channels)
+
+
+def decode_labels(message: Any) -> NDArray[np.uint8]:
+    """Return the (H,W) labels of a mono8 Image."""
+    if message.encoding.lower() not in ("mono8", "8uc1"):
+        raise InputError(f"part labels come as mono8, not as {message.encoding!r}")
+    return np.asarray(_rows(message, 1, np.dtype("u1")))
+
+
+def decode_flow(message: Any) -> NDArray[np.float32]:
+    """Return the (H,W,2) flow of a 32FC2 Image: pixels, +x right, +y down, NaN where unknown."""
+    if message.encoding.upper() != "32FC2":
+        raise InputError(f"optical flow comes as 32FC2, not as {message.encoding!r}")
+    pixels = _rows(message, 2, np.dtype(">f4" if message.is_bigendian else "<f4"))
+    return pixels.astype(np.float32, copy=False)
+
+
+def make_image(factory: MessageFactory, header: Any, pixels: NDArray[Any], encoding: str) -> Any:
+    """Return an Image of (H,W) or (H,W,C) pixels whose type fits `encoding`."""
+    little = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+    return factory.make(
+        "sensor_msgs/msg/Image",
+        header=header,
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding=encoding,
+        is_bigendian=0,
+        step=little.nbytes // pixels.shape[0],
+        data=little.reshape(-1).view(np.uint8),
+    )
+
+
+def compress(factory: MessageFactory, message: Any) -> Any:
+    """Return the CompressedImage (JPEG) of an rgb8 Image."""
+    rgb = decode_image(message)
+    return factory.make(
+        "sensor_msgs/msg/CompressedImage", header=message.header, format="rgb8; jpeg compressed bgr8", data=jpeg(rgb)
+    )
+
+
+def jpeg(rgb: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> NDArray[np.uint8]:
+    """Return the bytes of the JPEG file of an (H,W,3) RGB image."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise InputError(f"an image of shape {rgb.shape} cannot be written as JPEG")
+    return np.asarray(data, np.uint8).reshape(-1)

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairing of several inputs by their stamps, whatever order they arrive in."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter
+from typing import Any
+
+BACKWARD_JUMP_NS = 100_000_000
+"""A stamp this much before its predecessor on the same input is a restart of the recording, not disorder."""
+
+
+class _Queue:
+    """Items of one input that wait for their partners, by increasing stamp."""
+
+    def __init__(self) -> None:
+        self.stamps: list[int] = []
+        self.items: list[Any] = []
+        self.last: int | None = None
+
+    def drop(self, count: int) -> None:
+        del self.stamps[:count]
+        del self.items[:count]
+
+    def forget_after(self, stamp: int) -> int:
+        keep = bisect_left(self.stamps, stamp + 1)
+        lost = len(self.stamps) - keep
+        del self.stamps[keep:]
+        del self.items[keep:]
+        return lost
+
+    def nearest(self, stamp: int, final: bool) -> int | None:
+        """Index of the item nearest to `stamp` (the earlier of two as near), None while a nearer one may come."""
+        after = bisect_left(self.stamps, stamp)
+        if after == len(self.stamps):
+            return after - 1 if final else None
+        if after and stamp - self.stamps[after - 1] <= self.stamps[after] - stamp:
+            return after - 1
+        return after
+
+
+class Pairing:
+    """Makes sets of one item an input.
+
+    The first name leads: each of its items is joined with the nearest item of every other input, if all lie within
+    `slop_ns`; no item is used twice and sets come in the order of their stamps. A set is made as soon as no later
+    message can change it, so the sets do not depend on how the inputs interleave as long as no more than `depth`
+    items an input wait. What finds no partner is counted in `counters`: `unpaired` (its partners came and were too
+    far or used up), `dropped` (more than `depth` waited), `disordered` (stamp not after the one before on the same
+    input), `restarts` (stamp more than BACKWARD_JUMP_NS back: everything later than it is forgotten).
+    """
+
+    def __init__(self, names: tuple[str, ...], slop_ns: int = 0, depth: int = 60) -> None:
+        """Pair the inputs `names`, of which the first leads."""
+        self._queues = {name: _Queue() for name in names}
+        self._leader = names[0]
+        self._slop = slop_ns
+        self._depth = depth
+        self.counters: Counter[str] = Counter()
+
+    def add(self, name: str, stamp: int, item: Any) -> list[dict[str, tuple[int, Any]]]:
+        """Take one item and return the sets, name -> (stamp, item), that are now complete."""
+        queue = self._queues[name]
+        if queue.last is not None and stamp <= queue.last:
+            if queue.last - stamp < BACKWARD_JUMP_NS:
+                self.counters["disordered"] += 1
+                return []
+            self.counters["restarts"] += 1
+            for other in self._queues.values():
+                self.counters["unpaired"] += other.forget_after(stamp + BACKWARD_JUMP_NS)
+        queue.last = stamp
+        queue.stamps.append(stamp)
+        queue.items.append(item)
+        sets = self._complete(final=False)
+        if len(queue.stamps) > self._depth:
+            queue.drop(1)
+            self.counters["dropped"] += 1
+        return sets
+
+    def flush(self) -> list[dict[str, tuple[int, Any]]]:
+        """Return the sets of what waits, as if nothing more came, and forget the rest."""
+        sets = self._complete(final=True)
+        for queue in self._queues.values():
+            self.counters["unpaired"] += queue.forget_after(-1)
+        return sets
+
+    def reset(self) -> None:
+        """Forget everything that waits."""
+        self._queues = {name: _Queue() for name in self._queues}
+
+    def _complete(self, final: bool) -> list[dict[str, tuple[int, Any]]]:
+        sets = []
+        leader = self._queues[self._leader]
+        while leader.stamps:
+            stamp = leader.stamps[0]
+            indices = {name: queue.nearest(stamp, final) for name, queue in self._queues.items()}
+            if any(index is None for index in indices.values()):
+                break
+            if any(index < 0 or abs(self._queues[name].stamps[index] - stamp) > self._slop
+                   for name, index in indices.items()):
+                leader.drop(1)
+                self.counters["unpaired"] += 1
+                continue
+            sets.append({name: (q.stamps[indices[name]], q.items[indices[name]]) for name, q in self._queues.items()})
+            for name, queue in self._queues.items():
+                self.counters["unpaired"] += indices[name]
+                queue.drop(indices[name] + 1)
+        return sets
