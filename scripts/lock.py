@@ -7,7 +7,9 @@ import sys
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parent.parent / "requirements"
-HEADER = "# SPDX-License-Identifier: Apache-2.0\n# Exact versions of what `make venv` installs; `make lock` writes this file.\n"
+HEADER = """# SPDX-License-Identifier: Apache-2.0
+# Exact versions of what `make venv` installs; `make lock` writes this file.
+"""
 
 
 def main() -> None:
