@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Outlines of projected body parts: part mesh -> filled silhouette -> closed contour -> each side of the bone resampled.
+
+Thesis, chapter "Deformable Structure Model", section "Learning".
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+RESOLUTION = 500.0
+"""Pixels per metre at which silhouettes are drawn: 2 mm a pixel."""
+
+_SMOOTHING = 2.0  # pixels
+_CLEFT = 0.025  # metres
+
+
+@njit(cache=True)
+def _fill(points: NDArray[np.float64], triangles: NDArray[np.int32], mask: NDArray[np.uint8]) -> None:
+    height, width = mask.shape
+    for face in range(triangles.shape[0]):
+        a, b, c = points[triangles[face, 0]], points[triangles[face, 1]], points[triangles[face, 2]]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
+        if area == 0.0:
+            continue
+        sign = 1.0 if area > 0.0 else -1.0
+        top = max(0, int(np.ceil(min(a[1], b[1], c[1]))))
+        bottom = min(height - 1, int(np.floor(max(a[1], b[1], c[1]))))
+        left = max(0, int(np.ceil(min(a[0], b[0], c[0]))))
+        right = min(width - 1, int(np.floor(max(a[0], b[0], c[0]))))
+        for y in range(top, bottom + 1):
+            for x in range(left, right + 1):
+                if (
+                    sign * ((b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])) >= 0.0
+                    and sign * ((c[0] - b[0]) * (y - b[1]) - (c[1] - b[1]) * (x - b[0])) >= 0.0
+                    and sign * ((a[0] - c[0]) * (y - c[1]) - (a[1] - c[1]) * (x - c[0])) >= 0.0
+                ):
+                    mask[y, x] = 1
+
+
+def silhouette(points: NDArray[np.float64], triangles: NDArray[np.int32], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Fill every projected triangle, whichever way it faces.
+
+    `points` (V, 2) pixels, `triangles` (F, 3), `shape` (H, W). Returns (H, W) uint8: 1 where a pixel's centre is
+    covered, edges included.
+    """
+    mask = np.zeros(shape, np.uint8)
+    _fill(np.ascontiguousarray(points, np.float64), np.ascontiguousarray(triangles, np.int32), mask)
+    return mask
+
+
+def closed_contour(
+    points: NDArray[np.float64], triangles: NDArray[np.int32], resolution: float = RESOLUTION
+) -> NDArray[np.float64]:
+    """Return the outer contour of the largest piece of the silhouette of a projected part mesh.
+
+    `points` (V, 2) in metres (only those that `triangles` (F, 3) name count), `resolution` in pixels per metre.
+    Returns (K, 2) metres, closed (the last point is joined to the first), free of the steps of the pixel grid; clefts
+    narrower than 25 mm, as between fingers, are filled, because they would dominate the arc length.
+    Raises ValueError when the projection covers nothing.
+    """
+    used = points[np.unique(triangles)]
+    cleft = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * int(_CLEFT * resolution / 2) + 1,) * 2)
+    margin = len(cleft) + 2
+    origin = used.min(axis=0) - margin / resolution
+    width, height = np.ceil((used.max(axis=0) - origin) * resolution).astype(int) + margin
+    mask = silhouette((points - origin) * resolution, triangles, (height, width))
+    mask = cv2.morphologyEx(mask, cv2.MORPH_CLOSE, cleft)
+    pieces, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    if not pieces or max(map(len, pieces)) < 8:
+        raise ValueError(f"a part of {len(triangles)} faces covers no area in the projection")
+    piece = max(pieces, key=cv2.contourArea)[:, 0, :].astype(np.float64)
+    return _smooth(piece) / resolution + origin
+
+
+def _smooth(closed: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Circular Gaussian filter along a closed chain of pixels."""
+    reach = int(3 * _SMOOTHING)
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING) ** 2)
+    kernel /= kernel.sum()
+    padded = np.take(closed, np.arange(-reach, len(closed) + reach), axis=0, mode="wrap")
+    return np.stack([np.convolve(padded[:, axis], kernel, "valid") for axis in (0, 1)], axis=1)
+
+
+def resample_sides(
+    contour: NDArray[np.float64], proximal: NDArray[np.float64], distal: NDArray[np.float64], per_side: int
+) -> NDArray[np.float64]:
+    """Divide a closed contour by the line through the bone and sample each side evenly by arc length.
+
+    `contour` (K, 2); `proximal`, `distal` (2,) bone ends. Returns (2 * per_side, 2) in the part's own frame (origin in
+    the middle of the bone, x from proximal to distal, y a quarter turn on in the sense from image x to image y).
+    Row 0 is the farthest crossing of the bone line behind the proximal joint; the side of positive y comes first;
+    row `per_side` is the farthest crossing beyond the distal joint. Raises ValueError when the bone line misses the
+    contour.
+    """
+    local = to_bone_frame(contour, proximal, distal)
+    following = np.roll(local, -1, axis=0)
+    crossing = np.flatnonzero((local[:, 1] >= 0.0) != (following[:, 1] >= 0.0))
+    if len(crossing) < 2:
+        raise ValueError("the line through the bone does not cross the part's contour")
+    share = local[crossing, 1] / (local[crossing, 1] - following[crossing, 1])
+    abscissa = local[crossing, 0] + share * (following[crossing, 0] - local[crossing, 0])
+    first, last = int(np.argmin(abscissa)), int(np.argmax(abscissa))
+    there = _arc(local, crossing[first], crossing[last], abscissa[first], abscissa[last])
+    back = _arc(local, crossing[last], crossing[first], abscissa[last], abscissa[first])
+    if there[:, 1].mean() < back[:, 1].mean():
+        there, back = back[::-1], there[::-1]
+    return np.concatenate([_even(there, per_side), _even(back, per_side)])
+
+
+def to_bone_frame(
+    points: NDArray[np.float64], proximal: NDArray[np.float64], distal: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Express (K, 2) points in the frame with its origin in the middle of the bone and x from proximal to distal."""
+    axis = distal - proximal
+    axis = axis / np.hypot(*axis)
+    moved = points - 0.5 * (proximal + distal)
+    return np.stack([moved @ axis, moved @ np.array([-axis[1], axis[0]])], axis=1)
+
+
+def _arc(closed: NDArray[np.float64], start: int, end: int, start_x: float, end_x: float) -> NDArray[np.float64]:
+    """Points of a closed contour from the crossing after index `start` to the crossing after index `end`."""
+    count = (end - start) % len(closed)
+    inner = np.take(closed, np.arange(start + 1, start + 1 + count), axis=0, mode="wrap")
+    return np.concatenate([[[start_x, 0.0]], inner, [[end_x, 0.0]]])
+
+
+def _even(arc: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Sample `count` points at equal arc length, the first included and the last not."""
+    length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(arc, axis=0).T))])
+    wanted = length[-1] * np.arange(count) / count
+    return np.stack([np.interp(wanted, length, arc[:, axis]) for axis in (0, 1)], axis=1)
