@@ -77,6 +77,11 @@ class Camera:
         """The mean focal length in pixels: pixels per metre at one metre depth."""
         return float(np.sqrt(self.matrix[0, 0] * self.matrix[1, 1]))
 
+    def same_as(self, other: Camera) -> bool:
+        """Whether both cameras project every point to the same pixel."""
+        names = ("matrix", "distortion", "size", "rotation", "translation")
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
+
     def to_camera(self, points: ArrayLike) -> Floats:
         """World points (..., 3) in this camera's frame, metres."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation

@@ -26,10 +26,11 @@ Floats = NDArray[np.float64]
 MIN_VIEWS = 2
 _MAX_VOXELS = 40_000_000
 _BAND = 4.0  # voxels to either side of the surface in which the field is kept
+_BODY_REACH = 1.6  # metres from the middle of a body that no joint exceeds
 _PADDING = 3  # voxels around the carved body in which the field is smoothed
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class HullSettings(Settings):
     """How the visual hull is carved."""
 
@@ -37,10 +38,8 @@ class HullSettings(Settings):
     tolerance: float = setting(
         0.005, "how far outside a silhouette a voxel may lie and still be kept", unit="m", low=-0.1, high=0.2
     )
-    smoothing: float = setting(
-        0.7, "spread of the smoothing of the distance field", unit="voxels", low=0.3, high=3.0
-    )
-    margin: float = setting(0.25, "space around the joints that is searched for the body", unit="m", low=0.05, high=2.0)
+    smoothing: float = setting(0.7, "spread of the smoothing of the distance field", unit="voxels", low=0.3, high=3.0)
+    margin: float = setting(0.3, "space around the joints that is searched for the body", unit="m", low=0.05, high=2.0)
 
 
 def visual_hull(
@@ -60,7 +59,9 @@ def visual_hull(
     settings = settings or HullSettings()
     corners = _checked_bounds(bounds, settings.voxel)
     views = [
-        _View.of(camera, mask) for camera, mask in zip(cameras, _checked_masks(cameras, masks), strict=True) if mask.any()
+        _View.of(camera, mask)
+        for camera, mask in zip(cameras, _checked_masks(cameras, masks), strict=True)
+        if mask.any()
     ]
     if len(views) < MIN_VIEWS:
         raise PuppetError(f"a visual hull needs the silhouettes of at least {MIN_VIEWS} cameras, got {len(views)}")
@@ -72,10 +73,13 @@ def visual_hull(
 
 
 def bounds_of_joints(joints: ArrayLike, margin: float) -> Floats | None:
-    """The box (2,3) around the finite ones of `joints` (J,3) with `margin` metres about; None when all are NaN."""
+    """The box (2,3) with `margin` metres about `joints` (J,3); None when one is NaN or they are no one body's."""
     points = np.asarray(joints, np.float64)
-    points = points[np.isfinite(points).all(axis=1)]
-    return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin]) if len(points) else None
+    if len(points) == 0 or not np.isfinite(points).all():
+        return None
+    if np.linalg.norm(points - np.median(points, axis=0), axis=1).max() > _BODY_REACH:
+        return None
+    return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
 
 
 def bounds_of_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]], margin: float) -> Floats:
@@ -97,7 +101,9 @@ def bounds_of_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]
     middle = np.linalg.lstsq(normal, right)[0]
     depths = np.array([camera.to_camera(middle)[2] for camera, _ in views])
     if (depths <= 0).any():
-        raise PuppetError("the silhouettes' rays do not meet in front of the cameras; check the extrinsics on /tf_static")
+        raise PuppetError(
+            "the silhouettes' rays do not meet in front of the cameras; check the extrinsics on /tf_static"
+        )
     spans = [np.ptp(filled, axis=0).max() / camera.focal for camera, filled in views]
     reach = 0.5 * float((np.array(spans) * depths).max()) + margin
     return np.stack([middle - reach, middle + reach])

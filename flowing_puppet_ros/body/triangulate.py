@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 _REFINEMENTS = 8
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TriangulationSettings(Settings):
     """When views agree on a joint."""
 

@@ -20,7 +20,7 @@ _NEW_SCENE_SHARE = 0.5
 _NEW_SCENE_FRAMES = 3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class BackgroundSettings(Settings):
     """How the background of one camera is learned."""
 
@@ -32,8 +32,8 @@ class Background:
     """Running mean and variance of every pixel over the frames in which it lay outside the people (causal).
 
     A person who never leaves a pixel keeps it unknown, so somebody who walks on the spot does not become background,
-    as happens with a plain median. When more than half of the bare pixels differ from what is known for three frames
-    on end (the camera moved, the light changed), everything is forgotten.
+    as happens with a plain median. A frame in which more than half of the bare pixels differ from what is known is not
+    learned; with the third such frame on end (the camera moved, the light changed) everything older is forgotten.
     """
 
     def __init__(self, settings: BackgroundSettings | None = None) -> None:
@@ -55,7 +55,12 @@ class Background:
             self.count = np.zeros(image.shape[:2], np.int32)
             self.mean = np.zeros(image.shape, np.float32)
             self.variance = np.zeros(image.shape, np.float32)
-        self._forget_other_scene(image, bare)
+        if not self._same_scene(image, bare):
+            self._changed_frames += 1
+            if self._changed_frames < _NEW_SCENE_FRAMES:
+                return
+            self.count[:] = 0
+        self._changed_frames = 0
         _update(self.count, self.mean, self.variance, np.ascontiguousarray(image), bare, self.settings.memory)
 
     @property
@@ -67,17 +72,13 @@ class Background:
         """Largest channel difference (h,w) in grey levels, and the spread (h,w) of the background in that channel."""
         return _difference(self.mean, self.variance, np.ascontiguousarray(image))
 
-    def _forget_other_scene(self, image: Images, bare: NDArray[np.bool_]) -> None:
+    def _same_scene(self, image: Images, bare: NDArray[np.bool_]) -> bool:
         judged = bare & self.known
         if not judged.any():
-            return
+            return True
         levels, spread = self.difference(image)
         changed = (levels > _CHANGED_LEVELS) & (levels > _CHANGED_SPREADS * (spread + 1))
-        share = np.count_nonzero(changed & judged) / np.count_nonzero(judged)
-        self._changed_frames = self._changed_frames + 1 if share > _NEW_SCENE_SHARE else 0
-        if self._changed_frames >= _NEW_SCENE_FRAMES:
-            self.count[:] = 0
-            self._changed_frames = 0
+        return bool(np.count_nonzero(changed & judged) <= _NEW_SCENE_SHARE * np.count_nonzero(judged))
 
 
 @njit(cache=True)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.background import Background, BackgroundSettings
-from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.settings import setting
 
 Mask = NDArray[np.uint8]
 
@@ -36,17 +36,18 @@ _AREA_HISTORY = 31
 _AREA_MIN_HISTORY = 5
 
 
-@dataclass(frozen=True, slots=True)
-class SilhouetteSettings(Settings):
-    """How silhouettes are cut out."""
+@dataclass(frozen=True)
+class SilhouetteSettings(BackgroundSettings):
+    """How silhouettes are cut out, and how the background is learned."""
 
     max_side: int = setting(480, "longest image side that silhouettes are cut at", unit="px", low=64, high=8192)
     cut_rounds: int = setting(2, "GrabCut rounds", low=1, high=10)
     area_change: float = setting(
-        0.35, "a mask whose area differs from its running median by more than this share is not used", low=0.05, high=10.0
+        0.35,
+        "a mask whose area differs from its running median by more than this share is not used",
+        low=0.05,
+        high=10.0,
     )
-    min_frames: int = setting(3, "bare frames after which a background pixel is known", unit="frames", low=2, high=1000)
-    memory: int = setting(200, "frames after which old background fades", unit="frames", low=2, high=100000)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -75,7 +76,7 @@ class SilhouetteEstimator:
     def __init__(self, settings: SilhouetteSettings | None = None) -> None:
         """Know no background yet."""
         self.settings = settings or SilhouetteSettings()
-        self.background = Background(BackgroundSettings(self.settings.min_frames, self.settings.memory))
+        self.background = Background(self.settings)
         self._areas: deque[float] = deque(maxlen=_AREA_HISTORY)
 
     def reset(self) -> None:
@@ -147,7 +148,9 @@ def _check(image: NDArray[np.uint8], labels: NDArray[np.uint8], scale: float) ->
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise InputError(f"a silhouette needs an RGB image (H, W, 3) of uint8, got {image.shape} of {image.dtype}")
     if labels.shape != image.shape[:2] or labels.dtype != np.uint8:
-        raise InputError(f"part labels are {labels.shape} of {labels.dtype}, the image needs {image.shape[:2]} of uint8")
+        raise InputError(
+            f"part labels are {labels.shape} of {labels.dtype}, the image needs {image.shape[:2]} of uint8"
+        )
     if not (np.isfinite(scale) and scale > 0):
         raise InputError(f"the puppet's scale is {scale}; it must be a positive number of pixels per metre")
 

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From the tracked puppets of several calibrated cameras to triangulated joints and a visual hull."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.body.camera import Camera
+from flowing_puppet_ros.body.hull import MIN_VIEWS, HullSettings, bounds_of_joints, bounds_of_masks, visual_hull
+from flowing_puppet_ros.body.triangulate import TriangulationSettings, triangulate
+from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.image.silhouette import Observation, Silhouette, SilhouetteEstimator, SilhouetteSettings
+
+Floats = NDArray[np.float64]
+
+
+# The parts of a composed settings class must not be slotted: Python cannot merge the layouts of several slotted bases.
+@dataclass(frozen=True)
+class HullBuilderSettings(HullSettings, SilhouetteSettings, TriangulationSettings):
+    """Everything that leads from puppets to a hull."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PuppetView:
+    """What one camera contributes to a set: its observed frame, and the joints of the puppet in it.
+
+    `joints` (J,2) are pixels of the camera's full image, NaN where unknown; `confidence` (J,) is in [0,1].
+    """
+
+    observation: Observation
+    joints: Floats
+    confidence: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HullSet:
+    """What one synchronised set gives, in the world frame of the cameras' extrinsics, metres.
+
+    `points` (N,3) and outward `normals` (N,3) of the hull, empty when there is none and `problem` says why in one
+    sentence; `joints` (J,3) and `confidence` (J,), NaN and 0 where fewer than two views agree; the `silhouettes`.
+    """
+
+    points: Floats
+    normals: Floats
+    joints: Floats
+    confidence: Floats
+    silhouettes: dict[str, Silhouette]
+    problem: str = ""
+
+
+class HullBuilder:
+    """Keeps the cameras and their backgrounds, and builds the hull of one person for each set that is asked for.
+
+    Every frame of every camera goes through `observe`, which is cheap; `build` takes the observations of one instant.
+    """
+
+    def __init__(self, settings: HullBuilderSettings | None = None) -> None:
+        """Know no camera yet."""
+        self.settings = settings or HullBuilderSettings()
+        self.cameras: dict[str, Camera] = {}
+        self._estimators: dict[str, SilhouetteEstimator] = {}
+
+    def set_camera(self, name: str, camera: Camera) -> None:
+        """Take a camera's calibration; when a known camera's changes, its background is forgotten."""
+        known = self.cameras.get(name)
+        if known is not None and not known.same_as(camera):
+            self._estimators.pop(name, None)
+        self.cameras[name] = camera
+
+    def reset(self) -> None:
+        """Forget all backgrounds, as after a jump back in time; the calibrations stay."""
+        self._estimators.clear()
+
+    def background_share(self, name: str) -> float:
+        """The share of camera `name`'s image whose background is known, 0 to 1."""
+        estimator = self._estimators.get(name)
+        return float(estimator.background.known.mean()) if estimator and estimator.background.count.size else 0.0
+
+    def observe(self, name: str, image: NDArray[np.uint8], labels: NDArray[np.uint8], scale: float) -> Observation:
+        """Learn camera `name`'s background from a frame; see `SilhouetteEstimator.observe` for the arguments.
+
+        Raises InputError when the image has another size than the camera's calibration.
+        """
+        camera = self.cameras.get(name)
+        if camera is not None and image.shape[1::-1] != camera.size:
+            raise InputError(
+                f"the image of camera {name} is {image.shape[1]} x {image.shape[0]}, "
+                f"its camera_info says {camera.size[0]} x {camera.size[1]}"
+            )
+        if name not in self._estimators:
+            self._estimators[name] = SilhouetteEstimator(self.settings)
+        return self._estimators[name].observe(image, labels, scale)
+
+    def build(self, views: Mapping[str, PuppetView]) -> HullSet:
+        """Triangulate the joints and carve the hull of one set; cameras with an unusable mask are left out.
+
+        `views` maps camera names to what they saw at one instant. Raises InputError for a camera without
+        calibration.
+        """
+        missing = sorted(set(views) - set(self.cameras))
+        if missing:
+            raise InputError(f"camera {missing[0]} has no calibration; is its camera_info published?")
+        silhouettes = {name: self._estimators[name].cut(view.observation) for name, view in views.items()}
+        joints, confidence = self._joints(views)
+        empty = np.zeros((0, 3))
+        usable = [name for name, silhouette in silhouettes.items() if not silhouette.problem]
+        if len(usable) < MIN_VIEWS:
+            reasons = "; ".join(f"{name}: {each.problem}" for name, each in silhouettes.items() if each.problem)
+            problem = f"a visual hull needs {MIN_VIEWS} usable silhouettes, got {len(usable)} ({reasons})"
+            return HullSet(empty, empty, joints, confidence, silhouettes, problem)
+        cameras = [self.cameras[name] for name in usable]
+        masks = [silhouettes[name].mask for name in usable]
+        try:
+            bounds = bounds_of_joints(joints, self.settings.margin)
+            if bounds is None:
+                bounds = bounds_of_masks(cameras, masks, self.settings.margin)
+            points, normals = visual_hull(cameras, masks, bounds, self.settings)
+        except PuppetError as error:
+            return HullSet(empty, empty, joints, confidence, silhouettes, str(error))
+        return HullSet(points, normals, joints, confidence, silhouettes)
+
+    def _joints(self, views: Mapping[str, PuppetView]) -> tuple[Floats, Floats]:
+        if len(views) < MIN_VIEWS:
+            count = max((len(view.joints) for view in views.values()), default=0)
+            return np.full((count, 3), np.nan), np.zeros(count)
+        pixels = np.stack([view.joints for view in views.values()])
+        weights = np.stack([view.confidence for view in views.values()])
+        return triangulate([self.cameras[name] for name in views], pixels, weights, self.settings)
