@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Outlines of projected body parts: part mesh -> filled silhouette -> closed contour -> each side of the bone resampled.
+"""Outlines of projected body parts: mesh -> filled silhouette -> closed contour -> each side of the bone resampled.
 
 Thesis, chapter "Deformable Structure Model", section "Learning".
 """

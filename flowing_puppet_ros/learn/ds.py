@@ -21,7 +21,7 @@ Array = np.ndarray[Any, Any]
 
 COMPONENTS = 10
 POSES = 1500
-# Standard deviations added to the pairwise variables so that the exact dependence of lengths on shapes stays invertible.
+# Standard deviations added to the pairwise variables: lengths depend exactly on shapes, which cannot be inverted.
 SHAPE_FLOOR, ANGLE_FLOOR, METRE_FLOOR = 0.03, 0.03, 0.003
 
 LENGTH_PAIRS = (

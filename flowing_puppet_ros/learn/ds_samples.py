@@ -146,7 +146,9 @@ def part_faces(body: AnnyBody, tree: PartTree) -> dict[str, Array]:
     return {name: body.triangles[weight[:, part] >= OVERLAP] for part, name in enumerate(tree.names)}
 
 
-def project(vertices: Array, joints: dict[str, Array], faces: dict[str, Array], camera: RandomCamera) -> Projection | None:
+def project(
+    vertices: Array, joints: dict[str, Array], faces: dict[str, Array], camera: RandomCamera
+) -> Projection | None:
     """Project a posed body (V,3); None when a bone is too foreshortened or the torso too far from upright.
 
     The distal points of hands and feet, which are no centres of rotation, are the average of the part's contour.

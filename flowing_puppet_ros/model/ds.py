@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Deformable Structures: the part-based 2D model of body shape and pose (thesis, chapter of that name).
 
-Model space is in metres, x to the right and y down in the image of a camera that sees the person's front; an image point
-is `scale * model + offset` (Eqs. 8 and 9), scale in pixels per metre. From behind, x is mirrored.
+Model space is in metres, x to the right and y down in the image of a camera that sees the person's front; an image
+point is `scale * model + offset` (Eqs. 8 and 9), scale in pixels per metre. From behind, x is mirrored.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class DeformableStructures:
         return {key: np.asarray(value, np.float32) for key, value in arrays.items()}
 
     def sample(self, rng: np.random.Generator) -> PuppetShape:
-        """Draw a puppet in model space, from the torso to the leaves (Eqs. 11-14); its torso is upright at the origin."""
+        """Draw a puppet in model space, from torso to leaves (Eqs. 11-14); the torso is upright at the origin."""
         size = self.shapes[0].basis.shape[2]
         layout = PairLayout(size)
         coefficients = [rng.standard_normal(size)]

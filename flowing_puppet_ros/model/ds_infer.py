@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From joints to part contours: the shape posterior of thesis Eqs. 23-30, precomputed, then each part laid on its bone."""
+"""From joints to part contours: the posterior of thesis Eqs. 23-30, precomputed, then each part laid on its bone."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Joints of the Deformable Structures puppets, and which of them belong to which part (names are the person's sides)."""
+"""Joints of the Deformable Structures puppets and the parts they belong to (left and right are the person's)."""
 
 from __future__ import annotations
 

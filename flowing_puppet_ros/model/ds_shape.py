@@ -177,7 +177,10 @@ def _believe(
         factor = factors[child - 1]
         inner = np.linalg.inv(upward_precision[child] + factor.jj)
         own = factor.ij @ inner
-        message[child] = (factor.ii - own @ factor.ij.T, factor.parent - own @ (upward_information[child] + factor.child))
+        message[child] = (
+            factor.ii - own @ factor.ij.T,
+            factor.parent - own @ (upward_information[child] + factor.child),
+        )
         upward_precision[parent] += message[child][0]
         upward_information[parent] += message[child][1]
     belief_precision, belief_information = upward_precision.copy(), upward_information.copy()
