@@ -39,9 +39,10 @@ DETECTOR_DELAY_NS = 8_000_000
 # The keypoint files lag the videos: file j describes video frame j + 1.
 KEYPOINT_LAG = 1
 BODY_25B = (
-    "Nose LEye REye LEar REar LShoulder RShoulder LElbow RElbow LWrist RWrist LHip RHip LKnee RKnee LAnkle RAnkle "
-    "UpperNeck HeadTop LBigToe LSmallToe LHeel RBigToe RSmallToe RHeel"
-).split()
+    *("Nose", "LEye", "REye", "LEar", "REar", "LShoulder", "RShoulder", "LElbow", "RElbow", "LWrist", "RWrist"),
+    *("LHip", "RHip", "LKnee", "RKnee", "LAnkle", "RAnkle", "UpperNeck", "HeadTop"),
+    *("LBigToe", "LSmallToe", "LHeel", "RBigToe", "RSmallToe", "RHeel"),
+)
 
 
 def sha256(path: Path) -> str:

@@ -59,24 +59,29 @@ class Bag:
             raise InputError(f"{path} is cut off before its end: add --salvage to read what is whole")
         self._reader: Reader | None = None
         if self._salvage:
-            self.topics = self._scan()
+            self.details = self._scan()
             return
         try:
             self._reader = Reader(path)
             self._reader.open()
         except Exception as error:  # a damaged file fails in the libraries in any way
             raise InputError(_no_bag(path)) from error
-        self.topics = {
+        self.details = {
             c.topic: Topic(c.msgtype, c.msgcount, tuple(_qos(q) for q in getattr(c.ext, "offered_qos_profiles", ())))
             for c in self._reader.connections
         }
+
+    @property
+    def topics(self) -> dict[str, str]:
+        """Type of every topic by its name; `details` tells counts and QoS too."""
+        return {name: topic.type for name, topic in self.details.items()}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Record]:
         """Yield the messages of `topics` (all by default) in the order of their log times.
 
         A truncated file is read in the order of its bytes, which is the order of writing.
         """
-        chosen = set(self.topics if topics is None else topics)
+        chosen = set(self.details if topics is None else topics)
         if self._reader is None:
             yield from self._salvaged(chosen)
             return
@@ -92,7 +97,7 @@ class Bag:
     @property
     def count(self) -> int:
         """Number of messages."""
-        return sum(topic.count for topic in self.topics.values())
+        return sum(topic.count for topic in self.details.values())
 
     def close(self) -> None:
         """Close the files."""

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The `rosbags` type store of ROS 2 Jazzy with this package's messages, and a factory of its message objects.
 
-The message definitions are the `.msg` files of the interface packages: installed beside this package they lie in
-`flowing_puppet_ros/definitions/<package>/`, in a source tree in `msg_defs/` and `standins/`. Nothing of ROS is needed.
+The message definitions are the `.msg` files of the interface packages in `interfaces/`. Nothing of ROS is needed.
 """
 
 from __future__ import annotations
@@ -18,20 +17,16 @@ from rosbags.typesys.store import Typestore
 
 from flowing_puppet_ros.errors import PuppetError
 
-_PACKAGE = Path(__file__).resolve().parents[1]
-_FOLDERS = {
-    "flowing_puppet_msgs": ("definitions/flowing_puppet_msgs", "../msg_defs/msg"),
-    "hri_msgs": ("definitions/hri_msgs", "../standins/hri_msgs/msg"),
-}
+_INTERFACES = Path(__file__).resolve().parents[1] / "interfaces"
+_PACKAGES = ("flowing_puppet_msgs", "hri_msgs")
 
 
 def definition_files(package: str) -> tuple[Path, ...]:
-    """Return the `.msg` files of one of our interface packages, sorted by name."""
-    for folder in _FOLDERS[package]:
-        files = sorted((_PACKAGE / folder).glob("*.msg"))
-        if files:
-            return tuple(files)
-    raise PuppetError(f"the message definitions of {package} are missing beside {_PACKAGE}: reinstall the package")
+    """Return the `.msg` files of an interface package that ships with this one, sorted by name."""
+    files = tuple(sorted((_INTERFACES / package / "msg").glob("*.msg")))
+    if not files:
+        raise PuppetError(f"the message definitions {_INTERFACES / package}/msg are missing: reinstall the package")
+    return files
 
 
 @cache
@@ -39,7 +34,7 @@ def typestore() -> Typestore:
     """Return the store of all types that this package reads or writes (made once)."""
     store = get_typestore(Stores.ROS2_JAZZY)
     definitions: dict[str, Any] = {}
-    for package in _FOLDERS:
+    for package in _PACKAGES:
         for path in definition_files(package):
             definitions.update(get_types_from_msg(path.read_text("utf8"), f"{package}/msg/{path.stem}"))
     store.register(definitions)
@@ -84,6 +79,9 @@ def _scalar(name: str, value: Any) -> Any:
         return "" if value is None else str(value)
     if name == "bool":
         return bool(value)
-    if name.startswith("float"):
+    if name == "float32":
+        # A message that travels loses these digits; without a journey it must not keep them.
+        return 0.0 if value is None else float(np.float32(value))
+    if name == "float64":
         return 0.0 if value is None else float(value)
     return 0 if value is None else int(value)

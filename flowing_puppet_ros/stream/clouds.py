@@ -62,9 +62,7 @@ def _records(message: Any, fields: dict[str, Any]) -> NDArray[Any]:
     return np.ascontiguousarray(rows).reshape(-1).view(record)
 
 
-def make_cloud(
-    factory: MessageFactory, header: Any, points: NDArray[Any], normals: NDArray[Any] | None = None
-) -> Any:
+def make_cloud(factory: MessageFactory, header: Any, points: NDArray[Any], normals: NDArray[Any] | None = None) -> Any:
     """Return a dense, unorganised float32 PointCloud2 of points (N,3) in metres and their normals (N,3)."""
     columns = [np.asarray(points, np.float32).reshape(-1, 3)]
     names = ["x", "y", "z"]

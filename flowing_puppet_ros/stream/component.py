@@ -53,8 +53,9 @@ class Component:
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
 
-    def __init__(self, factory: MessageFactory) -> None:
+    def __init__(self, settings: Settings, factory: MessageFactory) -> None:
         """Make a component whose messages `factory` makes; nobody listens to its lazy outputs yet."""
+        self.settings = settings
         self.factory = factory
         self.counters: Counter[str] = Counter()
         self.warnings: list[str] = []
@@ -98,9 +99,12 @@ class Component:
         try:
             return self._process(port, message)
         except InputError as error:
-            self._warn(str(error))
-            self.counters["unusable"] += 1
+            self._unusable(error)
             return []
+
+    def _unusable(self, error: InputError) -> None:
+        self._warn(str(error))
+        self.counters["unusable"] += 1
 
     def _warn(self, sentence: str) -> None:
         """Log `sentence` once in the component's life; sentences that differ in their numbers only are the same."""

@@ -27,10 +27,14 @@ class MessageFactory(Protocol):
         ...
 
 
+def header_ns(header: Any) -> int:
+    """Return the stamp of a header in nanoseconds."""
+    return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec)
+
+
 def stamp_ns(message: Any) -> int:
     """Return the header stamp of `message` in nanoseconds."""
-    stamp = message.header.stamp
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+    return header_ns(message.header)
 
 
 def make_stamp(factory: MessageFactory, nanoseconds: int) -> Any:

@@ -39,6 +39,9 @@ class _Queue:
             return after - 1
         return after
 
+    def near(self, index: int, stamp: int, slop: int) -> bool:
+        return index >= 0 and abs(self.stamps[index] - stamp) <= slop
+
 
 class Pairing:
     """Makes sets of one item an input.
@@ -90,15 +93,17 @@ class Pairing:
         self._queues = {name: _Queue() for name in self._queues}
 
     def _complete(self, final: bool) -> list[dict[str, tuple[int, Any]]]:
-        sets = []
+        sets: list[dict[str, tuple[int, Any]]] = []
         leader = self._queues[self._leader]
         while leader.stamps:
             stamp = leader.stamps[0]
-            indices = {name: queue.nearest(stamp, final) for name, queue in self._queues.items()}
-            if any(index is None for index in indices.values()):
-                break
-            if any(index < 0 or abs(self._queues[name].stamps[index] - stamp) > self._slop
-                   for name, index in indices.items()):
+            indices: dict[str, int] = {}
+            for name, queue in self._queues.items():
+                index = queue.nearest(stamp, final)
+                if index is None:
+                    return sets
+                indices[name] = index
+            if any(not self._queues[name].near(index, stamp, self._slop) for name, index in indices.items()):
                 leader.drop(1)
                 self.counters["unpaired"] += 1
                 continue

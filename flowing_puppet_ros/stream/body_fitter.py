@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Point clouds in, fitted bodies out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.settings import setting
+from flowing_puppet_ros.stream.clouds import decode_cloud, make_cloud
+from flowing_puppet_ros.stream.component import BODIES, POINT_CLOUD, TRANSFORMS, Component, Output, Port
+from flowing_puppet_ros.stream.messages import MessageFactory, make_transform, stamp_ns
+from flowing_puppet_ros.stream.people import Joint, joints_of, make_bodies, make_body
+from flowing_puppet_ros.stream.shapes import make_deletions, make_mesh_marker, make_part_poses, make_topology
+from flowing_puppet_ros.stream.waiting import Line, Shelf
+
+# Rotation of the cloud's frame to one whose z axis points up, by the axis of the cloud's frame that does.
+_UPRIGHT = {
+    "z": np.eye(3),
+    "y": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
+    "-y": np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+}
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class BodyFitterSettings(FitterSettings):
+    """Settings of the fit, and of what the component reads and waits for."""
+
+    model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
+    up: str = setting("z", "axis of the cloud's frame that points up (-y in optical frames)", choices=tuple(_UPRIGHT))
+    view: str = setting("full", "cloud from all sides, or from one sensor at the frame's origin",
+                        choices=("full", "single"))  # fmt: skip
+    wait: int = setting(1, "newer clouds that may come before a cloud goes on without its initial joints",
+                        low=0, high=50)  # fmt: skip
+
+
+class BodyFitterComponent(Component):
+    """Fits a body to each cloud; starts from the joints on `initial` when somebody publishes them.
+
+    Each fit draws its random numbers from the seed and the cloud's stamp, so it does not depend on which clouds came
+    before it or were dropped.
+    """
+
+    settings_type = BodyFitterSettings
+    inputs = (Port("points", POINT_CLOUD, "sensor"), Port("initial", BODIES, optional=True))
+    outputs = (
+        Port("bodies", BODIES),
+        Port("body_meshes", "visualization_msgs/msg/MarkerArray", lazy=True),
+        Port("part_poses", "geometry_msgs/msg/PoseArray"),
+        Port("body_vertices", POINT_CLOUD, lazy=True),
+        Port("body_topology", "shape_msgs/msg/Mesh", "latched"),
+        Port("/tf", TRANSFORMS),
+    )
+
+    def __init__(self, settings: BodyFitterSettings, factory: MessageFactory) -> None:
+        """Load the body model."""
+        super().__init__(settings, factory)
+        self._settings = settings
+        self._model = StitchedPuppet.load(settings.model)
+        self._fitter = BodyFitter(self._model, settings)
+        self._line = Line()
+        self._initial = Shelf()
+        self._shown: dict[str, int] = {}
+        self._topology_sent = False
+
+    def reset(self) -> None:
+        """Forget what waits."""
+        self._line.clear()
+        self._initial.clear()
+
+    def flush(self) -> Output:
+        """Fit the clouds that still wait."""
+        return self._release(final=True)
+
+    def fit(
+        self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None
+    ) -> tuple[Any, list[tuple[str, BodyFit]]]:
+        """Fit the bodies in a PointCloud2 message, one for each body in `initial` (a BodyArray) or else one.
+
+        Returns the BodyArray message and (id, fit) of each of its bodies, in the cloud's frame. InputError in one
+        sentence when the cloud cannot be used.
+        """
+        turn = _UPRIGHT[self._settings.up]
+        points, normals = decode_cloud(cloud)
+        upright = points @ turn.T
+        turned = None if normals is None else normals @ turn.T
+        starts: list[tuple[str, dict[str, Joint] | None]] = [("b1", None)]
+        if initial is not None and initial.bodies:
+            starts = [(body.id or f"b{k + 1}", joints_of(body)) for k, body in enumerate(initial.bodies)]
+        fits = []
+        for identity, joints in starts:
+            fit = self._fitter.fit(
+                upright,
+                turned,
+                initial=None if joints is None else _turned_joints(joints, turn),
+                viewpoint=np.zeros(3) if self._settings.view == "single" else None,
+                seed=seed,
+                progress=progress,
+            )
+            fits.append((identity, _turned_back(fit, turn)))
+        bodies = [make_body(self.factory, identity, self._model, fit) for identity, fit in fits]
+        return make_bodies(self.factory, cloud.header, bodies), fits
+
+    def seed_of(self, stamp: int) -> int:
+        """Return the seed of the fit to the cloud of a stamp (nanoseconds)."""
+        return int(np.random.SeedSequence([self._settings.seed, max(stamp, 0)]).generate_state(1)[0])
+
+    def _process(self, port: str, message: Any) -> Output:
+        stamp = stamp_ns(message)
+        if port == "points":
+            self._line.waiting.append((stamp, message))
+        elif self._line.too_late(stamp):
+            self.counters["late initial"] += 1
+        else:
+            self._initial.put(stamp, message)
+        return self._release(final=False)
+
+    def _release(self, final: bool) -> Output:
+        outputs: Output = []
+        while self._line.waiting:
+            stamp, cloud = self._line.waiting[0]
+            initial = self._initial.get(stamp)
+            crowded = len(self._line.waiting) > self._settings.wait
+            if not (final or crowded or initial is not None or "initial" not in self._expected):
+                break
+            self._line.pop()
+            self._initial.forget_until(stamp)
+            outputs += self._fit_one(stamp, cloud, initial)
+        return outputs
+
+    def _fit_one(self, stamp: int, cloud: Any, initial: Any | None) -> Output:
+        self.counters["clouds"] += 1
+        try:
+            bodies, fits = self.fit(cloud, initial, self.seed_of(stamp))
+        except InputError as error:
+            self._unusable(error)
+            bodies, fits = make_bodies(self.factory, cloud.header, []), []
+        self.counters["bodies"] += len(fits)
+        return [("bodies", bodies), *self._shapes(cloud.header, fits)]
+
+    def _shapes(self, header: Any, fits: list[tuple[str, BodyFit]]) -> Output:
+        outputs: Output = []
+        if fits and not self._topology_sent:
+            self._topology_sent = True
+            outputs.append(("body_topology", make_topology(self.factory, self._model)))
+        states = [fit.state for _, fit in fits]
+        outputs.append(("part_poses", make_part_poses(self.factory, header, states)))
+        if "body_meshes" in self._wanted:
+            outputs.append(("body_meshes", self._markers(header, fits)))
+        if fits and "body_vertices" in self._wanted:
+            vertices = np.vstack([fit.vertices for _, fit in fits])
+            outputs.append(("body_vertices", make_cloud(self.factory, header, vertices)))
+        if fits:
+            pelvis = self._model.joint_names.index("pelvis")
+            frames = [
+                make_transform(self.factory, header, f"body_{identity}", fit.joints[pelvis], fit.state.rotation[0])
+                for identity, fit in fits
+            ]
+            outputs.append(("/tf", self.factory.make(TRANSFORMS, transforms=frames)))
+        return outputs
+
+    def _markers(self, header: Any, fits: list[tuple[str, BodyFit]]) -> Any:
+        gone = [number for identity, number in self._shown.items() if identity not in dict(fits)]
+        markers = make_deletions(self.factory, header, gone)
+        shown: dict[str, int] = {}
+        for identity, fit in fits:
+            shown[identity] = self._shown.get(identity, max([*self._shown.values(), *shown.values()], default=0) + 1)
+            markers.append(make_mesh_marker(self.factory, header, shown[identity], self._model.faces, fit.vertices))
+        self._shown = shown
+        return self.factory.make("visualization_msgs/msg/MarkerArray", markers=markers)
+
+
+def _turned_joints(joints: dict[str, Joint], turn: NDArray[np.float64]) -> dict[str, Joint]:
+    places = {name: turn @ np.array(joint[:3]) for name, joint in joints.items()}
+    return {name: (float(p[0]), float(p[1]), float(p[2]), joints[name][3]) for name, p in places.items()}
+
+
+def _turned_back(fit: BodyFit, turn: NDArray[np.float64]) -> BodyFit:
+    """Return the fit in the cloud's own frame."""
+    state = replace(fit.state, center=fit.state.center @ turn, rotation=turn.T @ fit.state.rotation)
+    return replace(fit, state=state, vertices=fit.vertices @ turn, joints=fit.joints @ turn)

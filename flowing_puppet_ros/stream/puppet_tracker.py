@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images and detections in, flowing puppets out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings
+from flowing_puppet_ros.image.people import TrackerSettings
+from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackResult
+from flowing_puppet_ros.model.ds import DeformableStructures
+from flowing_puppet_ros.settings import setting
+from flowing_puppet_ros.stream.component import IMAGE, PUPPETS, Component, Output, Port
+from flowing_puppet_ros.stream.images import decode_flow, decode_image, make_image
+from flowing_puppet_ros.stream.messages import MessageFactory, header_ns, stamp_ns
+from flowing_puppet_ros.stream.optical_flow import flow_picture
+from flowing_puppet_ros.stream.people import keypoints_of, make_puppets
+from flowing_puppet_ros.stream.waiting import Line, Shelf
+from flowing_puppet_ros.view.overlay import DrawnPuppet, draw_puppets
+
+
+@dataclass(frozen=True)
+class PuppetTrackerSettings(TrackerSettings, FlowSettings):
+    """Settings of the tracker, of the flow it computes, and of what the component waits for and draws."""
+
+    model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
+    parts: int = setting(14, "parts of the puppet: 10, or 14 with hands and feet", low=10, high=14)
+    wait: int = setting(1, "newer images that may come before an image goes on without its detection", low=0, high=50)
+    overlay_side: int = setting(960, "longest side of the overlay", unit="px", low=64, high=8192)
+
+
+class PuppetTrackerComponent(Component):
+    """Tracks the people of one camera.
+
+    An image waits for the detection and the flow of its stamp when somebody publishes them, but not longer than
+    `wait` newer images. Flow that is not published is computed here, and then shown on `flow/preview`.
+    """
+
+    settings_type = PuppetTrackerSettings
+    inputs = (
+        Port("image", IMAGE, "sensor", compressed=True),
+        Port("flow/forward", IMAGE, optional=True),
+        Port("flow/backward", IMAGE, optional=True),
+        Port("detections", PUPPETS, "sensor", optional=True),
+    )
+    outputs = (
+        Port("puppets", PUPPETS),
+        Port("part_labels", IMAGE, lazy=True),
+        Port("overlay", IMAGE, lazy=True, compressed=True),
+        Port("flow/preview", IMAGE, lazy=True, compressed=True),
+        Port("puppet_flow/preview", IMAGE, lazy=True, compressed=True),
+    )
+
+    def __init__(self, settings: PuppetTrackerSettings, factory: MessageFactory) -> None:
+        """Load the body model."""
+        super().__init__(settings, factory)
+        self._settings = settings
+        self._model = DeformableStructures.load(settings.model, settings.parts)
+        self._tracker = FlowingPuppetTracker(self._model, settings, settings)
+        self._line = Line()
+        self._shelves = {port.name: Shelf() for port in self.inputs if port.optional}
+        self._header: Any = None
+
+    def reset(self) -> None:
+        """Forget the people and everything that waits."""
+        self._tracker.reset()
+        self._line.clear()
+        for shelf in self._shelves.values():
+            shelf.clear()
+        self._header = None
+
+    def flush(self) -> Output:
+        """Process the images that still wait."""
+        return self._release(final=True)
+
+    def _process(self, port: str, message: Any) -> Output:
+        stamp = stamp_ns(message)
+        if port == "image":
+            self._line.waiting.append((stamp, message))
+        elif port != "flow/forward" and self._line.too_late(stamp):
+            self.counters[f"late {port}"] += 1
+        else:
+            self._shelves[port].put(stamp, message)
+        return self._release(final=False)
+
+    def _release(self, final: bool) -> Output:
+        outputs: Output = []
+        while self._line.waiting:
+            stamp, message = self._line.waiting[0]
+            crowded = len(self._line.waiting) > self._settings.wait
+            if not (final or crowded or self._ready(stamp)):
+                break
+            self._line.pop()
+            try:
+                outputs += self._step(stamp, message)
+            except InputError as error:
+                self._unusable(error)
+        return outputs
+
+    def _ready(self, stamp: int) -> bool:
+        """Whether everything that is expected for the image of `stamp` is there."""
+        needs = [("detections", stamp)]
+        if self._header is not None:
+            needs += [("flow/backward", stamp), ("flow/forward", header_ns(self._header))]
+        return all(self._shelves[port].get(at) is not None for port, at in needs if port in self._expected)
+
+    def _step(self, stamp: int, message: Any) -> Output:
+        image = decode_image(message)
+        detections = self._shelves["detections"].get(stamp)
+        if detections is None and "detections" in self._expected:
+            self.counters["images without detection"] += 1
+        people = None if detections is None else keypoints_of(detections)
+        result = self._tracker.step(image, stamp, people, self._flow(stamp))
+        for warning in result.warnings:
+            self._warn(warning)
+        earlier, self._header = self._header, message.header
+        self._shelves["detections"].forget_until(stamp)
+        self._shelves["flow/backward"].forget_until(stamp)
+        self._shelves["flow/forward"].forget_until(stamp - 1)
+        self.counters["images"] += 1
+        self.counters["puppets"] += len(result.puppets)
+        return self._publish(message.header, earlier, image, result)
+
+    def _flow(self, stamp: int) -> FlowPair | None:
+        if self._header is None or not {"flow/forward", "flow/backward"} <= self._expected:
+            return None
+        forward = self._shelves["flow/forward"].get(header_ns(self._header))
+        backward = self._shelves["flow/backward"].get(stamp)
+        if forward is None or backward is None:
+            self.counters["images without flow"] += 1
+            return None
+        return decode_flow(forward), decode_flow(backward)
+
+    def _publish(self, header: Any, earlier: Any, image: NDArray[np.uint8], result: TrackResult) -> Output:
+        puppets = make_puppets(self.factory, header, self._model, result.puppets)
+        outputs: Output = [("puppets", puppets)]
+        if "part_labels" in self._wanted:
+            labels = result.labels(image.shape[:2])
+            outputs.append(("part_labels", make_image(self.factory, header, labels, "mono8")))
+        if "overlay" in self._wanted:
+            outputs.append(("overlay", self._overlay(header, image, puppets)))
+        if result.flow is not None and earlier is not None:
+            forward = result.flow[0]
+            if "flow/preview" in self._wanted and "flow/forward" not in self._expected:
+                outputs.append(("flow/preview", flow_picture(self.factory, earlier, [forward])))
+            moved = result.puppet_flow() if "puppet_flow/preview" in self._wanted else None
+            if moved is not None:
+                picture = flow_picture(self.factory, earlier, [forward, moved.field])
+                outputs.append(("puppet_flow/preview", picture))
+        return outputs
+
+    def _overlay(self, header: Any, image: NDArray[np.uint8], puppets: Any) -> Any:
+        factor = min(1.0, self._settings.overlay_side / max(image.shape[:2]))
+        drawn = [DrawnPuppet.from_message(puppet).placed(factor) for puppet in puppets.puppets]
+        if factor < 1:
+            image = np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+        return make_image(self.factory, header, draw_puppets(image, drawn), "rgb8")

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images, part labels and puppets of several calibrated cameras in; visual hull and triangulated joints out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from flowing_puppet_ros.body.camera import Camera
+from flowing_puppet_ros.body.hull import MIN_VIEWS
+from flowing_puppet_ros.body.hull_builder import HullBuilder, HullBuilderSettings, HullSet
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.settings import setting
+from flowing_puppet_ros.stream.clouds import make_cloud
+from flowing_puppet_ros.stream.component import (
+    BODIES,
+    CAMERA_INFO,
+    IMAGE,
+    POINT_CLOUD,
+    PUPPETS,
+    TRANSFORMS,
+    Component,
+    Output,
+    Port,
+)
+from flowing_puppet_ros.stream.images import decode_image, decode_labels
+from flowing_puppet_ros.stream.messages import FrameTree, MessageFactory, make_header, stamp_ns
+from flowing_puppet_ros.stream.pairing import Pairing
+from flowing_puppet_ros.stream.people import make_bodies, make_joints
+from flowing_puppet_ros.stream.views import PersonView, same_person, view_of
+
+_OF_CAMERA = ("image", "part_labels", "puppets")
+
+
+@dataclass(frozen=True)
+class VisualHullSettings(HullBuilderSettings):
+    """Settings of silhouettes, triangulation and hull, and of what the component pairs."""
+
+    cameras: str = setting("", "names of the cameras, separated by commas")
+    frame: str = setting("", "frame of the hull; empty for the topmost frame of the cameras on /tf_static")
+    slop: float = setting(0.008, "largest difference of stamps within one set of images", unit="s", low=0.0, high=1.0)
+    every: int = setting(6, "a hull is built of every so many sets (all teach the background)", low=1, high=10000)
+
+
+class VisualHullComponent(Component):
+    """Carves the hull of one person; its joints are triangulated from the puppets of the same images."""
+
+    settings_type = VisualHullSettings
+    outputs = (Port("hull", POINT_CLOUD), Port("hull/joints", BODIES))
+
+    def __init__(self, settings: VisualHullSettings, factory: MessageFactory) -> None:
+        """Make the ports of the cameras named in the settings; InputError when there are fewer than two."""
+        super().__init__(settings, factory)
+        self._settings = settings
+        self._names = tuple(name for name in (part.strip() for part in settings.cameras.split(",")) if name)
+        if len(self._names) < 2 or len(set(self._names)) < len(self._names):
+            raise InputError(f"cameras is {settings.cameras!r}: a visual hull needs two or more different names")
+        self.inputs = (
+            *(port for name in self._names for port in _ports_of(name)),
+            Port("/tf_static", TRANSFORMS, "latched"),
+        )
+        self._builder = HullBuilder(settings)
+        self._frames = FrameTree()
+        self._infos: dict[str, Any] = {}
+        self._of_camera = {name: Pairing(_OF_CAMERA) for name in self._names}
+        self._sets = Pairing(self._names, round(settings.slop * 1e9))
+        self._last_stamp: int | None = None
+        self._seen = 0
+        self._frame = settings.frame
+
+    def reset(self) -> None:
+        """Forget backgrounds and what waits; calibrations and frames stay."""
+        self._builder.reset()
+        for pairing in (*self._of_camera.values(), self._sets):
+            pairing.reset()
+        self._last_stamp = None
+        self._seen = 0
+
+    def flush(self) -> Output:
+        """Use the sets that still wait."""
+        outputs: Output = []
+        for complete in self._sets.flush():
+            outputs += self._use(complete)
+        self._count_unpaired()
+        return outputs
+
+    def _process(self, port: str, message: Any) -> Output:
+        if port == "/tf_static":
+            self._frames.add(message)
+            return []
+        name, kind = port.rsplit("/", 1)
+        if kind == "camera_info":
+            self._infos[name] = message
+            return []
+        outputs: Output = []
+        for seen in self._of_camera[name].add(kind, stamp_ns(message), message):
+            stamp = seen["image"][0]
+            for complete in self._sets.add(name, stamp, {key: item for key, (_, item) in seen.items()}):
+                outputs += self._use(complete)
+        self._count_unpaired()
+        return outputs
+
+    def _count_unpaired(self) -> None:
+        for pairing, level in ((self._sets, "sets"), *((each, name) for name, each in self._of_camera.items())):
+            for reason, count in pairing.counters.items():
+                self.counters[f"{reason} {level}"] = count
+
+    def _use(self, complete: dict[str, tuple[int, Any]]) -> Output:
+        stamp = complete[self._names[0]][0]
+        if self._last_stamp is not None and stamp < self._last_stamp:
+            self._builder.reset()
+            self.counters["restarts"] += 1
+            self._seen = 0
+        self._last_stamp = stamp
+        self.counters["sets"] += 1
+        due = self._seen % self._settings.every == 0
+        self._seen += 1
+        try:
+            cameras = self._cameras()
+            views = self._views(complete, cameras)
+            if not due or len(views) < MIN_VIEWS:
+                return []
+            found = self._builder.build({name: view.hull_view for name, view in views.items()})
+        except InputError as error:
+            self._unusable(error)
+            return []
+        return self._publish(stamp, next(iter(views.values())).joint_names, found)
+
+    def _cameras(self) -> dict[str, Camera]:
+        """The calibrated cameras; InputError names what is missing."""
+        for name in self._names:
+            info = self._infos.get(name)
+            if info is None:
+                raise InputError(f"no camera_info came yet on {name}/camera_info")
+            frame = info.header.frame_id
+            self._frame = self._frame or self._frames.root(frame.lstrip("/"))
+            pose = self._frames.pose(self._frame, frame)
+            if pose is None:
+                raise InputError(f"/tf_static does not connect the frame {frame!r} of {name} with {self._frame!r}")
+            position, rotation = pose
+            world_to_camera = rotation.T, -rotation.T @ position
+            camera = Camera.from_info(info.k, info.d, info.width, info.height, *world_to_camera, info.distortion_model)
+            self._builder.set_camera(name, camera)
+        return self._builder.cameras
+
+    def _views(self, complete: dict[str, tuple[int, Any]], cameras: dict[str, Camera]) -> dict[str, PersonView]:
+        """Observe the same person in every camera that sees one."""
+        people = {name: list(item["puppets"].puppets) for name, (_, item) in complete.items()}
+        chosen = same_person(cameras, people, self._settings)
+        views = {}
+        for name, puppet in chosen.items():
+            item = complete[name][1]
+            image, labels = decode_image(item["image"]), decode_labels(item["part_labels"])
+            views[name] = view_of(self._builder, name, image, labels, puppet)
+        return views
+
+    def _publish(self, stamp: int, names: tuple[str, ...], found: HullSet) -> Output:
+        header = make_header(self.factory, stamp, self._frame)
+        joints = make_joints(self.factory, names, found.joints, found.confidence)
+        body = self.factory.make(
+            "flowing_puppet_msgs/msg/Body", id="b1", confidence=float(found.confidence.mean()), joints=joints
+        )
+        outputs: Output = [("hull/joints", make_bodies(self.factory, header, [body] if joints else []))]
+        if found.problem:
+            self._warn(found.problem)
+            self.counters["sets without hull"] += 1
+        else:
+            self.counters["hulls"] += 1
+            outputs.append(("hull", make_cloud(self.factory, header, found.points, found.normals)))
+        return outputs
+
+
+def _ports_of(camera: str) -> tuple[Port, ...]:
+    return (
+        Port(f"{camera}/image", IMAGE, "sensor", compressed=True),
+        Port(f"{camera}/part_labels", IMAGE),
+        Port(f"{camera}/puppets", PUPPETS),
+        Port(f"{camera}/camera_info", CAMERA_INFO, "sensor"),
+    )
