@@ -80,7 +80,14 @@ class HullBuilder:
         estimator = self._estimators.get(name)
         return float(estimator.background.known.mean()) if estimator and estimator.background.count.size else 0.0
 
-    def observe(self, name: str, image: NDArray[np.uint8], labels: NDArray[np.uint8], scale: float) -> Observation:
+    def observe(
+        self,
+        name: str,
+        image: NDArray[np.uint8],
+        labels: NDArray[np.uint8],
+        scale: float,
+        person: NDArray[np.uint8] | None = None,
+    ) -> Observation:
         """Learn camera `name`'s background from a frame; see `SilhouetteEstimator.observe` for the arguments.
 
         Raises InputError when the image has another size than the camera's calibration.
@@ -93,7 +100,7 @@ class HullBuilder:
             )
         if name not in self._estimators:
             self._estimators[name] = SilhouetteEstimator(self.settings)
-        return self._estimators[name].observe(image, labels, scale)
+        return self._estimators[name].observe(image, labels, scale, person)
 
     def build(self, views: Mapping[str, PuppetView]) -> HullSet:
         """Triangulate the joints and carve the hull of one set; cameras with an unusable mask are left out.

@@ -18,6 +18,12 @@ _CHANGED_SPREADS = 6.0
 _CHANGED_LEVELS = 25.0
 _NEW_SCENE_SHARE = 0.5
 _NEW_SCENE_FRAMES = 3
+# A value farther than this many grey levels and spreads from the mean is learned as if it were that far.
+_LIKELY_LEVELS = 8.0
+_LIKELY_SPREADS = 3.0
+# A shadow leaves at least this share of the light, and its share differs between channels by no more than this.
+_DARKEST_SHADOW = 0.35
+_SHADOW_TINT = 0.12
 
 
 @dataclass(frozen=True)
@@ -61,7 +67,16 @@ class Background:
                 return
             self.count[:] = 0
         self._changed_frames = 0
-        _update(self.count, self.mean, self.variance, np.ascontiguousarray(image), bare, self.settings.memory)
+        settings = self.settings
+        _update(
+            self.count,
+            self.mean,
+            self.variance,
+            np.ascontiguousarray(image),
+            bare,
+            settings.min_frames,
+            settings.memory,
+        )
 
     @property
     def known(self) -> NDArray[np.bool_]:
@@ -71,6 +86,12 @@ class Background:
     def difference(self, image: Images) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Largest channel difference (h,w) in grey levels, and the spread (h,w) of the background in that channel."""
         return _difference(self.mean, self.variance, np.ascontiguousarray(image))
+
+    def shadow(self, image: Images) -> NDArray[np.bool_]:
+        """Pixels (h,w) that are darker than the background by much the same factor in all channels."""
+        factor = (image + 1.0) / (self.mean + 1.0)
+        darkest, brightest = factor.min(axis=2), factor.max(axis=2)
+        return (brightest < 1) & (darkest > _DARKEST_SHADOW) & (brightest - darkest < _SHADOW_TINT)
 
     def _same_scene(self, image: Images, bare: NDArray[np.bool_]) -> bool:
         judged = bare & self.known
@@ -82,8 +103,11 @@ class Background:
 
 
 @njit(cache=True)
-def _update(count, mean, variance, image, bare, memory):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Welford's update with the count held at `memory`, which turns the mean into an exponential one."""
+def _update(count, mean, variance, image, bare, min_frames, memory):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Welford's update with the count held at `memory`, which turns the mean into an exponential one.
+
+    Once a pixel is known, a value pulls at most as far as a likely one: a limb the puppet misses leaves little trace.
+    """
     height, width, channels = image.shape
     for y in range(height):
         for x in range(width):
@@ -97,8 +121,11 @@ def _update(count, mean, variance, image, bare, memory):  # type: ignore[no-unty
                     variance[y, x, c] = 0.0
                     continue
                 delta = image[y, x, c] - mean[y, x, c]
+                if n > min_frames:
+                    likely = _LIKELY_LEVELS + _LIKELY_SPREADS * np.sqrt(variance[y, x, c])
+                    delta = min(max(delta, -likely), likely)
                 mean[y, x, c] += delta / n
-                variance[y, x, c] += (delta * (image[y, x, c] - mean[y, x, c]) - variance[y, x, c]) / n
+                variance[y, x, c] += (delta * delta * (n - 1) / n - variance[y, x, c]) / n
 
 
 @njit(cache=True)

@@ -24,6 +24,7 @@ Mask = NDArray[np.uint8]
 _SURE_CORE = 0.03  # this far inside the puppet is body
 _POSSIBLE_FRINGE = 0.07  # this far outside the puppet may be body
 _BARE_DISTANCE = 0.10  # farther than this outside the puppet is background
+_STRAY_REACH = 0.7  # how far a limb may lie from where the puppet has it
 _CROP_MARGIN = 0.25  # surroundings that GrabCut learns the colours of the background from
 _SPECK = 0.006  # radius of the opening that removes specks and threads
 
@@ -52,10 +53,15 @@ class SilhouetteSettings(BackgroundSettings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """One frame at working scale: image (h,w,3), puppet (h,w) bool, `scale` in working pixels per metre on the body."""
+    """One frame at working scale.
+
+    `image` (h,w,3), `puppet` (h,w) where the person's puppet lies, `others` (h,w) where only other people's do,
+    `scale` in working pixels per metre on the body.
+    """
 
     image: NDArray[np.uint8]
     puppet: NDArray[np.bool_]
+    others: NDArray[np.bool_]
     scale: float
 
 
@@ -84,53 +90,71 @@ class SilhouetteEstimator:
         self.background.reset()
         self._areas.clear()
 
-    def observe(self, image: NDArray[np.uint8], labels: NDArray[np.uint8], scale: float) -> Observation:
+    def observe(
+        self,
+        image: NDArray[np.uint8],
+        labels: NDArray[np.uint8],
+        scale: float,
+        person: NDArray[np.uint8] | None = None,
+    ) -> Observation:
         """Shrink `image` (H,W,3) RGB and the part `labels` (H,W), learn the background, return the frame to `cut`.
 
-        `labels` are positive on the puppets; `scale` is their size in pixels of `image` per metre. Frames without any
-        puppet teach nothing: that nobody was tracked is no proof that nobody stands there. Raises InputError for
-        images and labels that do not fit together and for a scale that is not positive.
+        `labels` are positive on all puppets; `person` (H,W) is positive on the one to cut out, all of them if not
+        given; `scale` is its size in pixels of `image` per metre. Frames without any puppet teach nothing: that nobody
+        was tracked is no proof that nobody stands there. Raises InputError for images and labels that do not fit
+        together and for a scale that is not positive.
         """
+        person = labels if person is None else person
         _check(image, labels, scale)
+        _check(image, person, scale)
         height, width = image.shape[:2]
         factor = min(1.0, self.settings.max_side / max(height, width))
         size = (max(1, round(width * factor)), max(1, round(height * factor)))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor < 1 else image
-        puppet = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST) > 0
-        observation = Observation(small, puppet, scale * factor)
-        if puppet.any():
-            self.background.update(small, ~_dilated(puppet, _BARE_DISTANCE * observation.scale))
+        everybody = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST) > 0
+        puppet = cv2.resize(person, size, interpolation=cv2.INTER_NEAREST) > 0
+        observation = Observation(small, puppet, everybody & ~puppet, scale * factor)
+        if everybody.any():
+            self.background.update(small, _distance_outside(everybody) > _BARE_DISTANCE * observation.scale)
         return observation
 
     def cut(self, observation: Observation) -> Silhouette:
         """The silhouette of an observed frame; its `problem` says so when it is empty or much unlike recent ones."""
         if not observation.puppet.any():
             return Silhouette(np.zeros(observation.puppet.shape, np.uint8), "no puppet in the image")
-        rows, columns = _crop(observation.puppet, _CROP_MARGIN * observation.scale)
-        part = Observation(
-            np.ascontiguousarray(observation.image[rows, columns]), observation.puppet[rows, columns], observation.scale
-        )
-        seed = self._seed(part, observation.image, rows, columns)
-        body = _grab_cut(part.image, seed, self.settings.cut_rounds)
+        seed = self._seed(observation)
+        sure = seed == cv2.GC_FGD
+        window = _crop(observation.puppet | sure, _CROP_MARGIN * observation.scale)
+        body = _grab_cut(np.ascontiguousarray(observation.image[window]), seed[window], self.settings.cut_rounds)
         mask = np.zeros(observation.puppet.shape, np.uint8)
-        mask[rows, columns] = _cleaned(body, part)
+        mask[window] = _cleaned(body, sure[window], _SPECK * observation.scale)
         return Silhouette(mask, self._alarm(mask, observation.scale))
 
-    def _seed(self, part: Observation, image: NDArray[np.uint8], rows: slice, columns: slice) -> Mask:
-        """GrabCut's seed (h,w) of the crop: what puppet and background together say of every pixel."""
-        core = _eroded(part.puppet, _SURE_CORE * part.scale)
-        fringe = _dilated(part.puppet, _POSSIBLE_FRINGE * part.scale)
-        seed = np.where(part.puppet, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-        known = self.background.known[rows, columns]
-        levels, spread = self.background.difference(image)
-        levels = cv2.blur(levels, (3, 3))[rows, columns]
-        ratio = levels / (spread[rows, columns] + _NOISE_LEVELS)
+    def _seed(self, observation: Observation) -> Mask:
+        """GrabCut's seed (h,w): what puppet and background together say of every pixel."""
+        puppet, scale = observation.puppet, observation.scale
+        known = self.background.known
+        levels, spread = self.background.difference(observation.image)
+        levels = cv2.blur(levels, (3, 3))
+        ratio = levels / (spread + _NOISE_LEVELS)
+        same = known & (levels < _SAME[0]) & (ratio < _SAME[1])
+        other = known & (levels > _OTHER[0]) & (ratio > _OTHER[1])
+
+        seed = np.where(puppet, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
         seed[known] = cv2.GC_PR_BGD
         seed[known & (levels > _DOUBTFUL[0]) & (ratio > _DOUBTFUL[1])] = cv2.GC_PR_FGD
-        seed[known & (levels > _OTHER[0]) & (ratio > _OTHER[1])] = cv2.GC_FGD
-        seed[known & (levels < _SAME[0]) & (ratio < _SAME[1])] = cv2.GC_BGD
-        seed[~fringe] = cv2.GC_BGD
-        seed[core] = cv2.GC_FGD
+        seed[other] = cv2.GC_FGD
+        seed[same] = cv2.GC_BGD
+        distance = _distance_outside(puppet)
+        seed[distance > _POSSIBLE_FRINGE * scale] = cv2.GC_BGD
+        # A limb that the puppet has elsewhere still hangs on the body and is no shadow.
+        stray = other & ~self.background.shadow(observation.image) & (distance <= _STRAY_REACH * scale)
+        stray &= _distance_outside(observation.others) > _BARE_DISTANCE * scale
+        seed[_connected(stray | puppet, puppet) & stray] = cv2.GC_FGD
+        # Where a misplaced part of the puppet shows the bare background, colour decides.
+        core = _eroded(puppet, _SURE_CORE * scale)
+        seed[core] = np.where(same[core], cv2.GC_PR_BGD, cv2.GC_FGD)
+        seed[observation.others] = cv2.GC_BGD
         return seed
 
     def _alarm(self, mask: Mask, scale: float) -> str:
@@ -161,11 +185,8 @@ def _disc(radius: float) -> Mask:
 
 
 def _distance_outside(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Distance (h,w) in pixels to the nearest pixel of `mask`; very large everywhere when there is none."""
     return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-
-
-def _dilated(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    return _distance_outside(mask) <= radius
 
 
 def _eroded(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
@@ -195,11 +216,16 @@ def _grab_cut(image: NDArray[np.uint8], seed: Mask, rounds: int) -> NDArray[np.b
     return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
 
 
-def _cleaned(body: NDArray[np.bool_], part: Observation) -> Mask:
-    """Open away specks, and keep only what hangs together with the core of the puppet; 255 on the body."""
-    opened = cv2.morphologyEx(body.astype(np.uint8), cv2.MORPH_OPEN, _disc(_SPECK * part.scale))
-    count, components = cv2.connectedComponents(opened, connectivity=8)
+def _connected(mask: NDArray[np.bool_], start: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The components (8 neighbours) of `mask` that meet `start`."""
+    count, components = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     kept = np.zeros(count, bool)
-    kept[components[_eroded(part.puppet, _SURE_CORE * part.scale)]] = True
+    kept[components[start]] = True
     kept[0] = False
-    return np.where(kept[components], 255, 0).astype(np.uint8)
+    return kept[components]
+
+
+def _cleaned(body: NDArray[np.bool_], sure: NDArray[np.bool_], speck: float) -> Mask:
+    """Open away specks and threads, and keep only what meets sure body; 255 on the body."""
+    opened = cv2.morphologyEx(body.astype(np.uint8), cv2.MORPH_OPEN, _disc(speck))
+    return np.where(_connected(opened > 0, sure), 255, 0).astype(np.uint8)

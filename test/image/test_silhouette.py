@@ -67,7 +67,7 @@ def walk(estimator: SilhouetteEstimator, frames: int) -> tuple[np.ndarray, np.nd
 
 def test_background_is_the_masked_mean_and_variance() -> None:
     rng = np.random.default_rng(0)
-    images = rng.integers(0, 256, (12, 6, 5, 3), dtype=np.uint8)
+    images = (rng.integers(4, 252, (6, 5, 3)) + rng.integers(-4, 5, (12, 6, 5, 3))).astype(np.uint8)
     bare = rng.random((12, 6, 5)) < 0.6
     background = Background(BackgroundSettings(min_frames=4))
     for image, outside in zip(images, bare, strict=True):
@@ -100,6 +100,32 @@ def test_background_follows_slow_change_and_forgets_after_a_cut() -> None:
     assert background.mean.max() == pytest.approx(10)
 
 
+def test_a_passing_limb_that_the_puppet_misses_leaves_little_trace() -> None:
+    everywhere = np.ones((4, 40), bool)
+    background = Background()
+    rng = np.random.default_rng(0)
+    for index in range(60):
+        image = rng.integers(97, 104, (4, 40, 3)).astype(np.uint8)
+        if 10 <= index < 50:
+            image[:, index - 10 : index - 5] = 200
+        background.update(image, everywhere)
+    assert np.abs(background.mean - 100).max() < 6
+    assert np.sqrt(background.variance).max() < 12
+
+
+def test_a_shadow_is_darker_by_one_factor_in_all_channels() -> None:
+    background = Background()
+    wall = np.empty((1, 4, 3), np.uint8)
+    wall[:] = (200, 150, 100)
+    for _ in range(3):
+        background.update(wall, np.ones((1, 4), bool))
+    image = wall.copy()
+    image[0, 1] = (120, 90, 60)
+    image[0, 2] = (120, 140, 60)
+    image[0, 3] = (10, 8, 5)
+    assert background.shadow(image).tolist() == [[False, True, False, False]]
+
+
 def test_silhouette_is_much_better_than_the_puppet() -> None:
     mask, truth, puppet = walk(SilhouetteEstimator(), 25)
     assert overlap(puppet, truth) < 0.8
@@ -130,6 +156,29 @@ def test_silhouettes_come_at_working_scale() -> None:
     assert mask.shape == (240, 180)
     assert set(np.unique(mask)) == {0, 255}
     assert overlap(mask, cv2.resize(truth, (180, 240), interpolation=cv2.INTER_NEAREST)) > 0.9
+
+
+def test_an_arm_that_the_puppet_has_elsewhere_is_found() -> None:
+    estimator = SilhouetteEstimator()
+    walk(estimator, 25)
+    truth, wrong = person(70, lift=0.2), person(70, lift=-0.7)
+    mask = estimator.cut(estimator.observe(frame(truth, 50), wrong, SCALE)).mask
+    arm, ghost = (truth == 5), (wrong == 5) & (truth == 0)
+    assert (mask[arm] > 0).mean() > 0.95
+    assert (mask[ghost] > 0).mean() < 0.2
+
+
+def test_other_people_are_neither_background_nor_silhouette() -> None:
+    estimator = SilhouetteEstimator()
+    walk(estimator, 25)
+    left, right = person(100, lift=0.3), person(260, lift=-0.5)
+    for index in range(5):
+        both = np.maximum(left, right)
+        observation = estimator.observe(frame(both, 50 + index), both, SCALE, left)
+    mask = estimator.cut(observation).mask
+    assert overlap(mask, left) > 0.93
+    assert not mask[:, 270:].any()
+    assert estimator.background.mean[300, 275].max() < 110  # still the floor, not the other person's leg
 
 
 def test_specks_far_from_the_puppet_are_dropped() -> None:
@@ -198,3 +247,5 @@ def test_images_and_labels_that_do_not_fit_are_refused() -> None:
     for scale in (0.0, -1.0, float("nan")):
         with pytest.raises(InputError, match="scale"):
             estimator.observe(image, labels, scale)
+    with pytest.raises(InputError, match="part labels"):
+        estimator.observe(image, labels, SCALE, labels[:-1])
