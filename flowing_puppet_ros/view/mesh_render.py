@@ -47,7 +47,7 @@ class OrthographicCamera:
 
 def orthographic(
     points: np.ndarray,
-    looking: Sequence[float],
+    looking: Sequence[float] | np.ndarray,
     size: tuple[int, int],
     up: Sequence[float] = (0.0, 0.0, 1.0),
     margin: float = 0.05,

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -42,12 +42,14 @@ class DrawnPuppet:
             tuple(sorted(range(len(parts)), key=lambda index: (parts[index].depth, index))),
         )
 
-    def scaled(self, factor: float) -> DrawnPuppet:
-        """The same puppet in an image that was resized by `factor` (pixel centres as in cv2.resize)."""
-        shift = (factor - 1) / 2
-        contours = tuple(contour * factor + shift for contour in self.contours)
-        names = (self.part_names, contours, self.order)
-        return DrawnPuppet(self.id, self.joint_names, self.joints * factor + shift, self.confidence, *names)
+    def placed(self, factor: float, corner: tuple[float, float] = (0.0, 0.0)) -> DrawnPuppet:
+        """The same puppet in an image cropped at pixel `corner` (x, y) and resized by `factor` (as cv2.resize does)."""
+
+        def move(points: np.ndarray) -> np.ndarray:
+            return (points - np.asarray(corner)) * factor + (factor - 1) / 2
+
+        contours = tuple(move(contour) for contour in self.contours)
+        return replace(self, joints=move(self.joints), contours=contours)
 
 
 def draw_puppets(
@@ -112,7 +114,7 @@ def _draw_joints(canvas: np.ndarray, puppet: DrawnPuppet, width: int) -> None:
             continue
         x, y = (int(value) for value in _fixed(point))
         level = float(np.clip(confidence, 0, 1)) if np.isfinite(confidence) else 0.0
-        radius = round((1.5 + 2.5 * level) * width * (1 << FIXED_BITS))
+        radius = round((1.2 + 1.6 * level) * width * (1 << FIXED_BITS))
         inside = joint_colour(name) if level >= 0.5 else (30, 30, 30)
         cv2.circle(canvas, (x, y), radius + (width << FIXED_BITS), (20, 20, 20), -1, cv2.LINE_AA, FIXED_BITS)
         cv2.circle(canvas, (x, y), radius, joint_colour(name), -1, cv2.LINE_AA, FIXED_BITS)
@@ -124,7 +126,10 @@ def _short(name: str) -> str:
 
 
 def _draw_labels(canvas: np.ndarray, puppet: DrawnPuppet, width: int) -> None:
-    """Names in a column on each side of the puppet, each with a line to its part; the id above the puppet."""
+    """Names in a column on each side of the puppet, each with a line to its part; the id above the puppet.
+
+    A puppet that is too small for the names to be told apart gets the id alone.
+    """
     indices = [index for index in puppet.order if _drawable(puppet.contours[index])]
     if not indices:
         return
@@ -136,7 +141,7 @@ def _draw_labels(canvas: np.ndarray, puppet: DrawnPuppet, width: int) -> None:
     low, high = corners.min(axis=0), corners.max(axis=0)
     height = max(box[1] for box in boxes)
     on_right = centres[:, 0] >= np.median(centres[:, 0])
-    for side in (False, True):
+    for side in (False, True) if high[1] - low[1] > 15 * height else ():
         chosen = [k for k in np.argsort(centres[:, 1], kind="stable") if on_right[k] == side]
         rows = spread([centres[k, 1] for k in chosen], 1.9 * height, height + 2, canvas.shape[0] - 4)
         for k, baseline in zip(chosen, rows, strict=True):

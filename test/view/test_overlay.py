@@ -69,15 +69,23 @@ def test_puppets_outside_the_image_and_grey_images() -> None:
 
 
 def test_labels_write_beside_the_puppet() -> None:
-    plain, labelled = (draw_puppets(IMAGE, [puppet()], labels=flag) for flag in (False, True))
+    image, big = np.full((420, 600, 3), 50, np.uint8), puppet().placed(3)
+    plain, labelled = (draw_puppets(image, [big], labels=flag) for flag in (False, True))
     changed = (plain != labelled).any(axis=2)
-    assert changed[:, 110:].any() and changed[:, :36].any() and changed[:38].any()
+    assert changed[:, 380:].any() and changed[:, :110].any() and changed[:114].any()
 
 
-def test_scaled_keeps_pixel_centres() -> None:
-    half = puppet().scaled(0.5)
+def test_placed_keeps_pixel_centres() -> None:
+    half = puppet().placed(0.5)
     assert half.joints[0] == pytest.approx([74.75, 14.75])  # (x + 0.5) / 2 - 0.5
     assert half.contours[0][0] == pytest.approx([19.75, 19.75])
+    cropped = puppet().placed(1.0, (10, 20))
+    assert cropped.joints[0] == pytest.approx([140, 10]) and cropped.contours[0][0] == pytest.approx([30, 20])
+
+
+def test_small_puppets_get_their_id_alone() -> None:
+    changed = (draw_puppets(IMAGE, [puppet()]) != draw_puppets(IMAGE, [puppet()], labels=False)).any(axis=2)
+    assert changed[:38].any() and not changed[44:].any()
 
 
 def test_from_message_sorts_the_parts_by_depth() -> None:

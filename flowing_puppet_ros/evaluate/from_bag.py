@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read puppets, detections, cameras and bodies out of a replay's bags, ready to be compared.
+
+Topics are found by their types and namespaces: what a camera publishes shares the namespace of its images, and
+PuppetArrays called `detections` come from a detector, all others from the tracker.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from flowing_puppet_ros.bag.reader import Bag
+from flowing_puppet_ros.body.camera import Camera
+from flowing_puppet_ros.body.triangulate import triangulate
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evaluate.joints import LIMB_JOINTS, named_points
+from flowing_puppet_ros.image.keypoints import normalise_name
+from flowing_puppet_ros.stream.messages import FrameTree, stamp_ns
+
+IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+INFO, CLOUD, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage"
+MESH = "shape_msgs/msg/Mesh"
+PUPPETS, BODIES = "flowing_puppet_msgs/msg/PuppetArray", "flowing_puppet_msgs/msg/BodyArray"
+
+Joints = dict[str, np.ndarray]
+
+
+@dataclass(slots=True, eq=False)
+class CameraRecord:
+    """What the bags hold of one camera; people of each image stamp (ns) as messages, largest puppets first."""
+
+    namespace: str
+    image_topic: str = ""
+    frame_id: str = ""
+    info: Any = None
+    camera: Camera | None = None
+    puppets: dict[int, list[Any]] = field(default_factory=dict)
+    detections: dict[int, list[Any]] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """The namespace without slashes around it, or "camera"."""
+        return self.namespace.strip("/") or "camera"
+
+
+@dataclass(slots=True, eq=False)
+class Recording:
+    """What both bags of a replay hold, without images and clouds; keys are stamps in ns."""
+
+    cameras: dict[str, CameraRecord] = field(default_factory=dict)
+    bodies: dict[int, list[Any]] = field(default_factory=dict)
+    triangles: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
+    body_frame: str = ""
+    cloud_topics: dict[str, str] = field(default_factory=dict)  # "hull" and "body_vertices" -> topic
+    counts: dict[str, int] = field(default_factory=dict)  # messages of each topic that replay wrote
+
+    @property
+    def start(self) -> int:
+        """The first stamp of all, ns; 0 without any."""
+        stamps = [*self.bodies]
+        for camera in self.cameras.values():
+            stamps += [*camera.puppets, *camera.detections]
+        return min(stamps, default=0)
+
+
+def namespace(topic: str) -> str:
+    """The topic without its last word; `/compressed` does not count as a word."""
+    return topic.removesuffix("/compressed").rpartition("/")[0]
+
+
+def read_recording(given: Bag, made: Bag) -> Recording:
+    """Gather a replay's input bag `given` and output bag `made`.
+
+    Raises InputError when `made` has neither puppets nor bodies, and says which topics it has.
+    """
+    recording = Recording(counts={name: topic.count for name, topic in made.details.items()})
+    if not any(_is_puppets(name, kind) or kind == BODIES for name, kind in made.topics.items()):
+        names = ", ".join(sorted(made.topics)) or "none"
+        raise InputError(f"{made.path} has neither puppets nor bodies; its topics are {names}")
+    frames = FrameTree()
+    for bag, small in ((given, (INFO, TRANSFORMS, PUPPETS)), (made, (INFO, TRANSFORMS, PUPPETS, BODIES, MESH))):
+        wanted = [name for name, kind in bag.topics.items() if kind in small and name != "/tf"]
+        for record in bag.messages(wanted):
+            _take(recording, frames, record.topic, record.type, record.message, bag is made)
+    for name, kind in made.topics.items():
+        leaf = name.rpartition("/")[2]
+        if kind == CLOUD and leaf in ("hull", "points", "body_vertices"):
+            recording.cloud_topics["body_vertices" if leaf == "body_vertices" else "hull"] = name
+    _find_images(recording, given)
+    _place_cameras(recording, frames)
+    return recording
+
+
+def _is_puppets(topic: str, kind: str) -> bool:
+    return kind == PUPPETS and not topic.endswith("detections")
+
+
+def _take(recording: Recording, frames: FrameTree, topic: str, kind: str, message: Any, made: bool) -> None:
+    if kind == TRANSFORMS:
+        frames.add(message)
+    elif kind == MESH:
+        recording.triangles = np.array([triangle.vertex_indices for triangle in message.triangles], np.int64)
+    elif kind == BODIES:
+        if not topic.endswith("joints"):
+            recording.bodies[stamp_ns(message)] = list(message.bodies)
+            recording.body_frame = message.header.frame_id
+    else:
+        camera = recording.cameras.setdefault(namespace(topic), CameraRecord(namespace(topic)))
+        if kind == INFO:
+            camera.info = message
+        elif _is_puppets(topic, kind):
+            if made:
+                camera.puppets[stamp_ns(message)] = sorted(message.puppets, key=lambda one: (-one.scale, one.id))
+        else:
+            camera.detections[stamp_ns(message)] = list(message.puppets)
+        camera.frame_id = camera.frame_id or message.header.frame_id
+
+
+def _find_images(recording: Recording, given: Bag) -> None:
+    """Give each camera the image topic of its namespace, or else the one whose first image has its frame."""
+    topics = [name for name, topic in given.details.items() if topic.type in IMAGE and topic.count]
+    by_frame: dict[str, str] = {}
+    for topic in topics:
+        message = next(given.messages([topic])).message
+        by_frame.setdefault(message.header.frame_id, topic)
+    for camera in recording.cameras.values():
+        same = [topic for topic in topics if namespace(topic) == camera.namespace]
+        camera.image_topic = min(same) if same else by_frame.get(camera.frame_id, "")
+
+
+def _place_cameras(recording: Recording, frames: FrameTree) -> None:
+    """Make calibrated cameras of those whose frame is tied to the bodies' frame (or to a common root)."""
+    for record in recording.cameras.values():
+        if record.info is None:
+            continue
+        frame = record.info.header.frame_id
+        pose = frames.pose(recording.body_frame or frames.root(frame), frame)
+        if pose is None:
+            continue
+        translation, rotation = pose
+        info = record.info
+        try:
+            record.camera = Camera.from_info(
+                info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model
+            )
+        except InputError:
+            record.camera = None  # uncalibrated: everything but the re-projection can still be shown
+
+
+def puppet_joints(person: Any) -> Joints:
+    """Known joints {our name: (x, y)} of a Puppet message, pixels."""
+    points = np.array([(joint.x, joint.y) for joint in person.joints], float).reshape(-1, 2)
+    seen = [k for k, joint in enumerate(person.joints) if joint.confidence > 0]
+    return named_points([person.joints[k].name for k in seen], points[seen])
+
+
+def body_joints(body: Any) -> Joints:
+    """Known joints {our name: (x, y, z)} of a Body message, metres."""
+    points = np.array([(j.position.x, j.position.y, j.position.z) for j in body.joints], float).reshape(-1, 3)
+    return named_points([joint.name for joint in body.joints], points)
+
+
+def nearest(joints: Joints, candidates: Iterable[Joints]) -> int | None:
+    """Index of the candidate whose common joints are nearest on average; None when none has a joint in common."""
+    best, least = None, np.inf
+    for index, candidate in enumerate(candidates):
+        common = [name for name in joints if name in candidate]
+        if common:
+            distance = float(np.mean([np.linalg.norm(joints[name] - candidate[name]) for name in common]))
+            if distance < least:
+                best, least = index, distance
+    return best
+
+
+def track_and_detections(camera: CameraRecord) -> tuple[dict[int, Joints], dict[int, Joints]]:
+    """The nearest person's puppet of each stamp, and the detection that fits it best, {stamp: joints}."""
+    frames = {stamp: puppet_joints(people[0]) for stamp, people in camera.puppets.items() if people}
+    reference: dict[int, Joints] = {}
+    for stamp, joints in frames.items():
+        candidates = [puppet_joints(person) for person in camera.detections.get(stamp, ())]
+        index = nearest(joints, candidates)
+        if index is not None:
+            reference[stamp] = candidates[index]
+    return frames, reference
+
+
+def triangulated(recording: Recording, bodies: Mapping[int, Joints]) -> dict[int, Joints]:
+    """Limb joints {stamp: {name: (3,) metres}} triangulated from the detections of the person of each body.
+
+    Where a camera detected several people it is the one nearest to the re-projected body. Stamps at which fewer than
+    two calibrated cameras detected anybody are left out.
+    """
+    placed = [(record, record.camera) for record in recording.cameras.values() if record.camera is not None]
+    found: dict[int, Joints] = {}
+    for stamp, body in bodies.items():
+        seen = [(record, camera) for record, camera in placed if record.detections.get(stamp)]
+        if len(seen) < 2 or not body:
+            continue
+        views = [_detected(record.detections[stamp], camera, body) for record, camera in seen]
+        points, confidence = (np.stack(column) for column in zip(*views, strict=True))
+        joints, _ = triangulate([camera for _, camera in seen], points, confidence)
+        found[stamp] = named_points(LIMB_JOINTS, joints)
+    return found
+
+
+def _detected(people: list[Any], camera: Camera, body: Joints) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (12,2) and confidences (12,) of the limb joints of the person that is where the body is."""
+    pixels, _ = camera.project(np.stack(list(body.values())))
+    expected = named_points(list(body), pixels)
+    chosen = people[nearest(expected, map(puppet_joints, people)) or 0]
+    points, confidence = np.full((len(LIMB_JOINTS), 2), np.nan), np.zeros(len(LIMB_JOINTS))
+    for joint in chosen.joints:
+        name = normalise_name(joint.name)
+        if name in LIMB_JOINTS:
+            points[LIMB_JOINTS.index(name)] = joint.x, joint.y
+            confidence[LIMB_JOINTS.index(name)] = joint.confidence
+    return points, confidence
+
+
+def first_bodies(recording: Recording) -> dict[int, Any]:
+    """The first body of each stamp that has one."""
+    return {stamp: bodies[0] for stamp, bodies in recording.bodies.items() if bodies}
+
+
+def frontality(people: Mapping[int, list[Any]]) -> float:
+    """How frontally a camera sees the first person on average: signed shoulder width over shoulder-to-hip length.
+
+    About 0.6 from the front, 0 from the side, negative from behind; -inf when the four joints never are known.
+    """
+    ratios = []
+    for persons in people.values():
+        joints = puppet_joints(persons[0]) if persons else {}
+        if all(f"{side}_{joint}" in joints for side in ("left", "right") for joint in ("shoulder", "hip")):
+            length = np.linalg.norm(
+                joints["left_shoulder"] + joints["right_shoulder"] - joints["left_hip"] - joints["right_hip"]
+            )
+            ratios.append((joints["left_shoulder"][0] - joints["right_shoulder"][0]) / max(float(length) / 2, 1.0))
+    return float(np.median(ratios)) if ratios else -np.inf

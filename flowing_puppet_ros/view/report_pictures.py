@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report's pictures: tracked puppets, optical and puppet flow, fitted meshes, all small enough for one page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import cv2
+import numpy as np
+
+from flowing_puppet_ros.bag.reader import Bag
+from flowing_puppet_ros.body.camera import Camera
+from flowing_puppet_ros.errors import PuppetError
+from flowing_puppet_ros.evaluate.from_bag import CameraRecord, body_joints, puppet_joints
+from flowing_puppet_ros.flow.estimate import OpticalFlow
+from flowing_puppet_ros.flow.puppet_flow import explained_fraction, motion_field, part_motions
+from flowing_puppet_ros.model.ds_render import render_labels
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.model.tree import DS14_PARENTS
+from flowing_puppet_ros.stream.clouds import decode_cloud
+from flowing_puppet_ros.stream.images import decode_image
+from flowing_puppet_ros.stream.messages import stamp_ns
+from flowing_puppet_ros.view.flow_colour import flow_legend, flow_scale, flow_to_rgb
+from flowing_puppet_ros.view.mesh_render import Canvas, orthographic
+from flowing_puppet_ros.view.overlay import DrawnPuppet, draw_puppets
+from flowing_puppet_ros.view.palette import part_colours
+from flowing_puppet_ros.view.pictures import shrink
+
+STRIP_HEIGHT, FLOW_HEIGHT, VIEW_HEIGHT = 760, 400, 400
+BODY_SIZE = (360, 520)
+POINT_COLOUR = (20, 90, 200)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowShot:
+    """One frame's motion to the next frame: three pictures of one size, and figures."""
+
+    stamp: int
+    image: np.ndarray
+    flow: np.ndarray
+    puppet_flow: np.ndarray
+    explained: float
+    full_scale: float  # pixels of the working grid that are fully saturated
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyShot:
+    """One stamp's body from the front and from its left, and over the cameras' images [(camera name, picture)]."""
+
+    stamp: int
+    front: np.ndarray
+    side: np.ndarray
+    views: list[tuple[str, np.ndarray]]
+
+
+def fetch(bag: Bag, wanted: Mapping[str, Iterable[int]]) -> dict[tuple[str, int], Any]:
+    """Messages {(topic, stamp)} of the wanted stamps (ns) of each topic; those that are not there are left out."""
+    stamps = {topic: set(values) for topic, values in wanted.items() if topic}
+    found: dict[tuple[str, int], Any] = {}
+    for record in bag.messages([topic for topic in stamps if topic in bag.topics]):
+        message = record.message
+        if stamp_ns(message) in stamps[record.topic]:
+            found[record.topic, stamp_ns(message)] = message
+    return found
+
+
+def spread_over(stamps: Sequence[int], count: int) -> list[int]:
+    """At most `count` of the sorted stamps, spread evenly, the first and the last among them."""
+    ordered = sorted(stamps)
+    if len(ordered) <= count:
+        return ordered
+    return [ordered[round(k * (len(ordered) - 1) / max(count - 1, 1))] for k in range(count)]
+
+
+def moving_stamps(camera: CameraRecord, count: int) -> list[int]:
+    """The stamp with the fastest puppet in each of `count` equal spans of the recording; each has a successor."""
+    stamps = sorted(camera.puppets)
+    speed: dict[int, float] = {}
+    for stamp, following in pairwise(stamps):
+        if camera.puppets[stamp] and camera.puppets[following]:
+            now, then = (puppet_joints(camera.puppets[s][0]) for s in (stamp, following))
+            common = [name for name in now if name in then]
+            speed[stamp] = sum(float(np.linalg.norm(then[name] - now[name])) for name in common)
+    chosen = []
+    for span in np.array_split(np.array(sorted(speed), np.int64), count):
+        if span.size:
+            chosen.append(max((int(stamp) for stamp in span), key=lambda stamp: (speed[stamp], -stamp)))
+    return chosen
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A part of an image: columns left to right and rows top to bottom, the last ones excluded."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    @classmethod
+    def around(cls, points: np.ndarray, shape: tuple[int, ...], margin: float) -> Box:
+        """The box of the finite points (N,2), wider by `margin` times its longer side, inside an image (H,W,...)."""
+        points = points[np.isfinite(points).all(axis=1)]
+        height, width = shape[:2]
+        if not len(points):
+            return cls(0, 0, width, height)
+        low, high = points.min(axis=0), points.max(axis=0)
+        more = margin * float((high - low).max())
+        left, top = (int(value) for value in np.clip(np.floor(low - more), 0, (width - 2, height - 2)))
+        right, bottom = (int(value) for value in np.clip(np.ceil(high + more), (left + 2, top + 2), (width, height)))
+        return cls(left, top, right, bottom)
+
+    def scaled(self, factor: float) -> Box:
+        """The same part of the image resized by `factor`."""
+        left, top = int(self.left * factor), int(self.top * factor)
+        right, bottom = (max(low + 1, round(high * factor)) for low, high in ((left, self.right), (top, self.bottom)))
+        return Box(left, top, right, bottom)
+
+    def cut(self, image: np.ndarray) -> np.ndarray:
+        """That part of an image, a view."""
+        return image[self.top : self.bottom, self.left : self.right]
+
+
+def people_box(people: Iterable[Sequence[Any]], shape: tuple[int, ...], margin: float = 0.14) -> Box:
+    """The part of an image (H,W,...) in which the nearest person of the given frames is."""
+    joints = [point for persons in people if persons for point in puppet_joints(persons[0]).values()]
+    return Box.around(np.array(joints, float).reshape(-1, 2), shape, margin)
+
+
+def track_shot(image: np.ndarray, people: Sequence[Any], box: Box) -> np.ndarray:
+    """The part `box` of an image with its puppets drawn over it, the first with labels; at most 760 rows."""
+    part = box.cut(image)
+    small = shrink(part, STRIP_HEIGHT)
+    factor = small.shape[0] / part.shape[0]
+    drawn = [DrawnPuppet.from_message(person).placed(factor, (box.left, box.top)) for person in people]
+    return draw_puppets(draw_puppets(small, drawn[:0:-1], labels=False), drawn[:1])
+
+
+def flow_shot(stamp: int, image: np.ndarray, following: np.ndarray, people: Sequence[Any], box: Box) -> FlowShot:
+    """Dense flow to the following image, and the puppet flow fitted to it under the puppets of `image`.
+
+    The flow is that of the whole image; the pictures show the part `box`.
+    """
+    forward, backward = OpticalFlow().at_working_scale(image, following)
+    height, width = forward.shape[:2]
+    factor = height / image.shape[0]
+    drawn = [DrawnPuppet.from_message(person).placed(factor) for person in reversed(people)]
+    labels, parents = paint_forest([person for person in drawn if person.contours], (height, width))
+    motions, background = part_motions(labels, parents, forward, backward)
+    field = motion_field(labels, motions.affine, background)
+    scale = flow_scale(forward[labels > 0][None] if (labels > 0).any() else forward)
+    small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    whole = (draw_puppets(small, drawn, opacity=0.25, labels=False), flow_to_rgb(forward, scale))
+    seen, dense, puppet = (_fit(box.scaled(factor).cut(p)) for p in (*whole, flow_to_rgb(field, scale)))
+    size = min(dense.shape[:2]) // 5
+    dense[-size:, -size:] = flow_legend(size)
+    return FlowShot(stamp, seen, dense, puppet, explained_fraction(labels, field, forward), scale)
+
+
+def _fit(picture: np.ndarray) -> np.ndarray:
+    """A picture resized to the rows of the flow figures."""
+    factor = FLOW_HEIGHT / picture.shape[0]
+    size = (max(1, round(picture.shape[1] * factor)), FLOW_HEIGHT)
+    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR))
+
+
+def paint_forest(people: Sequence[DrawnPuppet], shape: tuple[int, int]) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Labels (H,W) uint16 of all people's parts, running part index + 1, and the parents of the running indices."""
+    labels = np.zeros(shape, np.uint16)
+    parents: list[int] = []
+    for person in people:
+        first = len(parents)
+        own = render_labels(person.contours, person.order, shape)
+        labels = np.where(own > 0, own.astype(np.uint16) + np.uint16(first), labels)
+        for name in person.part_names:
+            parent = DS14_PARENTS.get(name)
+            parents.append(first + person.part_names.index(parent) if parent in person.part_names else -1)
+    return labels, tuple(parents)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyMesh:
+    """A fitted mesh with a colour per vertex, and what it was fitted to."""
+
+    vertices: np.ndarray  # (V,3) metres, z up
+    faces: np.ndarray  # (F,3)
+    colours: np.ndarray  # (V,3)
+    points: np.ndarray  # (N,3), may be empty
+
+
+def body_mesh(body: Any, vertices: Any, triangles: np.ndarray, hull: Any | None) -> BodyMesh | None:
+    """The first body's mesh from the messages of its stamp (clouds of the vertices and of the hull), None without one.
+
+    The cloud holds the vertices of all bodies one after the other.
+    """
+    if vertices is None or not len(triangles):
+        return None
+    count = int(triangles.max()) + 1
+    points = decode_cloud(vertices)[0][:count]
+    if len(points) < count:
+        return None
+    colours = np.full((count, 3), 205.0)
+    try:
+        model = StitchedPuppet.load(body.model)
+        if len(model.part_of_vertex) == count:
+            colours = part_colours(model.tree.names)[model.part_of_vertex].astype(float)
+    except PuppetError:
+        pass  # a body of a model that is not installed here is shown in grey
+    cloud = decode_cloud(hull)[0] if hull is not None else np.zeros((0, 3))
+    return BodyMesh(points, triangles, colours, cloud)
+
+
+def body_shot(stamp: int, body: Any, mesh: BodyMesh, images: Sequence[tuple[str, Camera, np.ndarray]]) -> BodyShot:
+    """Draw a body from two sides and over (camera name, camera, image)."""
+    forward, left = facing(body_joints(body))
+    front, side = (_from_side(mesh, -direction) for direction in (forward, left))
+    views = []
+    for name, camera, image in images:
+        box = Box.around(camera.project(mesh.vertices)[0], image.shape, 0.12)
+        small = shrink(box.cut(image), VIEW_HEIGHT)
+        size = (small.shape[1], small.shape[0])
+        canvas = Canvas(_cropped(camera, box).resized(size), size)
+        canvas.mesh(mesh.vertices, mesh.faces, mesh.colours)
+        views.append((name, canvas.picture(small, opacity=0.7).rgb))
+    return BodyShot(stamp, front, side, views)
+
+
+def _cropped(camera: Camera, box: Box) -> Camera:
+    matrix = camera.matrix.copy()
+    matrix[:2, 2] -= (box.left, box.top)
+    return replace(camera, matrix=matrix, size=(box.right - box.left, box.bottom - box.top))
+
+
+def facing(joints: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Horizontal unit vectors to the person's front and left, from shoulders and hips; x and y when unknown."""
+    left = np.zeros(3)
+    for joint in ("shoulder", "hip"):
+        sides = joints.get(f"left_{joint}"), joints.get(f"right_{joint}")
+        if sides[0] is not None and sides[1] is not None:
+            left += sides[0] - sides[1]
+    left[2] = 0
+    length = float(np.linalg.norm(left))
+    left = left / length if length > 1e-6 else np.array([0.0, 1.0, 0.0])
+    return np.cross(left, [0.0, 0.0, 1.0]), left
+
+
+def _from_side(mesh: BodyMesh, looking: np.ndarray) -> np.ndarray:
+    height = float(np.ptp(mesh.vertices[:, 2]))
+    reach = float(np.ptp(mesh.vertices[:, :2], axis=0).max())
+    scale = 0.88 * min(BODY_SIZE[1] / max(height, 1e-3), BODY_SIZE[0] / max(reach, 1e-3))
+    canvas = Canvas(orthographic(mesh.vertices, looking, BODY_SIZE, scale=scale), BODY_SIZE)
+    canvas.mesh(mesh.vertices, mesh.faces, mesh.colours)
+    if len(mesh.points):
+        canvas.points(mesh.points, POINT_COLOUR, radius=0.9)
+    return canvas.picture((250, 250, 250)).rgb
+
+
+def picture_of(messages: Mapping[tuple[str, int], Any], topic: str, stamp: int) -> np.ndarray | None:
+    """The RGB image of a fetched message, None when it is not there."""
+    message = messages.get((topic, stamp))
+    return None if message is None else decode_image(message)
