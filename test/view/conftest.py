@@ -80,7 +80,7 @@ def replay(tmp_path: Path) -> Replay:
 
 def joints_at(frame: int) -> dict[str, np.ndarray]:
     """The person walks to its left, 2 cm a frame."""
-    return {name: point + [0, 0.02 * frame, 0] for name, point in JOINTS.items()}
+    return {name: point + np.array([0, 0.02 * frame, 0]) for name, point in JOINTS.items()}
 
 
 def write_replay(folder: Path, content: Content) -> tuple[Path, Path]:
@@ -160,7 +160,7 @@ def _body(header: Any, stamp: int, frame: int) -> list[tuple[str, str, int, Any]
         FACTORY.make(
             "flowing_puppet_msgs/msg/BodyJoint",
             name=name,
-            position=make_point(FACTORY, point + [0, 0, 0.03]),
+            position=make_point(FACTORY, point + np.array([0, 0, 0.03])),
             confidence=0.9,
         )
         for name, point in joints_at(frame).items()
@@ -170,7 +170,7 @@ def _body(header: Any, stamp: int, frame: int) -> list[tuple[str, str, int, Any]
         "flowing_puppet_msgs/msg/Body", id="a1", model="nobody", energy=2.5 + frame, joints=joints, parts=parts
     )
     kind, cloud = "flowing_puppet_msgs/msg/BodyArray", "sensor_msgs/msg/PointCloud2"
-    vertices = BOX + [0, 0.02 * frame, 0]
+    vertices = BOX + np.array([0, 0.02 * frame, 0])
     return [
         ("/bodies", kind, stamp, FACTORY.make(kind, header=header, bodies=[body])),
         ("/hull/joints", kind, stamp, FACTORY.make(kind, header=header)),
@@ -200,16 +200,10 @@ def picture(pixels: dict[str, np.ndarray]) -> np.ndarray:
 
 def _person(pixels: dict[str, np.ndarray], identity: str, shift: float = 0.0) -> Any:
     """A puppet message; with an id it has a torso as its part, and all joints `shift` px to the right."""
-    joints = [
-        FACTORY.make(
-            "flowing_puppet_msgs/msg/PuppetJoint",
-            name=name,
-            x=pixels[name][0] + shift,
-            y=pixels[name][1],
-            confidence=0.9,
-        )
-        for name in LIMB_JOINTS
-    ]
+    joints = []
+    for name in LIMB_JOINTS:
+        x, y = pixels[name] + np.array([shift, 0])
+        joints.append(FACTORY.make("flowing_puppet_msgs/msg/PuppetJoint", name=name, x=x, y=y, confidence=0.9))
     parts = []
     if identity:
         contour = np.stack([pixels[name] for name in TORSO])
