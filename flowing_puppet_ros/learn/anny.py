@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.errors import InputError
@@ -64,6 +66,7 @@ class AnnyBody:
         self.mirror_bone = np.array([self.bone_names.index(_mirrored_bone(name)) for name in self.bone_names])
         weights = np.asarray(self._anny.skin_weights, dtype=np.float64)
         self.skin_weights = (weights + weights[self.mirror_vertex][:, self.mirror_bone]) / 2
+        self._landmark_vertices = self._find_landmarks(vertices)
 
     def bone(self, name: str) -> int:
         """Index of the bone called `name`."""
@@ -141,30 +144,45 @@ class AnnyBody:
         posed = np.squeeze(blended @ vertices[..., None], axis=-1) + weights @ offsets
         return posed, joints
 
-    def landmarks(self, rest: RestBody, posed: Array, joints: Array) -> dict[str, Array]:
+    def landmarks(self, posed: Array, joints: Array) -> dict[str, Array]:
         """Named joints {name: (...,3)} of posed vertices (...,V,3) and bone heads (...,B,3)."""
         return {name: joints[..., self.bone(bone), :] for name, bone in JOINT_BONES.items()} | {
-            name: posed[..., ids, :].mean(axis=-2) for name, ids in self._landmark_vertices(rest).items()
+            name: posed[..., ids, :].mean(axis=-2) for name, ids in self._landmark_vertices.items()
         }
 
-    def _landmark_vertices(self, rest: RestBody) -> dict[str, Array]:
-        vertices, owner = rest.vertices, self.skin_weights.argmax(axis=1)
+    def _find_landmarks(self, vertices: Array) -> dict[str, Array]:
+        owner = self.skin_weights.argmax(axis=1)
         head = np.flatnonzero(owner == self.bone("Head"))
-        ids = {"head_top": head[[vertices[head, 2].argmax()]], "nose": head[[vertices[head, 0].argmax()]]}
-        ids["face"] = np.concatenate([head[[vertices[head, 1].argmax()]], head[[vertices[head, 1].argmin()]]])
-        ids["left_ear"], ids["right_ear"] = ids["face"][:1], self.mirror_vertex[ids["face"][:1]]
-        for side in ("Left", "Right"):
-            foot = np.flatnonzero(np.isin(owner, [self.bone(f"{side}Foot"), self.bone(f"{side}ToeBase")]))
-            sole = foot[vertices[foot, 2] < vertices[foot, 2].min() + 0.05]
-            ids[f"{side.lower()}_toe"] = sole[[vertices[sole, 0].argmax()]]
-            ids[f"{side.lower()}_heel"] = sole[[vertices[sole, 0].argmin()]]
-        return ids
+        left_ear = head[[vertices[head, 1].argmax()]]
+        foot = np.flatnonzero(np.isin(owner, [self.bone("LeftFoot"), self.bone("LeftToeBase")]))
+        sole = foot[vertices[foot, 2] < vertices[foot, 2].min() + 0.05]
+        left = {
+            "ear": left_ear,
+            "eye": self._left_eyeball(vertices),
+            "toe": sole[[vertices[sole, 0].argmax()]],
+            "heel": sole[[vertices[sole, 0].argmin()]],
+        }
+        return {
+            "head_top": head[[vertices[head, 2].argmax()]],
+            "nose": head[[vertices[head, 0].argmax()]],
+            "face": np.concatenate([left_ear, self.mirror_vertex[left_ear]]),
+            **{f"left_{name}": ids for name, ids in left.items()},
+            **{f"right_{name}": self.mirror_vertex[ids] for name, ids in left.items()},
+        }
+
+    def _left_eyeball(self, vertices: Array) -> Array:
+        # The eyeballs are the smallest separate surfaces of the mesh.
+        n, edges = len(vertices), self.triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
+        graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(n, n))
+        labels = connected_components(graph, directed=False)[1]
+        size = np.bincount(labels)[labels]
+        return np.flatnonzero((size == size.min()) & (vertices[:, 1] > 0))
 
     def random_body(self, rng: np.random.Generator, rotations: Array) -> tuple[Array, dict[str, Array]]:
         """A random adult in the pose of `rotations` (B,3,3): vertices (V,3) and named joints {name: (3,)}."""
         rest = self.rest(self.sample_phenotype(rng))
         vertices, joints = self.pose(rest, rotations)
-        return vertices, self.landmarks(rest, vertices, joints)
+        return vertices, self.landmarks(vertices, joints)
 
 
 JOINT_BONES = {

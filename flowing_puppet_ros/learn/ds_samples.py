@@ -25,7 +25,7 @@ Array = np.ndarray[Any, Any]
 BATCH = 20
 POINTS_PER_SIDE = {"torso": 40, "head": 24}
 OTHER_POINTS_PER_SIDE = 28
-OVERLAP = 0.4
+OVERLAP = 0.25
 """A face belongs to every part that carries at least this share of its skin weight, so that parts overlap at joints."""
 
 SHORTEST_BONE = 0.3
@@ -100,7 +100,7 @@ def make_training_set(
     with tqdm(total=poses, desc=f"{gender} {parts}", unit="pose") as progress:
         while len(projections) < poses:
             vertices, bones = body.pose(rest, sampler.sample(rng, BATCH))
-            joints = body.landmarks(rest, vertices, bones)
+            joints = body.landmarks(vertices, bones)
             for index in range(BATCH):
                 camera = RandomCamera.draw(rng)
                 image = project(vertices[index], {name: xyz[index] for name, xyz in joints.items()}, faces, camera)

@@ -32,7 +32,8 @@ LIMB_CUTS = (  # the two parts, the bones above and below the cut, the bone whos
     ("left_lower_leg", "left_foot", "LeftLeg", "LeftFoot", None),
 )
 CAP_LENGTH = 0.3  # of the upper arm: how far the shoulder part reaches down the arm
-CAP_INNER = (0.42, -0.02)  # of the shoulder's y, and metres above the neck joint: upper end of the shoulder's inner cut
+COLLAR_TILT, COLLAR_HEIGHT = 0.45, 0.0  # metres a metre, metres: the cut of the head above the neck joint
+CAP_INNER = (0.52, -0.02)  # of the shoulder's y, and metres above the neck joint: upper end of the shoulder's inner cut
 CAP_LOWER = (1.0, -0.135)  # of the shoulder's y, and metres above the shoulder joint: its lower end, under the armpit
 LEG_INNER = 0.03  # metres: half the width of the strip of torso between the legs
 LEG_OUTER = (0.2, 0.05)  # metres, y and height above the hip joint of the outer end of the leg's cut
@@ -44,7 +45,7 @@ def part_of_vertex(body: AnnyBody) -> Array:
     rest = body.rest(body.mean_phenotype())
     names = tuple(SP_PARENTS)
     owner = np.full(len(rest.vertices), names.index("torso"), dtype=np.uint8)
-    owner[_weight(body, ("Neck", "Neck1", "Head")) > 0.5] = names.index("head")
+    owner[_is_head(body, rest.vertices, rest.joints)] = names.index("head")
     for name, where in _left_parts(body, rest.vertices, rest.joints).items():
         owner[where] = names.index(name)
         owner[body.mirror_vertex[where]] = names.index(mirrored_name(name))
@@ -61,7 +62,7 @@ def _left_parts(body: AnnyBody, vertices: Array, joints: Array) -> dict[str, Arr
         across = along if tail is None else _unit(along + _unit(joints[body.bone(tail)] - joint))
         limb, beyond = parts[above] | parts[below], (vertices - joint) @ across > 0
         parts[above], parts[below] = limb & ~beyond, limb & beyond
-    trunk = (weight.argmax(axis=1) == 0) & (vertices[:, 1] > 0) & (_weight(body, ("Neck", "Neck1", "Head")) <= 0.5)
+    trunk = (weight.argmax(axis=1) == 0) & (vertices[:, 1] > 0) & ~_is_head(body, vertices, joints)
     leg = (parts["left_upper_leg"] | trunk) & (_above_leg_cut(body, vertices, joints) < 0)
     arm = joints[body.bone("LeftForeArm")] - joints[body.bone("LeftArm")]
     beyond = (vertices - joints[body.bone("LeftArm")] - CAP_LENGTH * arm) @ arm > 0
@@ -71,6 +72,11 @@ def _left_parts(body: AnnyBody, vertices: Array, joints: Array) -> dict[str, Arr
         "left_upper_arm": parts["left_upper_arm"] & beyond,
         "left_upper_leg": leg & ~parts["left_lower_leg"],
     }
+
+
+def _is_head(body: AnnyBody, vertices: Array, joints: Array) -> Array:
+    above = (vertices - joints[body.bone("Neck")]) @ np.array([COLLAR_TILT, 0.0, 1.0]) > COLLAR_HEIGHT
+    return np.asarray((_weight(body, ("Neck", "Neck1", "Head")) > 0.2) & above)
 
 
 def _outside_shoulder_cut(body: AnnyBody, vertices: Array, joints: Array) -> Array:

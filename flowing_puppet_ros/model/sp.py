@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The Stitched Puppet: a part-based 3D body model with PCA shape and pose deformations (thesis chapter of that name).
+
+Metres; x forward, y to the person's left, z up (REP-103), origin between the hips of the template.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from flowing_puppet_ros.model import rotation, weights
+from flowing_puppet_ros.model.gaussian import Gaussian
+from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree, mirrored_name
+
+Array = np.ndarray[Any, Any]
+
+POSE_WIDTH = 12  # columns of BodyState.pose; parts with fewer coefficients leave the rest 0
+DEVIATIONS = 3.0  # samples stay within this many standard deviations of every coefficient
+MIRROR_POINT = np.array([1.0, -1.0, 1.0])
+MIRROR_AXIS = np.array([-1.0, 1.0, -1.0])  # what a mirror in the plane y = 0 does to a rotation vector
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyState:
+    """The node variables of all 16 parts (Eq. 44), with any leading batch dimensions.
+
+    center (...,16,3) metres, rotation (...,16,3,3), pose (...,16,12) zero-padded and shape (...,16,S), both in
+    standard deviations.
+    """
+
+    center: Array
+    rotation: Array
+    pose: Array
+    shape: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Interface:
+    """The points that a parent part and a child part share (Eq. 48): local indices (K,) in each and weights (K,)."""
+
+    parent_index: Array
+    child_index: Array
+    weight: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartTopology:
+    """How the template falls into parts, each with its own copy of the vertices on its border."""
+
+    part_vertices: tuple[Array, ...]
+    part_faces: tuple[Array, ...]
+    shared: tuple[tuple[Array, Array], ...]
+
+    @classmethod
+    def from_faces(cls, faces: Array, part_of_face: Array, tree: PartTree) -> PartTopology:
+        """Split template faces (F,3) by the part (F,) each belongs to; `shared` has local indices for every edge."""
+        vertices = tuple(np.unique(faces[part_of_face == i]).astype(np.int32) for i in range(len(tree)))
+        local = tuple(np.searchsorted(vertices[i], faces[part_of_face == i]).astype(np.int32) for i in range(len(tree)))
+        shared = []
+        for parent, child in tree.edges:
+            _, first, second = np.intersect1d(vertices[parent], vertices[child], return_indices=True)
+            shared.append((first.astype(np.int32), second.astype(np.int32)))
+        return cls(vertices, local, tuple(shared))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StitchedPuppet:
+    """A learned Stitched Puppet. V vertices, part i has N_i vertices and P_i pose coefficients, S shape coefficients.
+
+    faces (F,3) closed and counter-clockwise outside; part_vertices are template ids, border vertices stand in both
+    parts; mean_shape, shape_basis (N_i,3,S), mean_pose, pose_basis (N_i,3,P_i): Eqs. 45 and 46, in the part's frame
+    (origin in its rest centre, axes of the body); pairwise: Eq. 49 over [r_ij (3), d_i, d_j], r_ij = log(R_i^T R_j);
+    limit_low, limit_high (15,3) of r_ij; joint_index, joint_weight (J,M): joints as convex sums of vertices;
+    mirror_vertex (V,) and pose_mirror (P_i,) signs: the same body seen in a mirror.
+    """
+
+    name: str
+    tree: PartTree
+    faces: Array
+    part_of_vertex: Array
+    part_vertices: tuple[Array, ...]
+    part_faces: tuple[Array, ...]
+    mean_shape: tuple[Array, ...]
+    shape_basis: tuple[Array, ...]
+    mean_pose: tuple[Array, ...]
+    pose_basis: tuple[Array, ...]
+    rest_center: Array
+    interfaces: tuple[Interface, ...]
+    pairwise: tuple[Gaussian, ...]
+    limit_low: Array
+    limit_high: Array
+    joint_names: tuple[str, ...]
+    joint_index: Array
+    joint_weight: Array
+    mirror_vertex: Array
+    pose_mirror: tuple[Array, ...]
+
+    @classmethod
+    def load(cls, name: str = "neutral") -> StitchedPuppet:
+        """The shipped model neutral, female or male; InputError for another name."""
+        return cls.from_arrays(name, weights.load("sp", name))
+
+    @classmethod
+    def from_arrays(cls, name: str, arrays: Mapping[str, Array]) -> StitchedPuppet:
+        """Build from the arrays of a weights file, as `learn.sp` writes them."""
+        tree = PartTree.from_parents(SP_PARENTS)
+        topology = PartTopology.from_faces(arrays["faces"], arrays["part_of_face"], tree)
+        parts, edges = range(len(tree)), range(len(tree) - 1)
+        return cls(
+            name=name,
+            tree=tree,
+            faces=arrays["faces"],
+            part_of_vertex=arrays["part_of_vertex"],
+            part_vertices=topology.part_vertices,
+            part_faces=topology.part_faces,
+            mean_shape=tuple(arrays[f"mean_shape_{i}"].astype(np.float64) for i in parts),
+            shape_basis=tuple(arrays[f"shape_basis_{i}"].astype(np.float64) for i in parts),
+            mean_pose=tuple(arrays[f"mean_pose_{i}"].astype(np.float64) for i in parts),
+            pose_basis=tuple(arrays[f"pose_basis_{i}"].astype(np.float64) for i in parts),
+            rest_center=arrays["rest_center"].astype(np.float64),
+            interfaces=tuple(
+                Interface(*topology.shared[e], arrays[f"interface_weight_{e}"].astype(np.float64)) for e in edges
+            ),
+            pairwise=tuple(Gaussian(arrays[f"pair_mean_{e}"], arrays[f"pair_covariance_{e}"]) for e in edges),
+            limit_low=arrays["limit_low"].astype(np.float64),
+            limit_high=arrays["limit_high"].astype(np.float64),
+            joint_names=tuple(str(joint) for joint in arrays["joint_names"]),
+            joint_index=arrays["joint_index"],
+            joint_weight=arrays["joint_weight"].astype(np.float64),
+            mirror_vertex=arrays["mirror_vertex"],
+            pose_mirror=tuple(arrays[f"pose_mirror_{i}"].astype(np.float64) for i in parts),
+        )
+
+    @property
+    def shape_count(self) -> int:
+        """S, the number of intrinsic shape coefficients."""
+        return int(self.shape_basis[0].shape[2])
+
+    def pose_count(self, part: int) -> int:
+        """P_i, the number of pose coefficients of a part."""
+        return int(self.pose_basis[part].shape[2])
+
+    def rest_state(self) -> BodyState:
+        """The average body in the template pose: pose coefficients that undo the mean pose deformation."""
+        parts = len(self.tree)
+        pose = np.zeros((parts, POSE_WIDTH))
+        for i in range(parts):
+            basis = self.pose_basis[i].reshape((-1, self.pose_count(i)))
+            pose[i, : basis.shape[1]] = np.linalg.lstsq(basis, -self.mean_pose[i].ravel(), rcond=None)[0]
+        turned = np.broadcast_to(np.eye(3), (parts, 3, 3)).copy()
+        return BodyState(self.rest_center.copy(), turned, pose, np.zeros((parts, self.shape_count)))
+
+    def local_vertices(self, i: int, d: Array, s: Array) -> Array:
+        """Vertices (...,N_i,3) of part i in its own frame (Eqs. 45 and 46); d (...,P_i or zero-padded), s (...,S)."""
+        mean, count = self.mean_shape[i] + self.mean_pose[i], self.pose_count(i)
+        shaped = s @ self.shape_basis[i].reshape((-1, self.shape_count)).T
+        posed = d[..., :count] @ self.pose_basis[i].reshape((-1, count)).T
+        return np.asarray((shaped + posed).reshape((*shaped.shape[:-1], -1, 3)) + mean)
+
+    def part_mesh(self, i: int, o: Array, r: Array, d: Array, s: Array) -> Array:
+        """Vertices (...,N_i,3) of part i in the world (Eq. 47) with centre o (...,3) and rotation r (...,3,3)."""
+        return np.asarray(self.local_vertices(i, d, s) @ np.swapaxes(r, -1, -2) + np.asarray(o)[..., None, :])
+
+    def parts(self, state: BodyState) -> tuple[Array, ...]:
+        """Vertices (...,N_i,3) of every part in the world."""
+        return tuple(
+            self.part_mesh(
+                i, state.center[..., i, :], state.rotation[..., i, :, :], state.pose[..., i, :], state.shape[..., i, :]
+            )
+            for i in range(len(self.tree))
+        )
+
+    def vertices(self, state: BodyState) -> Array:
+        """Vertices (...,V,3) of the whole body; where parts share a vertex, the mean of their copies."""
+        total = np.zeros((*state.center.shape[:-2], len(self.part_of_vertex), 3))
+        copies = np.zeros(len(self.part_of_vertex))
+        for ids, mesh in zip(self.part_vertices, self.parts(state), strict=True):
+            total[..., ids, :] += mesh
+            copies[ids] += 1
+        return np.asarray(total / copies[:, None])
+
+    def joints(self, vertices: Array) -> Array:
+        """Joints (...,J,3), in the order of joint_names, of body vertices (...,V,3)."""
+        return np.asarray((self.joint_weight[..., None] * vertices[..., self.joint_index, :]).sum(axis=-2))
+
+    def stitch(self, child: int, parent: int, parent_points: Array, d: Array, s: Array) -> tuple[Array, Array]:
+        """Rotation (...,3,3) and centre (...,3) that lay the child's interface onto parent_points (...,K,3).
+
+        `parent_points` are the parent's interface points in the world, in the order of the interface of that edge.
+        """
+        if self.tree.parents[child] != parent:
+            raise ValueError(f"{self.tree.names[parent]} is not the parent of {self.tree.names[child]}")
+        interface = self.interfaces[child - 1]
+        points = self.local_vertices(child, d, s)[..., interface.child_index, :]
+        return rotation.procrustes(points, parent_points, interface.weight)
+
+    def sample(self, rng: np.random.Generator, shape_scale: float = 1.0, pose_scale: float = 1.0) -> BodyState:
+        """Draw a stitched body that faces x forward (thesis section "Generating Model Instances").
+
+        One shape for all parts, then from the torso outwards the pose coefficients given the parent's, and the
+        rotation and centre that stitch the part to its parent, within the joint limits. The scales multiply standard
+        deviations.
+        """
+        rest = self.rest_state()
+        rest.shape[:] = np.clip(shape_scale * rng.standard_normal(self.shape_count), -DEVIATIONS, DEVIATIONS)
+        torso = self.pose_count(0)
+        rest.pose[0, :torso] = np.clip(pose_scale * rng.standard_normal(torso), -DEVIATIONS, DEVIATIONS)
+        for parent, child in self.tree.edges:
+            given, own = self.pose_count(parent), self.pose_count(child)
+            d_child = self.pairwise[child - 1].condition(
+                np.arange(3 + given, 3 + given + own), np.arange(3, 3 + given), rest.pose[parent, :given]
+            )
+            drawn = d_child.mean + pose_scale * (d_child.sample(rng, 1)[0] - d_child.mean)
+            rest.pose[child, :own] = np.clip(drawn, -DEVIATIONS, DEVIATIONS)
+            self._place(rest, parent, child)
+        return rest
+
+    def _place(self, state: BodyState, parent: int, child: int) -> None:
+        mesh = self.part_mesh(
+            parent, state.center[parent], state.rotation[parent], state.pose[parent], state.shape[parent]
+        )
+        interface = self.interfaces[child - 1]
+        target = mesh[interface.parent_index]
+        turned, _ = self.stitch(child, parent, target, state.pose[child], state.shape[child])
+        relative = rotation.log(state.rotation[parent].T @ turned)
+        limited = np.clip(relative, self.limit_low[child - 1], self.limit_high[child - 1])
+        state.rotation[child] = state.rotation[parent] @ rotation.exp(limited)
+        own = self.local_vertices(child, state.pose[child], state.shape[child])[interface.child_index]
+        offsets = target - own @ state.rotation[child].T
+        state.center[child] = np.average(offsets, axis=0, weights=interface.weight)
+
+    def mirrored(self, state: BodyState) -> BodyState:
+        """The state of the same body seen in the mirror plane y = 0: left and right swapped."""
+        other = np.array([self.tree.index(mirrored_name(name)) for name in self.tree.names])
+        pose = state.pose[..., other, :].copy()
+        for i, signs in enumerate(self.pose_mirror):
+            pose[..., i, : len(signs)] *= signs
+        turned = MIRROR_POINT[:, None] * state.rotation[..., other, :, :] * MIRROR_POINT
+        return BodyState(state.center[..., other, :] * MIRROR_POINT, turned, pose, state.shape[..., other, :])
