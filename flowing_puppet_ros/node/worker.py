@@ -1,0 +1,69 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One thread that does the work of a node in order of arrival, while the node goes on receiving.
+
+Messages wait in bounded lines, one an input: when a line is full its oldest message is dropped for the newest, so a
+node that cannot keep up stays near the present instead of falling behind.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter, deque
+from collections.abc import Callable
+
+Task = Callable[[], None]
+
+
+class Worker:
+    """Runs tasks one after the other on its own thread."""
+
+    def __init__(self, limit: int, on_error: Callable[[Exception], None]) -> None:
+        """Start the thread; `limit` is the length of each line, and `on_error` takes what a task raised."""
+        self.dropped: Counter[str] = Counter()
+        self._limit = limit
+        self._on_error = on_error
+        self._tasks: deque[tuple[str | None, Task]] = deque()
+        self._changed = threading.Condition()
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
+        self._thread.start()
+
+    def put(self, line: str, task: Task) -> None:
+        """Append a task to a bounded line, dropping the line's oldest waiting task when it is full."""
+        with self._changed:
+            waiting = [index for index, (name, _) in enumerate(self._tasks) if name == line]
+            if len(waiting) >= self._limit:
+                del self._tasks[waiting[0]]
+                self.dropped[line] += 1
+            self._tasks.append((line, task))
+            self._changed.notify()
+
+    def call(self, task: Task) -> None:
+        """Append a task that is never dropped."""
+        with self._changed:
+            self._tasks.append((None, task))
+            self._changed.notify()
+
+    def clear(self) -> None:
+        """Forget the messages that wait; tasks given to `call` stay."""
+        with self._changed:
+            self._tasks = deque(item for item in self._tasks if item[0] is None)
+
+    def stop(self, timeout: float = 5.0) -> None:
+        """Finish the running task, drop the others and end the thread; `timeout` in seconds bounds the wait."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify()
+        self._thread.join(timeout)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._tasks or self._stopping)
+                if self._stopping:
+                    return
+                _, task = self._tasks.popleft()
+            try:
+                task()
+            except Exception as error:
+                self._on_error(error)
