@@ -10,14 +10,14 @@ CENTRE = np.array([1.0, 2.0, -0.5])
 
 
 @pytest.fixture(scope="module")
-def sphere():
+def sphere() -> CloudGrid:
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(3000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return CloudGrid.build(0.3 * normals + CENTRE, normals)
 
 
-def test_closest_is_within_a_cell_of_brute_force(sphere):
+def test_closest_is_within_a_cell_of_brute_force(sphere: CloudGrid) -> None:
     queries = np.random.default_rng(1).uniform(-0.5, 0.5, (500, 3)) + CENTRE
     index, distance = sphere.closest(queries)
     exact = np.linalg.norm(queries[:, None] - sphere.points, axis=2)
@@ -27,14 +27,14 @@ def test_closest_is_within_a_cell_of_brute_force(sphere):
     assert np.mean(distance - exact.min(axis=1)) < 0.1 * sphere.cell
 
 
-def test_far_queries_are_answered_at_the_border(sphere):
+def test_far_queries_are_answered_at_the_border(sphere: CloudGrid) -> None:
     index, distance = sphere.closest(np.array([[100.0, 2.0, -0.5], [-100.0, 2.0, -0.5]]))
     assert sphere.points[index[0], 0] > 1.25
     assert sphere.points[index[1], 0] < 0.75
     assert distance[0] == pytest.approx(98.7, abs=0.05)
 
 
-def test_data_cost_equals_the_formula(sphere):
+def test_data_cost_equals_the_formula(sphere: CloudGrid) -> None:
     rng = np.random.default_rng(2)
     points = rng.uniform(-0.4, 0.4, (4, 50, 3)) + CENTRE
     normals = rng.normal(size=(4, 50, 3))
@@ -47,7 +47,7 @@ def test_data_cost_equals_the_formula(sphere):
     np.testing.assert_allclose(mismatch, (angle > 0.75 * np.pi).mean(axis=1))
 
 
-def test_inside_out_surface_pays_for_its_normals_only(sphere):
+def test_inside_out_surface_pays_for_its_normals_only(sphere: CloudGrid) -> None:
     points, normals = sphere.points[None, :200], sphere.normals[None, :200]
     right, wrong = sphere.data_cost(points, normals), sphere.data_cost(points, -normals)
     assert right[0] == wrong[0]
@@ -55,7 +55,7 @@ def test_inside_out_surface_pays_for_its_normals_only(sphere):
     assert wrong[1] == 1.0
 
 
-def test_wide_clouds_get_larger_cells():
+def test_wide_clouds_get_larger_cells() -> None:
     points = np.array([[0.0, 0.0, 0.0], [100.0, 100.0, 100.0]])
     grid = CloudGrid.build(points, np.eye(3)[:2])
     assert grid.nearest.size < 3_000_000

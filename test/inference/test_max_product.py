@@ -11,8 +11,11 @@ from hypothesis import strategies as st
 from flowing_puppet_ros.inference.max_product import max_product, message_foundation
 from flowing_puppet_ros.model.tree import PartTree
 
+Costs = list[np.ndarray]
+Problem = tuple[PartTree, Costs, Costs]
 
-def random_problem(seed: int):
+
+def random_problem(seed: int) -> Problem:
     rng = np.random.default_rng(seed)
     nodes = int(rng.integers(1, 6))
     parents = (-1, *(int(rng.integers(0, child)) for child in range(1, nodes)))
@@ -23,7 +26,7 @@ def random_problem(seed: int):
     return tree, node_costs, edge_costs
 
 
-def exhaustive(tree, node_costs, edge_costs):
+def exhaustive(tree: PartTree, node_costs: Costs, edge_costs: Costs) -> dict[tuple[int, ...], float]:
     """Total cost of every configuration, as {assignment: cost}."""
     costs = {}
     for pick in product(*(range(len(cost)) for cost in node_costs)):
@@ -35,11 +38,11 @@ def exhaustive(tree, node_costs, edge_costs):
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6))
-def test_equals_exhaustive_search(seed):
+def test_equals_exhaustive_search(seed: int) -> None:
     tree, node_costs, edge_costs = random_problem(seed)
     result = max_product(tree, node_costs, edge_costs)
     costs = exhaustive(tree, node_costs, edge_costs)
-    best = min(costs, key=costs.get)
+    best = min(costs, key=lambda pick: costs[pick])
     assert tuple(result.assignment) == best
     assert result.cost == pytest.approx(costs[best])
     for node, marginal in enumerate(result.marginals):
@@ -49,7 +52,7 @@ def test_equals_exhaustive_search(seed):
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6))
-def test_foundation_row_minima_are_the_outgoing_messages(seed):
+def test_foundation_row_minima_are_the_outgoing_messages(seed: int) -> None:
     tree, node_costs, edge_costs = random_problem(seed)
     result = max_product(tree, node_costs, edge_costs)
     for node in range(len(tree)):
@@ -60,7 +63,7 @@ def test_foundation_row_minima_are_the_outgoing_messages(seed):
             np.testing.assert_allclose(rows.min(axis=1), np.concatenate(sent), atol=1e-12)
 
 
-def test_dropping_particles_outside_the_best_configuration_keeps_its_cost():
+def test_dropping_particles_outside_the_best_configuration_keeps_its_cost() -> None:
     tree, node_costs, edge_costs = random_problem(4)
     result = max_product(tree, node_costs, edge_costs)
     pick = result.assignment
@@ -72,7 +75,7 @@ def test_dropping_particles_outside_the_best_configuration_keeps_its_cost():
     assert alone.cost == pytest.approx(result.cost)
 
 
-def test_mismatched_shapes_are_refused():
+def test_mismatched_shapes_are_refused() -> None:
     tree = PartTree(("a", "b"), (-1, 0))
     with pytest.raises(ValueError, match="edge to node 1"):
         max_product(tree, [np.zeros(2), np.zeros(3)], [np.zeros((3, 2))])

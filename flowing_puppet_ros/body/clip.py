@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Clipping a cloud to the surroundings of believed limbs; visual hulls grow fins where no camera looks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Radius in metres at both ends of the limbs between joints.
+LIMBS: tuple[tuple[str, str, float, float], ...] = (
+    ("shoulder", "elbow", 0.055, 0.045),
+    ("elbow", "wrist", 0.045, 0.035),
+    ("wrist", "hand", 0.045, 0.045),
+    ("hip", "knee", 0.095, 0.06),
+    ("knee", "ankle", 0.065, 0.045),
+    ("ankle", "toe", 0.05, 0.045),
+)
+TRUNK: tuple[tuple[str, str, float, float], ...] = (
+    ("left_shoulder", "right_shoulder", 0.08, 0.08),
+    ("neck", "pelvis", 0.13, 0.14),
+    ("left_hip", "right_hip", 0.11, 0.11),
+    ("left_shoulder", "left_hip", 0.09, 0.11),
+    ("right_shoulder", "right_hip", 0.09, 0.11),
+    ("neck", "head_top", 0.08, 0.11),
+)
+
+
+def near_limbs(points: np.ndarray, joints: dict[str, np.ndarray], factor: float) -> np.ndarray:
+    """Which points (N,) lie within `factor` limb radii of the limbs' axes.
+
+    Args:
+        points: (N, 3) metres.
+        joints: places (3,) of a body's joints, all that `LIMBS` and `TRUNK` name.
+        factor: multiple of the radii, about 1.5 to 2.5 for hulls.
+    """
+    sides = [(f"{side}_{a}", f"{side}_{b}", ra, rb) for side in ("left", "right") for a, b, ra, rb in LIMBS]
+    near = np.zeros(len(points), dtype=bool)
+    for first, second, first_radius, second_radius in (*sides, *TRUNK):
+        if first in joints and second in joints:
+            near |= _inside(points, joints[first], joints[second], factor * first_radius, factor * second_radius)
+    return near
+
+
+def _inside(points: np.ndarray, a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> np.ndarray:
+    axis = b - a
+    along = np.clip((points - a) @ axis / max(float(axis @ axis), 1e-9), 0.0, 1.0)
+    distance = np.linalg.norm(points - a - along[:, None] * axis, axis=1)
+    return distance < radius_a + along * (radius_b - radius_a)

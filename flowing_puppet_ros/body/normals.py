@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Thinning of clouds and normals for clouds that come without."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+NEIGHBOURS = 24
+
+
+def thinned(points: np.ndarray, normals: np.ndarray | None, limit: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Replace the points of each voxel by their mean until at most `limit` are left.
+
+    Args:
+        points: (N, 3).
+        normals: (N, 3) unit or None.
+        limit: wanted number of points.
+
+    Returns:
+        Points and normals; untouched when they are few enough.
+    """
+    size = float(np.ptp(points, axis=0).max()) / 400
+    kept, kept_normals = points, normals
+    while len(kept) > limit:
+        cells = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
+        _, group = np.unique(cells, axis=0, return_inverse=True)
+        count = np.bincount(group)[:, None]
+        kept = _sums(points, group) / count
+        if normals is not None:
+            total = _sums(normals, group)
+            length = np.linalg.norm(total, axis=1, keepdims=True)
+            kept_normals = total / np.where(length > 1e-9, length, 1)
+        size *= max(1.05, np.sqrt(len(kept) / limit))
+    return kept, kept_normals
+
+
+def _sums(values: np.ndarray, group: np.ndarray) -> np.ndarray:
+    return np.stack([np.bincount(group, column) for column in values.T], axis=1)
+
+
+def estimated_normals(points: np.ndarray, viewpoint: np.ndarray | None) -> np.ndarray:
+    """Outward unit normals (N, 3) of a cloud (N, 3) in metres, by Open3D.
+
+    Seen from one place they turn towards it. Otherwise they are made consistent over tangent planes (Hoppe et al.
+    1992), and all are turned over when most point towards the body's inside.
+    """
+    import open3d as o3d
+
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(min(NEIGHBOURS, len(points))))
+    if viewpoint is not None:
+        cloud.orient_normals_towards_camera_location(viewpoint)
+        return np.asarray(cloud.normals).copy()
+    if len(points) > NEIGHBOURS:
+        cloud.orient_normals_consistent_tangent_plane(NEIGHBOURS // 2)
+    normals = np.asarray(cloud.normals).copy()
+    # Around a limb the mean of a neighbourhood lies inside it, so that outward normals point away from it.
+    near = cKDTree(points).query_ball_point(points[:: max(1, len(points) // 500)], 0.12)
+    outward = [
+        float(normals[index] @ (points[index] - points[rows].mean(axis=0)))
+        for index, rows in zip(range(0, len(points), max(1, len(points) // 500)), near, strict=True)
+    ]
+    return normals if np.sum(outward) >= 0 else -normals

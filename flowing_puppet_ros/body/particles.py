@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Particles: hypotheses of the Stitched Puppet's parts, and the bodies made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Particles:
+    """Hypotheses of one part: thesis Eq. 44 with the rotation as a matrix.
+
+    Attributes:
+        center: (P, 3) metres.
+        rotation: (P, 3, 3) from the template pose.
+        pose: (P, D) pose deformation coefficients, standard deviations.
+        shape: (P, S) intrinsic shape coefficients, standard deviations.
+    """
+
+    center: np.ndarray
+    rotation: np.ndarray
+    pose: np.ndarray
+    shape: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.center)
+
+    def take(self, index: np.ndarray) -> Particles:
+        """Return the particles of `index`."""
+        return Particles(self.center[index], self.rotation[index], self.pose[index], self.shape[index])
+
+    @classmethod
+    def join(cls, groups: list[Particles]) -> Particles:
+        """Return the particles of all groups, in order."""
+        return cls(
+            np.concatenate([group.center for group in groups]),
+            np.concatenate([group.rotation for group in groups]),
+            np.concatenate([group.pose for group in groups]),
+            np.concatenate([group.shape for group in groups]),
+        )
+
+
+def state_of(model: StitchedPuppet, groups: list[Particles], pick: np.ndarray) -> BodyState:
+    """The body made of particle `pick[i]` of every part i."""
+    pose = np.zeros((len(groups), max(basis.shape[2] for basis in model.pose_basis)))
+    for part, group in enumerate(groups):
+        pose[part, : group.pose.shape[1]] = group.pose[pick[part]]
+    return BodyState(
+        np.stack([group.center[p] for group, p in zip(groups, pick, strict=True)]),
+        np.stack([group.rotation[p] for group, p in zip(groups, pick, strict=True)]),
+        pose,
+        np.stack([group.shape[p] for group, p in zip(groups, pick, strict=True)]),
+    )
+
+
+def particles_of(model: StitchedPuppet, states: list[BodyState]) -> list[Particles]:
+    """Per part one particle a body."""
+    return [
+        Particles(
+            np.stack([state.center[part] for state in states]),
+            np.stack([state.rotation[part] for state in states]),
+            np.stack([state.pose[part, : model.pose_basis[part].shape[2]] for state in states]),
+            np.stack([state.shape[part] for state in states]),
+        )
+        for part in range(len(model.tree))
+    ]

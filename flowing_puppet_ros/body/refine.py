@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The finish: Gauss-Newton over all parts at once, with one shape for the whole body and matches both ways.
+
+Where the search treats parts one by one, here the unknowns are the rotation, place and deformation of all sixteen parts
+and a single vector of intrinsic shape. Matches are renewed at every step and weighted by a Geman-McClure kernel that
+narrows from step to step, so that far limbs are first drawn in and the surface is then fitted closely.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowing_puppet_ros.body.correspondence import Cloud, Quadratic, attract
+from flowing_puppet_ros.body.energy import JointTargets
+from flowing_puppet_ros.body.joint_prior import JointPrior
+from flowing_puppet_ros.body.points import PointSet
+from flowing_puppet_ros.model import rotation as so3
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+
+MAX_COEFFICIENT = 3.5
+MAX_TURN = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class RefineWeights:
+    """Strength of each term against the mean squared distance between surfaces (square metres).
+
+    Attributes:
+        stitch: mean squared gap of an interface.
+        pose: squared pose coefficient.
+        shape: squared shape coefficient; weak, or heavy and thin people are drawn to the mean.
+        pairwise: half squared Mahalanobis distance of an edge to its Gaussian (Eq. 49).
+        sigma_start: first width of the robust kernel, metres.
+        sigma_end: last width.
+        iterations: steps.
+    """
+
+    stitch: float = 0.3
+    pose: float = 1e-6
+    shape: float = 1e-6
+    pairwise: float = 1e-6
+    sigma_start: float = 0.10
+    sigma_end: float = 0.03
+    iterations: int = 25
+
+
+class Refiner:
+    """Gauss-Newton for one model."""
+
+    def __init__(self, model: StitchedPuppet) -> None:
+        self._model = model
+        parts = range(len(model.tree))
+        self._points = [PointSet.of_part(model, part, np.arange(len(model.part_vertices[part]))) for part in parts]
+        self._share = 1.0 / np.bincount(np.concatenate(model.part_vertices), minlength=len(model.part_of_vertex))
+        self._prior = [JointPrior(pairwise) for pairwise in model.pairwise]
+        sizes = [6 + points.pose_basis.shape[2] for points in self._points]
+        ends = np.cumsum(sizes)
+        self._columns = [np.arange(end - size, end) for size, end in zip(sizes, ends, strict=True)]
+        self._shape_columns = ends[-1] + np.arange(model.shape_basis[0].shape[2])
+        self._regressor = np.zeros((len(model.joint_names), len(model.part_of_vertex)))
+        for row, (index, weight) in enumerate(zip(model.joint_index, model.joint_weight, strict=True)):
+            np.add.at(self._regressor[row], index, weight)
+
+    def run(self, state: BodyState, cloud: Cloud | None, targets: JointTargets, weights: RefineWeights) -> BodyState:
+        """Refine a body; without a cloud only believed joints, stitching and priors count.
+
+        All parts of the result have the same shape coefficients; it starts from their mean.
+        """
+        state = BodyState(
+            state.center.copy(),
+            state.rotation.copy(),
+            state.pose.copy(),
+            np.tile(state.shape.mean(axis=0), (len(state.shape), 1)),
+        )
+        ratio = weights.sigma_end / weights.sigma_start
+        for step in range(weights.iterations):
+            sigma = weights.sigma_start * ratio ** (step / max(weights.iterations - 1, 1))
+            state = self._step(state, cloud, targets, weights, sigma)
+        return state
+
+    def _step(
+        self, state: BodyState, cloud: Cloud | None, targets: JointTargets, weights: RefineWeights, sigma: float
+    ) -> BodyState:
+        local = [
+            points.local(state.pose[part, None, : points.pose_basis.shape[2]], state.shape[part, None])[0]
+            for part, points in enumerate(self._points)
+        ]
+        jacobians = [self._jacobian(part, state.rotation[part], local[part]) for part in range(len(local))]
+        world = [
+            points @ rotation.T + center
+            for points, rotation, center in zip(local, state.rotation, state.center, strict=True)
+        ]
+        size = self._shape_columns[-1] + 1
+        hessian, gradient = np.zeros((size, size)), np.zeros(size)
+        vertices = self._merge(world)
+        if cloud is not None:
+            self._add_quadratic(attract(vertices, self._model.faces, cloud, sigma), jacobians, hessian, gradient)
+        self._add_joints(targets, vertices, jacobians, hessian, gradient)
+        self._add_stitching(weights.stitch, world, jacobians, hessian, gradient)
+        self._add_priors(state, weights, hessian, gradient)
+        hessian[np.diag_indices(size)] += 1e-9 + 1e-3 * hessian.diagonal()
+        return self._moved(state, np.linalg.solve(hessian, -gradient))
+
+    def _jacobian(self, part: int, rotation: np.ndarray, local: np.ndarray) -> np.ndarray:
+        """Derivative (N, 3, 6 + D + S) of the world points by turn (multiplied on the right), place, pose and shape."""
+        points = self._points[part]
+        cross = np.zeros((len(local), 3, 3))
+        cross[:, 0, 1], cross[:, 0, 2] = local[:, 2], -local[:, 1]
+        cross[:, 1, 0], cross[:, 1, 2] = -local[:, 2], local[:, 0]
+        cross[:, 2, 0], cross[:, 2, 1] = local[:, 1], -local[:, 0]
+        identity = np.broadcast_to(rotation.T, cross.shape)
+        return rotation @ np.concatenate([cross, identity, points.pose_basis, points.shape_basis], axis=2)
+
+    def _merge(self, world: list[np.ndarray]) -> np.ndarray:
+        """Template vertices (V, 3): the mean of the copies in different parts."""
+        vertices = np.zeros((len(self._share), 3))
+        for rows, points in zip(self._model.part_vertices, world, strict=True):
+            vertices[rows] += points * self._share[rows, None]
+        return vertices
+
+    def _block(self, part: int) -> np.ndarray:
+        return np.concatenate([self._columns[part], self._shape_columns])
+
+    def _add_quadratic(
+        self, quadratic: Quadratic, jacobians: list[np.ndarray], hessian: np.ndarray, gradient: np.ndarray
+    ) -> None:
+        for part, jacobian in enumerate(jacobians):
+            rows = self._model.part_vertices[part]
+            share = self._share[rows]
+            weighted = (share[:, None, None] * quadratic.matrix[rows]) @ jacobian
+            flat = jacobian.reshape(-1, jacobian.shape[2])
+            columns = self._block(part)
+            hessian[np.ix_(columns, columns)] += flat.T @ weighted.reshape(flat.shape)
+            gradient[columns] += (share[:, None] * quadratic.vector[rows]).reshape(-1) @ flat
+
+    def _add_joints(
+        self,
+        targets: JointTargets,
+        vertices: np.ndarray,
+        jacobians: list[np.ndarray],
+        hessian: np.ndarray,
+        gradient: np.ndarray,
+    ) -> None:
+        chosen = np.flatnonzero(targets.weight > 0)
+        if not len(chosen):
+            return
+        rows = np.zeros((len(chosen), 3, len(gradient)))
+        for part, jacobian in enumerate(jacobians):
+            vertex = self._model.part_vertices[part]
+            share = self._regressor[np.ix_(chosen, vertex)] * self._share[vertex]
+            rows[:, :, self._block(part)] += np.tensordot(share, jacobian, 1)
+        gap = self._regressor[chosen] @ vertices - targets.points[chosen]
+        flat = rows.reshape(-1, len(gradient))
+        weight = np.repeat(targets.weight[chosen], 3)
+        hessian += (flat * weight[:, None]).T @ flat
+        gradient += flat.T @ (weight * gap.reshape(-1))
+
+    def _add_stitching(
+        self,
+        strength: float,
+        world: list[np.ndarray],
+        jacobians: list[np.ndarray],
+        hessian: np.ndarray,
+        gradient: np.ndarray,
+    ) -> None:
+        for edge, (parent, child) in enumerate(self._model.tree.edges):
+            interface = self._model.interfaces[edge]
+            weight = np.repeat(strength * interface.weight / interface.weight.sum(), 3)
+            gap = (world[parent][interface.parent_index] - world[child][interface.child_index]).reshape(-1)
+            a = jacobians[parent][interface.parent_index].reshape(len(gap), -1)
+            b = jacobians[child][interface.child_index].reshape(len(gap), -1)
+            shapes = len(self._shape_columns)
+            rows = np.concatenate([a[:, :-shapes], -b[:, :-shapes], a[:, -shapes:] - b[:, -shapes:]], axis=1)
+            columns = np.concatenate([self._columns[parent], self._columns[child], self._shape_columns])
+            hessian[np.ix_(columns, columns)] += (rows * weight[:, None]).T @ rows
+            gradient[columns] += rows.T @ (weight * gap)
+
+    def _add_priors(self, state: BodyState, weights: RefineWeights, hessian: np.ndarray, gradient: np.ndarray) -> None:
+        for part, columns in enumerate(self._columns):
+            hessian[columns[6:], columns[6:]] += weights.pose
+            gradient[columns[6:]] += weights.pose * state.pose[part, : len(columns) - 6]
+        hessian[self._shape_columns, self._shape_columns] += weights.shape
+        gradient[self._shape_columns] += weights.shape * state.shape[0]
+        for edge, (parent, child) in enumerate(self._model.tree.edges):
+            of_parent, of_child = self._columns[parent], self._columns[child]
+            block, slope = self._prior[edge].quadratic(
+                state.rotation[parent],
+                state.rotation[child],
+                state.pose[parent, : len(of_parent) - 6],
+                state.pose[child, : len(of_child) - 6],
+            )
+            columns = np.concatenate([of_parent[:3], of_child[:3], of_parent[6:], of_child[6:]])
+            hessian[np.ix_(columns, columns)] += weights.pairwise * block
+            gradient[columns] += weights.pairwise * slope
+
+    def _moved(self, state: BodyState, step: np.ndarray) -> BodyState:
+        center, rotation, pose = state.center.copy(), state.rotation.copy(), state.pose.copy()
+        for part, columns in enumerate(self._columns):
+            turn = step[columns[:3]]
+            turn = turn * min(1.0, MAX_TURN / max(float(np.linalg.norm(turn)), 1e-12))
+            center[part] += step[columns[3:6]]
+            rotation[part] = rotation[part] @ so3.exp(turn)
+            pose[part, : len(columns) - 6] += step[columns[6:]]
+        shape = np.clip(state.shape + step[self._shape_columns], -MAX_COEFFICIENT, MAX_COEFFICIENT)
+        return BodyState(center, rotation, np.clip(pose, -MAX_COEFFICIENT, MAX_COEFFICIENT), shape)

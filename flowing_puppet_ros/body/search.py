@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search for a body in a cloud: diverse particle max-product over the Stitched Puppet's parts (D-PMP)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowing_puppet_ros.body.energy import JointTargets, Judged, stitching_costs
+from flowing_puppet_ros.body.levenberg import improve
+from flowing_puppet_ros.body.particles import Particles, particles_of, state_of
+from flowing_puppet_ros.body.points import PartPoints
+from flowing_puppet_ros.body.proposals import Proposer
+from flowing_puppet_ros.body.schedule import Stage, four_stages
+from flowing_puppet_ros.evidence.cloud import CloudGrid
+from flowing_puppet_ros.inference.diverse import select_diverse
+from flowing_puppet_ros.inference.max_product import MaxProduct, max_product, message_foundation
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+
+
+@dataclass(frozen=True, slots=True)
+class SearchWeights:
+    """Constants of the energy and of the selection.
+
+    Attributes:
+        stitch: factor of squared gaps in metres; the thesis's alphas alone let parts drift apart.
+        mismatch: cost of a part all of whose normals contradict the cloud's (eta of Eq. 52, per fraction).
+        temperature: of the diverse selection.
+        neighbours: probability that a new particle is proposed by a neighbour.
+        lm_steps: Levenberg-Marquardt steps a new particle.
+        lm_points: surface points a part that they use.
+    """
+
+    stitch: float = 4.0
+    mismatch: float = 0.3
+    temperature: float = 0.1
+    neighbours: float = 0.5
+    lm_steps: int = 4
+    lm_points: int = 60
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """Result of a search: the best body, and the cost of Eq. 50 with the weights of the last stage."""
+
+    state: BodyState
+    cost: float
+
+
+class Search:
+    """D-PMP for one model; one instance serves any number of clouds."""
+
+    def __init__(self, model: StitchedPuppet, points: tuple[PartPoints, ...], weights: SearchWeights) -> None:
+        self._model = model
+        self._points = points
+        self._weights = weights
+        self._proposer = Proposer(model, points)
+
+    def run(
+        self,
+        start: list[Particles],
+        grid: CloudGrid,
+        targets: JointTargets,
+        stages: tuple[Stage, ...],
+        iterations: int,
+        rng: np.random.Generator,
+        progress: Callable[[float], None] | None = None,
+    ) -> Found:
+        """Improve particles and return the best body.
+
+        Args:
+            start: per part the first particles; their number stays.
+            grid: the cloud.
+            targets: believed joints.
+            stages: schedule; the last one ends at 1.
+            iterations: rounds of proposing and selecting.
+            rng: source of all randomness.
+            progress: called with the fraction done.
+        """
+        counts = [len(particles) for particles in start]
+        judged = [
+            Judged.judge(points, particles, grid, targets)
+            for points, particles in zip(self._points, start, strict=True)
+        ]
+        best = self._solve(judged, stages[0])[0].assignment
+        for iteration in range(iterations):
+            stage = next(stage for stage in stages if iteration < stage.until * iterations or stage is stages[-1])
+            proposed = [self._propose(part, judged, best, stage, rng) for part in range(len(judged))]
+            judged = [
+                group.extend(Judged.judge(points, self._improve(points, new, grid, targets), grid, targets))
+                for points, group, new in zip(self._points, judged, proposed, strict=True)
+            ]
+            result, edges = self._solve(judged, stage)
+            judged = [
+                group.take(self._select(part, counts[part], result, edges, stage.greedy))
+                for part, group in enumerate(judged)
+            ]
+            best = np.zeros(len(judged), dtype=np.int64)
+            if progress is not None:
+                progress((iteration + 1) / iterations)
+        result, _ = self._solve(judged, stages[-1])
+        return Found(state_of(self._model, [group.particles for group in judged], result.assignment), result.cost)
+
+    def energy(self, state: BodyState, grid: CloudGrid) -> float:
+        """Eq. 50 of one body, with every weight as in the last stage of the search."""
+        none = JointTargets.none(self._model)
+        judged = [
+            Judged.judge(points, group, grid, none)
+            for points, group in zip(self._points, particles_of(self._model, [state]), strict=True)
+        ]
+        return self._solve(judged, four_stages(self._model.tree)[-1])[0].cost
+
+    def _propose(
+        self, part: int, judged: list[Judged], best: np.ndarray, stage: Stage, rng: np.random.Generator
+    ) -> Particles:
+        if stage.greedy:
+            copies = judged[part].particles.take(np.full(len(judged[part].particles), best[part]))
+            return self._proposer.walk(copies, stage.noise, rng, deformation_only=0.5)
+        return self._proposer.propose(part, judged, stage.noise, self._weights.neighbours, rng)
+
+    def _improve(self, points: PartPoints, new: Particles, grid: CloudGrid, targets: JointTargets) -> Particles:
+        return improve(points, new, grid, targets, self._weights.lm_steps, self._weights.lm_points)
+
+    def _solve(self, judged: list[Judged], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
+        """Run max-product with the weights of a stage (Eqs. 50-52)."""
+        nodes = [
+            beta * (group.distance + self._weights.mismatch * group.mismatch) + group.pull
+            for beta, group in zip(stage.data, judged, strict=True)
+        ]
+        edges = []
+        for edge, (parent, child) in enumerate(self._model.tree.edges):
+            a, b = judged[parent], judged[child]
+            centers = a.particles.center, b.particles.center
+            weight = self._model.interfaces[edge].weight
+            cost = stitching_costs(weight, a.interfaces[edge], b.interfaces[edge], centers, self._weights.stitch)
+            edges.append(stage.stitch[edge] * cost)
+        return max_product(self._model.tree, nodes, edges), edges
+
+    def _select(self, part: int, count: int, result: MaxProduct, edges: list[np.ndarray], greedy: bool) -> np.ndarray:
+        """Choose the particles to keep, the one of the best body first."""
+        kept = int(result.assignment[part])
+        if greedy:
+            order = np.argsort(result.marginals[part], kind="stable")
+            return np.concatenate([[kept], order[order != kept][: count - 1]])
+        foundation = message_foundation(self._model.tree, edges, result, part)
+        return select_diverse(foundation, count, kept, self._weights.temperature)

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Map every vertex of one scan to its point on another through two fits of one body model."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from flowing_puppet_ros.body.io import read_scan
+from flowing_puppet_ros.body.surface import correspond
+from flowing_puppet_ros.errors import InputError
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("fit_a", type=Path, metavar="A.npz", help="fit of scan A, as `fit` writes it")
+    parser.add_argument("fit_b", type=Path, metavar="B.npz", help="fit of scan B")
+    parser.add_argument("--scan-a", type=Path, required=True, metavar="FILE", help="scan A, a mesh or cloud")
+    parser.add_argument("--scan-b", type=Path, required=True, metavar="FILE", help="scan B, a mesh or cloud")
+    parser.add_argument("--out", type=Path, required=True, metavar="PAIRS.npz", help="points (N,3), distance (N,)")
+    parser.add_argument("--json", action="store_true", help="print a JSON object on stdout")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write for every vertex of scan A its point on scan B, in scan B's frame and unit."""
+    vertices_a, faces_a = _read_fit(arguments.fit_a)
+    vertices_b, faces_b = _read_fit(arguments.fit_b)
+    if not np.array_equal(faces_a, faces_b):
+        raise InputError(f"{arguments.fit_a} and {arguments.fit_b} are fits of different models; fit both with one")
+    scan_a, scan_b = read_scan(arguments.scan_a), read_scan(arguments.scan_b)
+    points, distance = correspond(vertices_a, vertices_b, faces_a, scan_a, scan_b)
+    try:
+        with arguments.out.open("wb") as file:
+            np.savez_compressed(file, points=points.astype(np.float32), distance=distance.astype(np.float32))
+    except OSError as error:
+        raise InputError(f"--out {arguments.out} cannot be written: {error.strerror}") from error
+    if arguments.json:
+        summary = {"output": str(arguments.out), "pairs": len(points), "mean_distance": float(distance.mean())}
+        print(json.dumps(summary))
+    return 0
+
+
+def _read_fit(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return arrays["vertices"].astype(np.float64), arrays["faces"].astype(np.int64)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} is no fit; make it with `flowing-puppet fit`") from error

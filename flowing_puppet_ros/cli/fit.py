@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit the 3D Stitched Puppet to meshes and clouds of one person each."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
+from flowing_puppet_ros.body.frames import UNITS, Y_UP, Z_UP, Frame, guess_scale, up_candidates
+from flowing_puppet_ros.body.io import Scan, read_scan, write_ply
+from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.view.palette import part_colours
+
+WRITTEN_SHAPES = 4
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's arguments."""
+    parser.add_argument("inputs", nargs="+", type=Path, metavar="INPUT", help=".ply .obj .off .stl .pcd .xyz .npy .npz")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for <stem>.npz and <stem>.ply")
+    parser.add_argument(
+        "--model", choices=("neutral", "female", "male"), default="neutral", help="body model [neutral]"
+    )
+    FitterSettings.add_arguments(parser)
+    parser.add_argument("--up", choices=("y", "z", "auto"), default="auto", help="the input's up axis [auto]")
+    parser.add_argument("--unit", choices=(*UNITS, "auto"), default="auto", help="the input's unit [auto]")
+    parser.add_argument(
+        "--view",
+        choices=("full", "single"),
+        default="full",
+        help="whether the input shows all sides, or one, seen from the origin of its frame [full]",
+    )
+    parser.add_argument("--json", action="store_true", help="print one JSON object per input on stdout")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fit every input; one that fails is reported and the others go on."""
+    stems = Counter(path.stem for path in arguments.inputs)
+    double = next((stem for stem, count in stems.items() if count > 1), None)
+    if double is not None:
+        raise InputError(f"two inputs are called {double!r} and would overwrite each other's result; fit them apart")
+    try:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {arguments.out} cannot be made: {error.strerror}") from error
+    fitter = BodyFitter(StitchedPuppet.load(arguments.model), FitterSettings.from_arguments(arguments))
+    status = 0
+    for path in arguments.inputs:
+        try:
+            summary = _fit_file(path, fitter, arguments)
+        except PuppetError as error:
+            print(f"flowing-puppet fit: {error}", file=sys.stderr)
+            summary = {"input": str(path), "error": str(error)}
+            status = max(status, error.exit_status)
+        if arguments.json:
+            print(json.dumps(summary), flush=True)
+    return status
+
+
+def _fit_file(path: Path, fitter: BodyFitter, arguments: argparse.Namespace) -> dict[str, object]:
+    started = time.perf_counter()
+    scan = read_scan(path)
+    with tqdm(total=100, desc=path.name, unit="%", file=sys.stderr, leave=not arguments.json) as bar:
+        frame, fit = _best_fit(scan, fitter, arguments, bar)
+    seconds = time.perf_counter() - started
+    stem = arguments.out / path.stem
+    vertices = frame.to_scan(fit.vertices).astype(np.float32)
+    model = fitter.model
+    np.savez_compressed(
+        stem.with_name(path.stem + ".npz"),
+        vertices=vertices,
+        faces=model.faces,
+        part_of_vertex=model.part_of_vertex,
+        part_names=np.array(model.tree.names),
+        part_rotation=(frame.rotation.T @ fit.state.rotation).astype(np.float32),
+        part_center=frame.to_scan(fit.state.center).astype(np.float32),
+        part_confidence=fit.part_confidence.astype(np.float32),
+        joint_names=np.array(model.joint_names),
+        joints=frame.to_scan(fit.joints).astype(np.float32),
+        shape_coefficients=fit.state.shape[:, :WRITTEN_SHAPES].astype(np.float32),
+        all_shape_coefficients=fit.state.shape.astype(np.float32),
+        pose_coefficients=fit.state.pose.astype(np.float32),
+        energy=fit.energy,
+        confidence=fit.confidence,
+        two_way_distance=fit.two_way_distance / frame.scale,
+        seconds=seconds,
+        model=model.name,
+    )
+    colours = part_colours(model.tree.names)[model.part_of_vertex]
+    write_ply(stem.with_name(path.stem + ".ply"), vertices, model.faces, colours)
+    return {
+        "input": str(path),
+        "output": str(stem.with_name(path.stem + ".npz")),
+        "model": model.name,
+        "energy": fit.energy,
+        "confidence": fit.confidence,
+        "two_way_distance_m": fit.two_way_distance,
+        "metres_per_unit": frame.scale,
+        "up": "y" if np.array_equal(frame.rotation, Y_UP) else "z",
+        "seconds": seconds,
+    }
+
+
+def _best_fit(scan: Scan, fitter: BodyFitter, arguments: argparse.Namespace, bar: tqdm) -> tuple[Frame, BodyFit]:
+    """Fit in every frame that the scan may have and keep the closest body."""
+    scale = guess_scale(scan) if arguments.unit == "auto" else UNITS[arguments.unit]
+    rotations = up_candidates(scan, scale) if arguments.up == "auto" else [{"y": Y_UP, "z": Z_UP}[arguments.up]]
+    rng = np.random.default_rng(fitter.settings.seed)
+    points, normals = scan.surface(fitter.settings.cloud_points, rng)
+    sensor = _sensor(points, normals) if arguments.view == "single" else None
+    fits = []
+    for turn, rotation in enumerate(rotations):
+        frame = Frame(scale, rotation)
+        viewpoint = None if sensor is None else frame.to_body(sensor)
+        fit = fitter.fit(
+            frame.to_body(points),
+            None if normals is None else normals @ rotation.T,
+            viewpoint=viewpoint,
+            progress=_shown(bar, turn, len(rotations)),
+        )
+        fits.append((frame, fit))
+    return min(fits, key=lambda pair: pair[1].two_way_distance)
+
+
+def _shown(bar: tqdm, turn: int, turns: int) -> Progress:
+    def show(done: float) -> None:
+        bar.update(int(100 * (turn + done) / turns) - bar.n)
+
+    return show
+
+
+def _sensor(points: np.ndarray, normals: np.ndarray | None) -> np.ndarray:
+    """Where the sensor stood: the origin when it lies outside the cloud, otherwise where the normals look."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    if np.any((low > 0) | (high < 0)):
+        return np.zeros(3)
+    if normals is None:
+        raise InputError("--view single needs the sensor at the origin of the input's frame, or normals; give either")
+    mean = normals.mean(axis=0)
+    return points.mean(axis=0) + 3 * float(np.ptp(points, axis=0).max()) * mean / max(float(np.linalg.norm(mean)), 1e-9)
