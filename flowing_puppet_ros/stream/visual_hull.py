@@ -39,7 +39,7 @@ class VisualHullSettings(HullBuilderSettings):
     cameras: str = setting("", "names of the cameras, separated by commas")
     frame: str = setting("", "frame of the hull; empty for the topmost frame of the cameras on /tf_static")
     slop: float = setting(0.008, "largest difference of stamps within one set of images", unit="s", low=0.0, high=1.0)
-    every: int = setting(6, "a hull is built of every so many sets (all teach the background)", low=1, high=10000)
+    every: int = setting(6, "a hull is built of every so many sets that show somebody; all teach the background", low=1, high=10000)
 
 
 class VisualHullComponent(Component):
@@ -113,12 +113,13 @@ class VisualHullComponent(Component):
             self._seen = 0
         self._last_stamp = stamp
         self.counters["sets"] += 1
-        due = self._seen % self._settings.every == 0
-        self._seen += 1
         try:
             cameras = self._cameras()
             views = self._views(complete, cameras)
-            if not due or len(views) < MIN_VIEWS:
+            if len(views) < MIN_VIEWS:
+                return []
+            self._seen += 1
+            if self._seen % self._settings.every:
                 return []
             found = self._builder.build({name: view.hull_view for name, view in views.items()})
         except InputError as error:
@@ -134,12 +135,12 @@ class VisualHullComponent(Component):
                 raise InputError(f"no camera_info came yet on {name}/camera_info")
             frame = info.header.frame_id
             self._frame = self._frame or self._frames.root(frame.lstrip("/"))
-            pose = self._frames.pose(self._frame, frame)
-            if pose is None:
+            world = self._frames.pose(self._frame, frame)
+            if world is None:
                 raise InputError(f"/tf_static does not connect the frame {frame!r} of {name} with {self._frame!r}")
-            position, rotation = pose
-            world_to_camera = rotation.T, -rotation.T @ position
-            camera = Camera.from_info(info.k, info.d, info.width, info.height, *world_to_camera, info.distortion_model)
+            translation, rotation = world
+            size = info.width, info.height
+            camera = Camera.from_info(info.k, info.d, *size, rotation, translation, info.distortion_model)
             self._builder.set_camera(name, camera)
         return self._builder.cameras
 
