@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `replay`."""
     parser.add_argument("input", type=Path, help="bag: .mcap, .db3 or a rosbag2 folder")
     parser.add_argument("--out", type=Path, required=True, help="output bag: a .mcap file, or a folder with metadata")
-    parser.add_argument("--rate", type=float, default=0.0, help="speed in terms of the recording's; 0 is full speed [0]")
+    parser.add_argument("--rate", type=float, default=0.0, help="times the recording's speed; 0 is full speed [0]")
     parser.add_argument(
         "--topic-map", action="append", default=[], metavar="OLD:=NEW", help="rename a topic of the input (repeatable)"
     )
