@@ -73,19 +73,21 @@ def namespace(topic: str) -> str:
 
 
 def read_recording(given: Bag, made: Bag) -> Recording:
-    """Gather a replay's input bag `given` and output bag `made`.
+    """Gather a replay's input bag `given` and output bag `made`; what both hold is taken from the output.
 
     Raises InputError when `made` has neither puppets nor bodies, and says which topics it has.
     """
     recording = Recording(counts={name: topic.count for name, topic in made.details.items()})
-    if not any(_is_puppets(name, kind) or kind == BODIES for name, kind in made.topics.items()):
+    carried = {_role(name, kind) for name, kind in made.topics.items()}
+    if not carried & {PUPPETS, BODIES}:
         names = ", ".join(sorted(made.topics)) or "none"
         raise InputError(f"{made.path} has neither puppets nor bodies; its topics are {names}")
     frames = FrameTree()
-    for bag, small in ((given, (INFO, TRANSFORMS, PUPPETS)), (made, (INFO, TRANSFORMS, PUPPETS, BODIES, MESH))):
-        wanted = [name for name, kind in bag.topics.items() if kind in small and name != "/tf"]
+    missing = {INFO, TRANSFORMS, "detections"} - carried
+    for bag, roles in ((made, carried - {""}), (given, missing)):
+        wanted = [name for name, kind in bag.topics.items() if _role(name, kind) in roles]
         for record in bag.messages(wanted):
-            _take(recording, frames, record.topic, record.type, record.message, bag is made)
+            _take(recording, frames, record.topic, record.type, record.message)
     for name, kind in made.topics.items():
         leaf = name.rpartition("/")[2]
         if kind == CLOUD and leaf in ("hull", "points", "body_vertices"):
@@ -95,26 +97,30 @@ def read_recording(given: Bag, made: Bag) -> Recording:
     return recording
 
 
-def _is_puppets(topic: str, kind: str) -> bool:
-    return kind == PUPPETS and not topic.endswith("detections")
+def _role(topic: str, kind: str) -> str:
+    """What a topic of this type is read for: its type, or "detections"; empty when it is not read."""
+    leaf = topic.rpartition("/")[2]
+    if kind == PUPPETS and leaf == "detections":
+        return "detections"
+    unread = (kind == BODIES and leaf == "joints") or (kind == TRANSFORMS and leaf != "tf_static")
+    return kind if kind in (INFO, TRANSFORMS, PUPPETS, BODIES, MESH) and not unread else ""
 
 
-def _take(recording: Recording, frames: FrameTree, topic: str, kind: str, message: Any, made: bool) -> None:
-    if kind == TRANSFORMS:
+def _take(recording: Recording, frames: FrameTree, topic: str, kind: str, message: Any) -> None:
+    role = _role(topic, kind)
+    if role == TRANSFORMS:
         frames.add(message)
-    elif kind == MESH:
+    elif role == MESH:
         recording.triangles = np.array([triangle.vertex_indices for triangle in message.triangles], np.int64)
-    elif kind == BODIES:
-        if not topic.endswith("joints"):
-            recording.bodies[stamp_ns(message)] = list(message.bodies)
-            recording.body_frame = message.header.frame_id
+    elif role == BODIES:
+        recording.bodies[stamp_ns(message)] = list(message.bodies)
+        recording.body_frame = message.header.frame_id
     else:
         camera = recording.cameras.setdefault(namespace(topic), CameraRecord(namespace(topic)))
-        if kind == INFO:
+        if role == INFO:
             camera.info = message
-        elif _is_puppets(topic, kind):
-            if made:
-                camera.puppets[stamp_ns(message)] = sorted(message.puppets, key=lambda one: (-one.scale, one.id))
+        elif role == PUPPETS:
+            camera.puppets[stamp_ns(message)] = sorted(message.puppets, key=lambda one: (-one.scale, one.id))
         else:
             camera.detections[stamp_ns(message)] = list(message.puppets)
         camera.frame_id = camera.frame_id or message.header.frame_id

@@ -49,7 +49,7 @@ def orthographic(
     points: np.ndarray,
     looking: Sequence[float] | np.ndarray,
     size: tuple[int, int],
-    up: Sequence[float] = (0.0, 0.0, 1.0),
+    up: Sequence[float] | np.ndarray = (0.0, 0.0, 1.0),
     margin: float = 0.05,
     scale: float | None = None,
 ) -> OrthographicCamera:

@@ -105,8 +105,11 @@ class ReportData:
 
 
 def gather(input_bag: Path, output_bag: Path, summary: Mapping[str, Any] | None = None) -> ReportData:
-    """Read both bags of a replay; raises InputError when one is no bag or the output has neither puppets nor bodies."""
-    with open_bag(input_bag) as given, open_bag(output_bag) as made:
+    """Read both bags of a replay, also where they are cut off.
+
+    Raises InputError when one is no bag or the output has neither puppets nor bodies.
+    """
+    with open_bag(input_bag, salvage=True) as given, open_bag(output_bag, salvage=True) as made:
         recording = read_recording(given, made)
         data = ReportData(input_bag.name, output_bag.name, summary or {}, recording.start, recording.counts)
         tracked = [camera for camera in recording.cameras.values() if camera.puppets]

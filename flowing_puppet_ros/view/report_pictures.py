@@ -215,8 +215,8 @@ def body_mesh(body: Any, vertices: Any, triangles: np.ndarray, hull: Any | None)
 
 def body_shot(stamp: int, body: Any, mesh: BodyMesh, images: Sequence[tuple[str, Camera, np.ndarray]]) -> BodyShot:
     """Draw a body from two sides and over (camera name, camera, image)."""
-    forward, left = facing(body_joints(body))
-    front, side = (_from_side(mesh, -direction) for direction in (forward, left))
+    forward, left, up = facing(body_joints(body))
+    front, side = (_from_side(mesh, -direction, up) for direction in (forward, left))
     views = []
     for name, camera, image in images:
         box = Box.around(camera.project(mesh.vertices)[0], image.shape, 0.12)
@@ -234,24 +234,34 @@ def _cropped(camera: Camera, box: Box) -> Camera:
     return replace(camera, matrix=matrix, size=(box.right - box.left, box.bottom - box.top))
 
 
-def facing(joints: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Horizontal unit vectors to the person's front and left, from shoulders and hips; x and y when unknown."""
-    left = np.zeros(3)
-    for joint in ("shoulder", "hip"):
-        sides = joints.get(f"left_{joint}"), joints.get(f"right_{joint}")
-        if sides[0] is not None and sides[1] is not None:
-            left += sides[0] - sides[1]
-    left[2] = 0
+def facing(joints: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vectors to the person's front and left and upwards, from shoulders and hips; x, y and z when unknown.
+
+    Up is z, unless the trunk is nearer to lying in a z-up frame: then the axis nearest to the trunk, as in clouds in
+    the frame of an optical sensor (y down).
+    """
+    x, y, z = np.eye(3)
+    sides = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "hip")}
+    if not sides <= set(joints):
+        return x, y, z
+    shoulders, hips = ([joints[f"{side}_{joint}"] for side in ("left", "right")] for joint in ("shoulder", "hip"))
+    trunk = shoulders[0] + shoulders[1] - hips[0] - hips[1]
+    nearest = int(np.abs(trunk).argmax())
+    up = z if trunk[2] > 0.3 * np.linalg.norm(trunk) else np.sign(trunk[nearest]) * np.eye(3)[nearest]
+    left = shoulders[0] - shoulders[1] + hips[0] - hips[1]
+    left = left - (left @ up) * up
     length = float(np.linalg.norm(left))
-    left = left / length if length > 1e-6 else np.array([0.0, 1.0, 0.0])
-    return np.cross(left, [0.0, 0.0, 1.0]), left
+    if not length > 1e-6:
+        return x, y, z
+    return np.cross(left / length, up), left / length, up
 
 
-def _from_side(mesh: BodyMesh, looking: np.ndarray) -> np.ndarray:
-    height = float(np.ptp(mesh.vertices[:, 2]))
-    reach = float(np.ptp(mesh.vertices[:, :2], axis=0).max())
+def _from_side(mesh: BodyMesh, looking: np.ndarray, up: np.ndarray) -> np.ndarray:
+    across = np.cross(looking, up)
+    height = float(np.ptp(mesh.vertices @ up))
+    reach = max(float(np.ptp(mesh.vertices @ direction)) for direction in (across, looking))
     scale = 0.88 * min(BODY_SIZE[1] / max(height, 1e-3), BODY_SIZE[0] / max(reach, 1e-3))
-    canvas = Canvas(orthographic(mesh.vertices, looking, BODY_SIZE, scale=scale), BODY_SIZE)
+    canvas = Canvas(orthographic(mesh.vertices, looking, BODY_SIZE, up, scale=scale), BODY_SIZE)
     canvas.mesh(mesh.vertices, mesh.faces, mesh.colours)
     if len(mesh.points):
         canvas.points(mesh.points, POINT_COLOUR, radius=0.9)

@@ -143,14 +143,16 @@ def joints_table(errors: JointErrors, unit: str, factor: float, caption: str) ->
 
 def settings_tables(summary: Mapping[str, Any]) -> str:
     """Fold away the settings, counters and other entries of a replay's summary; empty without any."""
-    html = ""
     plain = [(key, _text(value)) for key, value in summary.items() if not isinstance(value, (dict, list, tuple))]
-    if plain:
-        html += table(("entry", "value"), plain, (), "What the replay said about itself.")
-    for group in ("settings", "counters"):
+    html = table(("entry", "value"), plain, (), "What the replay said about itself.") if plain else ""
+    for group in ("settings", "counters", "seconds_of"):
+        alike: dict[tuple[tuple[str, str], ...], list[str]] = {}
         for name, values in summary.get(group, {}).items():
-            rows = [(key, _text(value)) for key, value in values.items()] if isinstance(values, dict) else []
-            html += table(("name", "value"), rows or [(name, _text(values))], (), f"{name}: {group}")
+            pairs = values.items() if isinstance(values, dict) else [("seconds", values)]
+            alike.setdefault(tuple((key, _text(value)) for key, value in pairs), []).append(name)
+        title = group.replace("seconds_of", "time")
+        for rows, names in alike.items():
+            html += table(("name", "value"), rows, (1,), f"{', '.join(names)}: {title}")
     return details("Settings and counters of the replay", html) if html else ""
 
 

@@ -17,6 +17,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.from_bag import read_recording
 from flowing_puppet_ros.view.report import collage, report_page, write_report
 from flowing_puppet_ros.view.report_data import gather
+from flowing_puppet_ros.view.report_pictures import facing
 
 type Replay = Callable[..., tuple[Path, Path]]
 
@@ -192,3 +193,27 @@ def test_the_same_bags_make_the_same_page(replay: Replay, tmp_path: Path) -> Non
         write_report(given, made, tmp_path / name, {"seconds": 2.0})
         pages.append((tmp_path / name).read_bytes())
     assert pages[0] == pages[1]
+
+
+def test_settings_that_are_alike_stand_in_one_table(replay: Replay) -> None:
+    summary = {
+        "settings": {"cam01/tracker": {"seed": 3}, "cam02/tracker": {"seed": 3}, "fitter": {"seed": 4}},
+        "seconds_of": {"fitter": 1.25},
+        "warnings": ["an image was <bad>"],
+    }
+    text = Page(report_page(gather(*replay(), summary=summary))).text
+    assert "cam01/tracker, cam02/tracker: settings" in text and "fitter: time" in text
+    assert "1 warning(s)" in text and "an image was <bad>" in text
+
+
+def test_facing_finds_up_in_other_frames() -> None:
+    upright = {
+        f"{side}_{joint}": np.array([0.0, y, z])
+        for side, y in (("left", 0.2), ("right", -0.2))
+        for joint, z in (("shoulder", 1.4), ("hip", 0.9))
+    }
+    assert np.allclose(facing(upright), np.eye(3))
+    # In an optical frame (x right, y down, z away) a person who faces the camera has its left at the right.
+    optical = {name: np.array([p[1], -p[2], 3 - p[0]]) for name, p in upright.items()}
+    assert np.allclose(facing(optical), [[0, 0, -1], [1, 0, 0], [0, -1, 0]])
+    assert np.allclose(facing({}), np.eye(3))
