@@ -25,6 +25,7 @@ from flowing_puppet_ros.stream.messages import FrameTree
 STATIC = "/tf_static"
 _CARRIED = (CAMERA_INFO, PUPPETS, TRANSFORMS)
 """Types of input topics that go into the output bag too, so that a viewer needs no other bag for frames and cameras."""
+_COMPONENTS = ("optical_flow", "puppet_tracker", "visual_hull", "body_fitter")
 _TOO_LARGE = ("flow/forward", "flow/backward")
 
 
@@ -88,11 +89,10 @@ class _Replay:
                     instance.component.wants(port.name, True)
 
     def _settings(self) -> dict[str, dict[str, Any]]:
-        names = ("puppet_tracker", "visual_hull", "body_fitter")
-        unknown = sorted(set(self._options.settings) - set(names))
+        unknown = sorted(set(self._options.settings) - set(_COMPONENTS))
         if unknown:
-            raise InputError(f"there is no component {unknown[0]!r}; there are {', '.join(names)}")
-        chosen = {name: dict(self._options.settings.get(name, {})) for name in names}
+            raise InputError(f"there is no component {unknown[0]!r}; there are {', '.join(_COMPONENTS)}")
+        chosen = {name: dict(self._options.settings.get(name, {})) for name in _COMPONENTS}
         for name in ("puppet_tracker", "body_fitter"):
             chosen[name].setdefault("seed", self._options.seed)
         return chosen

@@ -21,6 +21,9 @@ from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.errors import InputError
 
 
+_OF_NODES_ONLY = ("queue", "use_sim_time")
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `replay`."""
     parser.add_argument("input", type=Path, help="bag: .mcap, .db3 or a rosbag2 folder")
@@ -83,7 +86,8 @@ def read_params(path: Path) -> dict[str, dict[str, Any]]:
         values = entry.get("ros__parameters") if isinstance(entry, dict) else None
         if not isinstance(values, dict):
             raise InputError(f"the parameter file {path} has no ros__parameters under {str(name)!r}")
-        found[str(name).strip("/")] = values
+        settings = {key: value for key, value in values.items() if key not in _OF_NODES_ONLY}
+        found[str(name).rpartition("/")[2]] = settings
     return found
 
 
