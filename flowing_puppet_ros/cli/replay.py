@@ -20,7 +20,6 @@ from ruamel.yaml.error import YAMLError
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.errors import InputError
 
-
 _OF_NODES_ONLY = ("queue", "use_sim_time")
 
 

@@ -39,8 +39,7 @@ class VisualHullSettings(HullBuilderSettings):
     cameras: str = setting("", "names of the cameras, separated by commas")
     frame: str = setting("", "frame of the hull; empty for the topmost frame of the cameras on /tf_static")
     slop: float = setting(0.008, "largest difference of stamps within one set of images", unit="s", low=0.0, high=1.0)
-    every: int = setting(6,
-                         "sets with a person from one hull to the next; all teach the background", low=1, high=9999)  # fmt: skip
+    every: int = setting(6, "sets with a person from one hull to the next; all teach the background", low=1, high=9999)
 
 
 class VisualHullComponent(Component):
