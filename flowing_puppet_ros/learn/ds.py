@@ -21,6 +21,7 @@ Array = np.ndarray[Any, Any]
 
 COMPONENTS = 10
 POSES = 1500
+NEGLIGIBLE = 1e-6  # metres: components with less deviation are rounding noise and get coefficients of about 0
 # Standard deviations added to the pairwise variables: lengths depend exactly on shapes, which cannot be inverted.
 SHAPE_FLOOR, ANGLE_FLOOR, METRE_FLOOR = 0.03, 0.03, 0.003
 
@@ -55,7 +56,7 @@ def _fit_part(part: PartSamples, name: str, components: int) -> tuple[PartShape,
     flat = part.points.reshape(len(part.points), -1)
     mean = flat.mean(axis=0)
     _, values, axes = np.linalg.svd(flat - mean, full_matrices=False)
-    deviation = values[:components] / np.sqrt(len(flat) - 1)
+    deviation = np.maximum(values[:components] / np.sqrt(len(flat) - 1), NEGLIGIBLE)
     coefficients = (flat - mean) @ axes[:components].T / deviation
     basis = (axes[:components].T * deviation).reshape(*part.points.shape[1:], components)
     return PartShape(mean.reshape(-1, 2), basis, len(PART_JOINTS[name])), coefficients
@@ -101,10 +102,15 @@ def run(arguments: argparse.Namespace) -> int:
     """Learn one model and write it with its card."""
     if arguments.poses < 2 * COMPONENTS:
         raise InputError(f"--poses is {arguments.poses}; a model needs at least {2 * COMPONENTS}")
+    if arguments.seed < 0:
+        raise InputError(f"--seed is {arguments.seed}; it must be 0 or more")
+    try:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {arguments.out} cannot be made: {error.strerror}; choose another folder") from error
     rng = np.random.default_rng(arguments.seed)
     training = make_training_set(arguments.gender, arguments.parts, arguments.poses, rng, arguments.mocap)
     model = fit(arguments.gender, training)
-    arguments.out.mkdir(parents=True, exist_ok=True)
     path = arguments.out / f"ds_{model.name}.npz"
     np.savez_compressed(path, **model.to_arrays())  # type: ignore[arg-type]
     path.with_suffix(".md").write_text(_card(model, arguments), encoding="utf-8")

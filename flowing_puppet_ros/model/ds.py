@@ -15,6 +15,7 @@ import numpy as np
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model import weights
+from flowing_puppet_ros.model.ds_energy import PairwiseEnergy
 from flowing_puppet_ros.model.ds_infer import ShapeFromJoints
 from flowing_puppet_ros.model.ds_joints import JOINT_NAMES, PART_JOINTS, part_tree
 from flowing_puppet_ros.model.ds_shape import PairLayout, PartShape, PuppetShape, View, rotate
@@ -49,6 +50,7 @@ class DeformableStructures:
     joint_names: tuple[str, ...] = field(init=False)
     part_joints: tuple[tuple[int, ...], ...] = field(init=False)
     _shape_from_joints: ShapeFromJoints = field(init=False, repr=False)
+    _energy: PairwiseEnergy = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Derive names and the precomputed shape inference."""
@@ -58,6 +60,7 @@ class DeformableStructures:
         object.__setattr__(self, "part_joints", part_joints)
         inference = ShapeFromJoints(self.tree, self.shapes, self.pairwise, part_joints)
         object.__setattr__(self, "_shape_from_joints", inference)
+        object.__setattr__(self, "_energy", PairwiseEnergy(self.tree, self.shapes, self.pairwise, part_joints))
 
     @property
     def name(self) -> str:
@@ -150,6 +153,11 @@ class DeformableStructures:
         contours, coefficients = self._shape_from_joints((joints - origin) / to_pixels)
         placed = tuple(contour * to_pixels + origin for contour in contours)
         return PuppetShape(joints.copy(), placed, coefficients, scale, view)
+
+    def energy(self, shape: PuppetShape) -> float:
+        """-log p(l) of Eq. 5 in nats, with Z = 1, of a puppet that stands on its joints; lower is more likely."""
+        to_pixels = self._to_pixels(shape.scale, shape.view)
+        return self._energy((shape.joints - shape.joints[0]) / to_pixels, np.stack(shape.coefficients))
 
     def estimate_scale(self, joints: Array, confidence: Array) -> float:
         """Pixels per metre of a person with joints (J,2) in pixels (NaN where unknown) and their confidence (J,).

@@ -78,8 +78,9 @@ class ShapeFromJoints:
     def __call__(self, joints: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
         """Contours (K_i,2) and coefficients (Z,) of every part for joints (J,2); model space, metres.
 
-        After the inference every part is stretched along its bone so that the bone's ends lie on the given joints, and
-        the torso's contour follows what remains at its shoulders and hips.
+        After the inference every part is stretched along its bone so that the bone's ends lie on the given joints (what
+        lies beyond the ends, such as a hand beyond the wrist, keeps its size), and the torso's contour follows what
+        remains at its shoulders and hips.
         """
         observation, direction, center, length = self.observation(joints)
         posterior = (self._gain @ observation + self._offset).reshape(-1, self._size)
@@ -89,7 +90,9 @@ class ShapeFromJoints:
         model_length = np.maximum(points[self._contour_end + 1, 0] - proximal[:, 0], self._shortest)
         stretch = np.maximum(length / model_length, LEAST_STRETCH)
         part = self._part
-        points[:, 0] = (points[:, 0] - proximal[part, 0] - 0.5 * model_length[part]) * stretch[part]
+        along = points[:, 0] - proximal[part, 0]
+        inside = np.clip(along, 0.0, model_length[part])
+        points[:, 0] = along + inside * (stretch[part] - 1.0) - 0.5 * (model_length * stretch)[part]
         points = rotate(points, direction[part, 1], direction[part, 0]) + center[part]
         contours = [points[start:end] for start, end in zip(self._start, self._contour_end, strict=False)]
         residual = joints[self._flat_joints] - points[self._is_joint]
