@@ -8,7 +8,7 @@ SAMPLE := bags/cache/sample
 # The two variables that the ROS wheels leave in their children would keep another environment's Python from starting.
 CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: venv demo sample-bag test lint lock clean
+.PHONY: venv demo sample-bag test lint config lock clean
 
 venv:
 	@python=$$(sh scripts/find_python.sh) && $(CLEAN_ENV) "$$python" -I scripts/make_venv.py
@@ -27,6 +27,9 @@ lint: venv
 
 test: lint
 	@$(CLEAN_ENV) $(PYTHON) -m pytest
+
+config: venv
+	@$(PYTHON) scripts/write_config.py
 
 lock: venv
 	@$(PYTHON) scripts/lock.py

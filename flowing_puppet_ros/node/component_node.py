@@ -57,7 +57,7 @@ class ComponentNode[C: Component](Node):
         self._diagnostics = Diagnostics(self.get_fully_qualified_name(), name)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported = self._steady.now()
-        self._outputs = {port.name: self._publishers(port) for port in self.component.outputs}
+        self._outputs = {port.name: self._open_output(port) for port in self.component.outputs}
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
         self._optional = [port for port in self.component.inputs if port.optional]
         self._lazy = [port for port in self.component.outputs if port.lazy]
@@ -87,7 +87,7 @@ class ComponentNode[C: Component](Node):
                 qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
 
-    def _publishers(self, port: Port) -> list[tuple[Publisher, Callable[[Any], Any]]]:
+    def _open_output(self, port: Port) -> list[tuple[Publisher, Callable[[Any], Any]]]:
         """Return the publishers of a port, each with what makes its message out of the component's."""
         made: list[tuple[Publisher, Callable[[Any], Any]]]
         made = [(self._publisher(message_type(port.type), port.name, port.qos), _same)]

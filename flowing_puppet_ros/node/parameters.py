@@ -43,5 +43,6 @@ def declare[S: Settings](node: Node, settings_type: type[S]) -> S:
         try:
             values[info.name] = node.declare_parameter(info.name, info.default, descriptor(info)).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            raise InputError(f"parameter {info.name}: {error}; it is {info.description}") from error
+            reason = str(error).removesuffix(f": {info.name}")
+            raise InputError(f"parameter {info.name}: {reason}; it is the {info.description}") from error
     return settings_type.from_mapping(values)

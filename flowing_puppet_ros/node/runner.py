@@ -21,6 +21,7 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
     """
     try:
         import rclpy
+        from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
         from rclpy.utilities import remove_ros_args
 
         make_node = import_module(module).make_node
@@ -28,12 +29,12 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
         print(f"{name}: {error}; source a ROS 2 Jazzy, or run `make venv` in the source tree", file=sys.stderr)
         return 2
     given = [name, *(sys.argv[1:] if arguments is None else arguments)]
-    _parser(name, description).parse_args(remove_ros_args(given)[1:])
     try:
+        _parser(name, description).parse_args(remove_ros_args(given)[1:])
         rclpy.init(args=given)
         return _spin(name, make_node)
-    except (PuppetError, rclpy.exceptions.RCLError, rclpy._rclpy_pybind11.RCLInvalidROSArgsError) as error:
-        print(f"{name}: {error}", file=sys.stderr)
+    except (PuppetError, RCLError, UnknownROSArgsError) as error:
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         return 2
     finally:
         rclpy.try_shutdown()

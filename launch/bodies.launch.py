@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit bodies: `ros2 launch flowing_puppet_ros bodies.launch.py points:=/camera/points`, or from calibrated cameras.
+
+With `cameras:=cam01,cam02,cam03` the images of these namespaces are tracked, their visual hull is carved, and bodies
+are fitted to the hull; the poses of the cameras are read from /tf_static.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+try:
+    from launch import LaunchContext, LaunchDescription
+    from launch.actions import DeclareLaunchArgument, OpaqueFunction
+    from launch.substitutions import LaunchConfiguration
+    from launch_ros.actions import Node
+except ImportError as error:
+    sys.exit(
+        f"bodies.launch.py: {error}; launch files need a sourced ROS 2 Jazzy, without it start the nodes themselves"
+    )
+
+CONFIG = Path(__file__).resolve().parent.parent / "config"
+
+
+def nodes(context: LaunchContext) -> list[Node]:
+    """Return the body fitter, and in front of it the trackers and the hull of the named cameras."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in ("cameras", "points", "initial", "image")}
+    folder = Path(LaunchConfiguration("config").perform(context))
+    clock = {"use_sim_time": LaunchConfiguration("use_sim_time")}
+
+    def node(
+        name: str, namespace: str = "", remappings: list[tuple[str, str]] | None = None, **parameters: str
+    ) -> Node:
+        return Node(
+            package="flowing_puppet_ros",
+            executable=name,
+            name=name,
+            namespace=namespace,
+            output="screen",
+            parameters=[str(folder / f"{name}.yaml"), clock, *([parameters] if parameters else [])],
+            remappings=remappings or [],
+        )
+
+    cameras = [name for name in given["cameras"].split(",") if name]
+    if not cameras:
+        return [node("body_fitter", remappings=[("points", given["points"]), ("initial", given["initial"])])]
+    image = given["image"]
+    kinds = (("image", image), ("image/compressed", f"{image}/compressed"))
+    of_cameras = [(f"{camera}/{port}", f"{camera}/{topic}") for camera in cameras for port, topic in kinds]
+    return [
+        *(node("puppet_tracker", camera, list(kinds)) for camera in cameras),
+        node("visual_hull", remappings=of_cameras, cameras=",".join(cameras)),
+        node("body_fitter", remappings=[("points", "hull"), ("initial", "hull/joints")]),
+    ]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return the arguments and the nodes that follow from them."""
+    arguments = {
+        "cameras": ("", "namespaces of calibrated cameras, separated by commas; empty to fit the clouds on `points`"),
+        "image": ("image", "image topic in the namespace of each camera"),
+        "points": ("points", "cloud topic when there are no cameras"),
+        "initial": ("initial", "joints that start the fit (BodyArray), optional"),
+        "config": (str(CONFIG), "folder of the parameter files"),
+        "use_sim_time": ("false", "take the time from /clock"),
+    }
+    declared = [
+        DeclareLaunchArgument(name, default_value=value, description=text) for name, (value, text) in arguments.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=nodes)])

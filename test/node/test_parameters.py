@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings as ROS parameters: descriptors, overrides, refusals in one sentence."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import pytest
+import rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.node.parameters import declare
+from flowing_puppet_ros.settings import Settings, setting
+
+pytestmark = pytest.mark.ros
+
+
+@dataclass(frozen=True)
+class Sample(Settings):
+    """One setting of each kind."""
+
+    count: int = setting(3, "how many", low=1, high=9)
+    ratio: float = setting(0.5, "share", low=0.0)
+    mode: str = setting("a", "way", choices=("a", "b"))
+    loud: bool = setting(False, "speak")
+
+
+@pytest.fixture(autouse=True)
+def ros() -> Iterator[None]:
+    """Run each test in its own context."""
+    rclpy.init()
+    yield
+    rclpy.try_shutdown()
+
+
+def node(**overrides: object) -> Node:
+    """Return a node started with these parameters."""
+    given = [Parameter(name, value=value) for name, value in overrides.items()]
+    return Node("sample", parameter_overrides=given)
+
+
+def test_defaults_and_overrides() -> None:
+    assert declare(node(), Sample) == Sample()
+    assert declare(node(count=7, loud=True), Sample) == Sample(count=7, loud=True)
+
+
+def test_descriptors_show_help_range_and_choices() -> None:
+    made = node()
+    declare(made, Sample)
+    count, ratio, mode = (made.describe_parameter(name) for name in ("count", "ratio", "mode"))
+    assert count.description == "how many (1 to 9)"
+    assert (count.integer_range[0].from_value, count.integer_range[0].to_value) == (1, 9)
+    assert ratio.floating_point_range[0].from_value == 0.0
+    assert mode.additional_constraints == "one of a, b"
+    assert count.read_only
+
+
+@pytest.mark.parametrize(("name", "value"), [("count", 0), ("count", 1.5), ("ratio", -0.1), ("mode", "c")])
+def test_bad_values_are_one_sentence_with_the_name(name: str, value: object) -> None:
+    with pytest.raises(InputError, match=name) as refused:
+        declare(node(**{name: value}), Sample)
+    assert str(value) in str(refused.value)
+    assert "\n" not in str(refused.value)
