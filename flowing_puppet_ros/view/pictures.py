@@ -13,12 +13,16 @@ import numpy as np
 from flowing_puppet_ros.errors import InputError
 
 
+def to_height(image: np.ndarray, height: int) -> np.ndarray:
+    """Scale an image (H,W,3) to `height` rows with its aspect ratio."""
+    factor = height / image.shape[0]
+    size = (max(1, round(image.shape[1] * factor)), height)
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR))
+
+
 def shrink(image: np.ndarray, height: int) -> np.ndarray:
-    """Scale an image (H,W,3) down to `height` rows with its aspect ratio; a smaller image is returned as it is."""
-    if image.shape[0] <= height:
-        return image
-    width = max(1, round(image.shape[1] * height / image.shape[0]))
-    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    """Scale an image (H,W,3) down to `height` rows; a smaller image is returned as it is."""
+    return image if image.shape[0] <= height else to_height(image, height)
 
 
 def caption(image: np.ndarray, text: str, size: float = 0.5) -> np.ndarray:
@@ -48,13 +52,9 @@ def contact_sheet(images: Sequence[np.ndarray], columns: int, gap: int = 6, back
 
 def row(images: Sequence[np.ndarray], height: int, gap: int = 6, background: int = 255) -> np.ndarray:
     """Join images beside each other, all scaled to `height` rows."""
-    widths = [max(1, round(image.shape[1] * height / image.shape[0])) for image in images]
-    scaled = [
-        cv2.resize(i, (width, height), interpolation=cv2.INTER_AREA) for i, width in zip(images, widths, strict=True)
-    ]
     bar = np.full((height, gap, 3), background, np.uint8)
-    pieces = [piece for image in scaled for piece in (bar, image)]
-    return np.hstack([*pieces[1:]])
+    pieces = [piece for image in images for piece in (bar, to_height(image, height))]
+    return np.hstack(pieces[1:])
 
 
 def encode(image: np.ndarray, kind: str = "jpg", quality: int = 82) -> bytes:

@@ -12,8 +12,8 @@ import numpy as np
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.view.page import details, figure, page, paragraph, row, strip
+from flowing_puppet_ros.view.pictures import caption, save, to_height
 from flowing_puppet_ros.view.pictures import row as joined
-from flowing_puppet_ros.view.pictures import save
 from flowing_puppet_ros.view.plots import Series, heat_strip, line_plot
 from flowing_puppet_ros.view.report_data import BodiesData, ReportData, energy_series, error_series, gather
 from flowing_puppet_ros.view.report_tables import (
@@ -177,22 +177,21 @@ def _joints_section(data: ReportData) -> str:
 
 
 def collage(data: ReportData) -> np.ndarray:
-    """Join the main pictures in a row: puppet, optical flow, puppet flow, body; (560,W,3) RGB.
+    """Join pictures of about one moment in a row: puppet, optical flow, puppet flow, body; (560,W,3) RGB.
 
-    Raises InputError when there are none.
+    The moment is that of the liveliest flow shown. Raises InputError when there are no pictures.
     """
+    liveliest = max(data.flow, key=lambda shot: shot.full_scale, default=None)
+    moment = liveliest.stamp if liveliest else data.start
     pictures = []
     if data.strip:
-        pictures.append(data.strip[len(data.strip) // 2][1])
-    if data.flow:
-        shot = max(data.flow, key=lambda one: one.full_scale)
-        pictures += [shot.flow, shot.puppet_flow]
+        pictures.append((min(data.strip, key=lambda frame: abs(frame[0] - moment))[1], "flowing puppet"))
+    if liveliest:
+        pictures += [(liveliest.flow, "optical flow"), (liveliest.puppet_flow, "puppet flow")]
     if data.body_shots:
-        body = data.body_shots[len(data.body_shots) // 2]
-        pictures.append(body.front)
-        names = [name for name, _ in body.views]
-        if data.shown_camera in names:
-            pictures.append(body.views[names.index(data.shown_camera)][1])
+        body = min(data.body_shots, key=lambda shot: abs(shot.stamp - moment))
+        pictures.append((body.front, "stitched puppet"))
+        pictures += [(image, f"seen by {name}") for name, image in body.views if name == data.shown_camera]
     if not pictures:
         raise InputError(f"{data.output_name} gives no picture: it has neither puppets over images nor meshes")
-    return joined(pictures, PICTURE_HEIGHT)
+    return joined([caption(to_height(image, PICTURE_HEIGHT), text) for image, text in pictures], PICTURE_HEIGHT, 4, 190)

@@ -27,7 +27,7 @@ from flowing_puppet_ros.view.flow_colour import flow_legend, flow_scale, flow_to
 from flowing_puppet_ros.view.mesh_render import Canvas, orthographic
 from flowing_puppet_ros.view.overlay import DrawnPuppet, draw_puppets
 from flowing_puppet_ros.view.palette import part_colours
-from flowing_puppet_ros.view.pictures import shrink
+from flowing_puppet_ros.view.pictures import shrink, to_height
 
 STRIP_HEIGHT, FLOW_HEIGHT, VIEW_HEIGHT = 760, 400, 400
 BODY_SIZE = (360, 520)
@@ -153,18 +153,12 @@ def flow_shot(stamp: int, image: np.ndarray, following: np.ndarray, people: Sequ
     field = motion_field(labels, motions.affine, background)
     scale = flow_scale(forward[labels > 0][None] if (labels > 0).any() else forward)
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    whole = (draw_puppets(small, drawn, opacity=0.25, labels=False), flow_to_rgb(forward, scale))
-    seen, dense, puppet = (_fit(box.scaled(factor).cut(p)) for p in (*whole, flow_to_rgb(field, scale)))
+    outlined = draw_puppets(small, drawn, opacity=0.25, labels=False)
+    whole = (outlined, flow_to_rgb(forward, scale), flow_to_rgb(field, scale))
+    seen, dense, puppet = (to_height(box.scaled(factor).cut(p), FLOW_HEIGHT) for p in whole)
     size = min(dense.shape[:2]) // 5
     dense[-size:, -size:] = flow_legend(size)
     return FlowShot(stamp, seen, dense, puppet, explained_fraction(labels, field, forward), scale)
-
-
-def _fit(picture: np.ndarray) -> np.ndarray:
-    """A picture resized to the rows of the flow figures."""
-    factor = FLOW_HEIGHT / picture.shape[0]
-    size = (max(1, round(picture.shape[1] * factor)), FLOW_HEIGHT)
-    return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR))
 
 
 def paint_forest(people: Sequence[DrawnPuppet], shape: tuple[int, int]) -> tuple[np.ndarray, tuple[int, ...]]:
