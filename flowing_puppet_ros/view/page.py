@@ -44,6 +44,7 @@ svg .line{fill:none;stroke-width:1.8;stroke-linejoin:round}
 .key{display:inline-block;width:22px;height:4px;border-radius:2px;margin-right:7px;vertical-align:middle}
 .ramp{width:120px;height:10px;image-rendering:pixelated;vertical-align:middle}
 details{margin:10px 0}summary{cursor:pointer}
+@media(max-width:720px){th[scope=row],td.n{white-space:normal;overflow-wrap:normal}table{font-size:.88rem}}
 """ + "".join(f".s{k}{{stroke:var(--c{k})}}.d{k}{{fill:var(--c{k})}}.k{k}{{background:var(--c{k})}}" for k in range(8))
 
 # Without scripts every frame of a strip is shown, one below the other, and the controls are not.
