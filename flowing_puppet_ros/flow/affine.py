@@ -4,7 +4,8 @@
 A motion is a (2, 3) array A that takes a point of the first image to the second: p' = A [x, y, 1]^T. The thesis fits
 one to the flow inside every visible part (flowing puppets, section 2); here by iteratively reweighted least squares
 with a Geman-McClure weight, from a median translation on, each flow vector weighted by its round trip through the
-backward flow.
+backward flow. A part's outline always takes in some background: vectors that the background's motion explains weigh
+less in the parts, which matters where a limb moves and changes nothing where it rests.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ LEAST_FOR_TRANSLATION = 8
 RESIDUAL_FLOOR = 1.0  # px; flow noise that no fit should try to beat
 DEFORMATION = 0.3  # expected size of A's linear part beside the identity
 CORRELATED_PIXELS = 50.0  # neighbouring flow vectors err together: this many count as one
+BACKGROUND_SHARE = 0.3  # weight of a part's vector that moves just as the background does
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,7 +64,7 @@ def fit_affine(points: Floats, vectors: Floats, weights: Floats | None = None) -
     """Robust affine motion (2, 3) of flow `vectors` (N, 2) at `points` (N, 2), its residual in px and its support."""
     if weights is None:
         weights = np.ones(len(points))
-    samples = np.column_stack([points, vectors, weights])
+    samples = np.column_stack([points, vectors, weights, weights])
     affine = np.empty((2, 3))
     residual, support = _fit(np.ascontiguousarray(samples, dtype=np.float64), affine)
     return affine, residual, support
@@ -71,7 +73,8 @@ def fit_affine(points: Floats, vectors: Floats, weights: Floats | None = None) -
 def fit_regions(labels: NDArray[np.unsignedinteger], count: int, forward: Flow, backward: Flow | None) -> RegionMotions:
     """Fit one motion to each of the labels 0 .. count - 1 of `labels` (H, W), over the pixels with known flow.
 
-    Regions of few pixels get a translation, those of fewer still the identity and `known` False.
+    Label 0 is the background, the others are in front of it. Regions of few pixels get a translation, those of fewer
+    still the identity and `known` False.
     """
     back = backward if backward is not None else np.empty((0, 0, 2), np.float32)
     regions = np.ascontiguousarray(labels, dtype=np.uint16)
@@ -110,7 +113,10 @@ def _round_trip_weight(x: int, y: int, u: float, v: float, backward: Flow) -> fl
 def _gather(
     labels: NDArray[np.uint16], count: int, forward: Flow, backward: Flow
 ) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
-    """Samples (M, 5) = x, y, u, v, weight sorted by label, start of each label (count + 1,), pixels of each label."""
+    """Samples (M, 6) sorted by label, the first of each label (count + 1,), pixels of each label (count,).
+
+    A sample is x, y, u, v, how well the round trip closes in (0, 1], and its weight in a fit, for now the same.
+    """
     height, width = labels.shape
     pixels = np.zeros(count, np.int64)
     for y in range(height):
@@ -121,7 +127,7 @@ def _gather(
     starts = np.zeros(count + 1, np.int64)
     for region in range(count):
         starts[region + 1] = starts[region] + (pixels[region] + step[region] - 1) // step[region]
-    samples = np.empty((starts[count], 5))
+    samples = np.empty((starts[count], 6))
     seen = np.zeros(count, np.int64)
     for y in range(height):
         for x in range(width):
@@ -132,22 +138,29 @@ def _gather(
             if seen[region] % step[region] == 0:
                 row = samples[starts[region] + seen[region] // step[region]]
                 row[0], row[1], row[2], row[3] = x, y, u, v
-                row[4] = _round_trip_weight(x, y, u, v, backward)
+                row[4] = row[5] = _round_trip_weight(x, y, u, v, backward)
             seen[region] += 1
     return samples, starts, pixels
 
 
 @njit(cache=True)
-def _fit_all(
-    samples: Floats, starts: NDArray[np.int64], affine: Floats, residual: Floats, support: Floats
-) -> None:
-    for region in range(len(starts) - 1):
+def _fit_all(samples: Floats, starts: NDArray[np.int64], affine: Floats, residual: Floats, support: Floats) -> None:
+    """Fit the background, label 0, then discount in the other regions what moves with it and fit those."""
+    residual[0], support[0] = _fit(samples[: starts[1]], affine[0])
+    a = affine[0]
+    for k in range(starts[1], len(samples)):
+        x, y = samples[k, 0], samples[k, 1]
+        misfit_x = a[0, 0] * x + a[0, 1] * y + a[0, 2] - x - samples[k, 2]
+        misfit_y = a[1, 0] * x + a[1, 1] * y + a[1, 2] - y - samples[k, 3]
+        square = (misfit_x * misfit_x + misfit_y * misfit_y) / RESIDUAL_FLOOR**2
+        samples[k, 5] *= (BACKGROUND_SHARE + square) / (1.0 + square)
+    for region in range(1, len(starts) - 1):
         residual[region], support[region] = _fit(samples[starts[region] : starts[region + 1]], affine[region])
 
 
 @njit(cache=True)
 def _fit(samples: Floats, affine: Floats) -> tuple[float, float]:
-    """Write the robust motion of `samples` (x, y, u, v, weight) into `affine`; return residual and support."""
+    """Write the robust motion of `samples` (M, 6) into `affine`; return residual and support."""
     affine[:] = 0.0
     affine[0, 0] = affine[1, 1] = 1.0
     if len(samples) < LEAST_FOR_TRANSLATION:
@@ -179,7 +192,7 @@ def _reweighted_step(
         u, v = samples[k, 2], samples[k, 3]
         misfit_x = u - motion[0, 0] - motion[0, 1] * x - motion[0, 2] * y
         misfit_y = v - motion[1, 0] - motion[1, 1] * x - motion[1, 2] * y
-        weight = samples[k, 4] / (1.0 + (misfit_x * misfit_x + misfit_y * misfit_y) / (scale * scale)) ** 2
+        weight = samples[k, 5] / (1.0 + (misfit_x * misfit_x + misfit_y * misfit_y) / (scale * scale)) ** 2
         row = (1.0, x, y)
         for i in range(unknowns):
             for j in range(unknowns):
@@ -197,7 +210,7 @@ def _reweighted_step(
 def _agreement(
     samples: Floats, centre_x: float, centre_y: float, radius: float, scale: float, motion: Floats
 ) -> tuple[float, float]:
-    """Residual (px, root mean square over the inliers) and support (weighted share of inliers) of a motion."""
+    """Residual (px, root mean square over the inliers) and support (their share, by round trip) of a motion."""
     total, inlier, squares = 0.0, 0.0, 0.0
     for k in range(len(samples)):
         x, y = (samples[k, 0] - centre_x) / radius, (samples[k, 1] - centre_y) / radius

@@ -28,7 +28,7 @@ PRESETS = {
 SMALLEST_SIDE = 16
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class FlowSettings(Settings):
     """How the dense flow is computed."""
 

@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flowing-puppet tracker: people as 2D puppets, carried by optical flow and re-anchored by detections.
+
+Causal: each image is used once, with the flow from the one before it (thesis, flowing puppets, sections 1 and 2). The
+state of a person is the location of the joints, a scale and a view; the puppet follows from them (section 4).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.flow.estimate import (
+    FlowPair,
+    FlowSettings,
+    OpticalFlow,
+    as_image,
+    resize_flow,
+    working_size,
+)
+from flowing_puppet_ros.flow.puppet_flow import PuppetFlow
+from flowing_puppet_ros.image.association import Detection, associate
+from flowing_puppet_ros.image.carry import Carriage, Grid, carry_people, paint_people
+from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
+from flowing_puppet_ros.image.people import Person, TrackerSettings
+from flowing_puppet_ros.model.ds import DeformableStructures
+from flowing_puppet_ros.model.ds_render import depth_order
+from flowing_puppet_ros.model.ds_shape import PuppetShape, View
+
+type Floats = NDArray[np.float64]
+
+LEAST_KNOWN = 3  # a person of whom fewer joints are known is lost
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedPuppet:
+    """One person in one image, pixels of the image.
+
+    `joints` (J, 2) in the order of the model's joint_names, `confidence` (J,) in [0, 1], `scale` px/m, `view` front or
+    back, `contours` one (K_i, 2) a part, `depth` (P,) paint order of each part, 0 farthest, `energy` the negative log
+    of the body prior, the flow's misfit and the distance of the detection (up to a constant; lower is better).
+    """
+
+    id: str
+    model: str
+    joints: Floats
+    confidence: Floats
+    scale: float
+    view: View
+    energy: float
+    contours: tuple[Floats, ...]
+    depth: tuple[int, ...]
+    shape: PuppetShape
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackResult:
+    """What one step found: `puppets` in the order of their ids, `flow` (forward, backward) at working scale, or None.
+
+    `flow` leads from the previous image to this one; it is None for the first image and when nobody was tracked.
+    """
+
+    puppets: list[TrackedPuppet]
+    flow: FlowPair | None
+    warnings: list[str]
+    _model: DeformableStructures
+    _grid: Grid
+    _carriage: Carriage | None
+
+    def labels(self, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+        """Part labels (H, W) uint8 of all people, part index + 1, 0 background; `shape` is the image's if not given."""
+        height, width = shape or (self._grid.image[1], self._grid.image[0])
+        grid = Grid(self._grid.image, (width, height))
+        labels = paint_people(self._model, [puppet.shape for puppet in self.puppets], grid)
+        parts = len(self._model.tree)
+        return np.where(labels > 0, (labels - 1) % parts + 1, 0).astype(np.uint8)
+
+    def puppet_flow(self) -> PuppetFlow | None:
+        """The puppet flow from the previous image to this one, on the grid of `flow`; None where that is None."""
+        return self._carriage.puppet_flow() if self._carriage else None
+
+
+@dataclass(slots=True, eq=False)
+class _Previous:
+    """What the next step needs of an image: its stamp, the grid and the small grey picture."""
+
+    stamp_ns: int
+    grid: Grid
+    grey: NDArray[np.uint8]
+
+
+class FlowingPuppetTracker:
+    """Tracks people through the images of one camera; every step takes the next image."""
+
+    def __init__(
+        self,
+        model: DeformableStructures,
+        settings: TrackerSettings | None = None,
+        flow_settings: FlowSettings | None = None,
+    ) -> None:
+        self.model = model
+        self.settings = settings or TrackerSettings()
+        self.optical_flow = OpticalFlow(flow_settings)
+        self.people: list[Person] = []
+        self._previous: _Previous | None = None
+        self._started = 0
+
+    def reset(self) -> None:
+        """Forget everybody and the previous image; ids go on, so that none is used twice in a run."""
+        self.people = []
+        self._previous = None
+
+    def step(
+        self,
+        image: NDArray[np.uint8],
+        stamp_ns: int,
+        detections: Sequence[Keypoints] | None = None,
+        flow: FlowPair | None = None,
+    ) -> TrackResult:
+        """Take the next `image` (H, W, 3) RGB or (H, W) grey, uint8, and say who is where in it.
+
+        `detections` are the people a detector found in this image; None when none ran, empty when it found nobody.
+        `flow` is (forward from the previous image, backward to it), each (h, w, 2) in pixels of its own grid of any
+        resolution, NaN unknown; computed here when not given. A stamp before the previous one or an image of another
+        size restarts the tracker with a warning. InputError for what is no image.
+        """
+        image = as_image(image)
+        size = (image.shape[1], image.shape[0])
+        grid = Grid(size, working_size(image.shape, self.optical_flow.settings.max_side))
+        warnings = self._restart_if_broken(stamp_ns, size)
+        previous = self._previous
+        self._previous = _Previous(stamp_ns, grid, self.optical_flow.prepare(image))
+        carriage, pair = None, None
+        if previous is not None and self.people:
+            pair = self._flow(previous, flow, warnings)
+            carriage = carry_people(self.model, self.people, pair, grid, self.settings)
+        self._take(detections, warnings)
+        self.people = [person for person in self.people if self._lives(person, size)]
+        for person in self.people:
+            person.settle(self.model)
+        puppets = [self._puppet(person, size) for person in self.people]
+        return TrackResult(puppets, pair, warnings, self.model, grid, carriage)
+
+    def _restart_if_broken(self, stamp_ns: int, size: tuple[int, int]) -> list[str]:
+        previous = self._previous
+        if previous is None:
+            return []
+        if stamp_ns < previous.stamp_ns:
+            self.reset()
+            return [f"the stamp went back from {previous.stamp_ns} to {stamp_ns} ns: tracking starts anew"]
+        if size != previous.grid.image:
+            self.reset()
+            return [f"the image size changed from {previous.grid.image} to {size}: tracking starts anew"]
+        if stamp_ns == previous.stamp_ns:
+            return [f"two images have the stamp {stamp_ns} ns: both are used, in the order they came"]
+        return []
+
+    def _flow(self, previous: _Previous, given: FlowPair | None, warnings: list[str]) -> FlowPair:
+        if given is not None:
+            if all(part.ndim == 3 and part.shape[2] == 2 and min(part.shape[:2]) > 1 for part in given):
+                work = previous.grid.work
+                return resize_flow(given[0], work), resize_flow(given[1], work)
+            warnings.append(f"flow of shape {given[0].shape} is no (h, w, 2) field: it is computed here instead")
+        assert self._previous is not None
+        return self.optical_flow.between(previous.grey, self._previous.grey)
+
+    def _take(self, detections: Sequence[Keypoints] | None, warnings: list[str]) -> None:
+        """Fuse the detections into the people they belong to and start new people at the rest."""
+        for person in self.people:
+            person.unseen += 1
+            person.detection_energy = 0.0
+        if detections is None:
+            return
+        found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
+        matched, free = associate(self.people, found, self.settings.match_distance)
+        for index, person in enumerate(self.people):
+            person.missed += 1
+            if index in matched:
+                person.fuse(*found[matched[index]], self.settings)
+                person.update_scale_and_view(self.model)
+                person.unseen = person.missed = 0
+        # The surest new person comes first: it gets the lower id, and a place when there is only one left.
+        for index in sorted(free, key=lambda k: -found[k][1].sum()):
+            self._start(found[index], warnings)
+
+    def _start(self, detection: Detection, warnings: list[str]) -> None:
+        joints, confidence = detection
+        if np.count_nonzero(np.isfinite(joints).all(axis=1)) < self.settings.least_joints:
+            return
+        if len(self.people) >= self.settings.most_people:
+            warnings.append(f"more than {self.settings.most_people} people: the others are left out")
+            return
+        identity = letters(self.settings.seed) + str(self._started + 1)
+        try:
+            self.people.append(Person.start(identity, self.model, joints, confidence, self.settings))
+        except InputError as error:
+            warnings.append(f"a detected person is left out: {error}")
+            return
+        self._started += 1
+
+    def _lives(self, person: Person, size: tuple[int, int]) -> bool:
+        if person.unseen > self.settings.unseen_images or person.missed > self.settings.missed_detections:
+            return False
+        known = person.mean[~person.unknown]
+        if len(known) < LEAST_KNOWN:
+            return False
+        low, high = known.min(axis=0), known.max(axis=0)
+        return not ((high < 0).any() or (low > np.array(size) - 1).any())
+
+    def _puppet(self, person: Person, size: tuple[int, int]) -> TrackedPuppet:
+        shape = person.shape
+        assert shape is not None
+        order = depth_order(self.model, person.view)
+        depth = tuple(int(rank) for rank in np.argsort(order))
+        energy = self.model.energy(shape) + person.flow_energy + person.detection_energy
+        return TrackedPuppet(
+            person.id,
+            self.model.name,
+            person.mean.copy(),
+            person.confidence(size),
+            person.scale,
+            person.view,
+            float(energy),
+            shape.contours,
+            depth,
+            shape,
+        )
+
+
+def letters(seed: int) -> str:
+    """The seed as letters: 0 a, 1 b, ..., 25 z, 26 aa, ...: ids of runs with different seeds differ."""
+    text = ""
+    seed += 1
+    while seed > 0:
+        seed, digit = divmod(seed - 1, 26)
+        text = chr(ord("a") + digit) + text
+    return text

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read the frames of a video file or of a folder of images, one after the other."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+
+IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
+FOLDER_FPS = 30.0  # of images in a folder, which carry no rate
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One image (H, W, 3) RGB uint8, its index, its time since the start, and its file in a folder ("" in a video)."""
+
+    index: int
+    stamp_ns: int
+    image: NDArray[np.uint8]
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class FrameSource:
+    """Frames of a video or folder: iterate to read them; `count` is what the container says, 0 unknown."""
+
+    path: Path
+    fps: float
+    count: int
+    files: tuple[Path, ...]
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Yield the frames in order; InputError at the first that cannot be read."""
+        images = self._images() if self.files else self._video()
+        index = -1
+        for index, (image, path) in enumerate(images):
+            rgb = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+            yield Frame(index, round(index * 1e9 / self.fps), rgb, path)
+        if index < 0:
+            raise InputError(f"{self.path} has no frame that can be decoded; it is broken or of an unknown codec")
+
+    def _images(self) -> Iterator[tuple[NDArray[np.uint8], str]]:
+        for path in self.files:
+            image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+            if image is None:
+                raise InputError(f"{path} is no readable image; remove or replace it")
+            yield np.asarray(image, dtype=np.uint8), str(path)
+
+    def _video(self) -> Iterator[tuple[NDArray[np.uint8], str]]:
+        capture = cv2.VideoCapture(str(self.path))
+        try:
+            while True:
+                read, image = capture.read()
+                if not read:
+                    return
+                yield np.asarray(image, dtype=np.uint8), ""
+        finally:
+            capture.release()
+
+
+def open_frames(path: str | Path) -> FrameSource:
+    """Open a video file or a folder of images (in natural order: frame2 before frame10); InputError with the reason."""
+    path = Path(path)
+    if path.is_dir():
+        files = tuple(sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES), key=_natural))
+        if not files:
+            raise InputError(f"the folder {path} has no images ({' '.join(sorted(IMAGE_SUFFIXES))})")
+        return FrameSource(path, FOLDER_FPS, len(files), files)
+    if not path.is_file():
+        raise InputError(f"{path} does not exist; give a video file, a folder of images or a bag")
+    if path.suffix.lower() in IMAGE_SUFFIXES:
+        return FrameSource(path, FOLDER_FPS, 1, (path,))
+    capture = cv2.VideoCapture(str(path))
+    opened, fps, count = capture.isOpened(), capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    capture.release()
+    if not opened:
+        raise InputError(f"{path} is no video that can be read; give a video file, a folder of images or a bag")
+    rate = fps if np.isfinite(fps) and 0 < fps <= 1e4 else FOLDER_FPS
+    return FrameSource(path, float(rate), max(0, int(count)), ())
+
+
+def _natural(path: Path) -> tuple[list[tuple[int, int, str]], str]:
+    """Sorting key that compares the runs of digits in a name as numbers."""
+    pieces = re.findall(r"(\d+)|(\D+)", path.name)
+    return [(0, int(digits), "") if digits else (1, 0, text) for digits, text in pieces], path.name

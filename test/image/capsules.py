@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A body model of capsules with the interface of the Deformable Structures model: the tracker is tested alone."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.model.ds_shape import PuppetShape
+from flowing_puppet_ros.model.tree import DS10_PARENTS, PartTree
+
+MEAN = {
+    "neck": (0.0, -0.50),
+    "belly": (0.0, -0.12),
+    "face": (0.0, -0.68),
+    "right_shoulder": (-0.18, -0.46),
+    "left_shoulder": (0.18, -0.46),
+    "right_hip": (-0.10, 0.0),
+    "left_hip": (0.10, 0.0),
+    "right_elbow": (-0.30, -0.22),
+    "left_elbow": (0.30, -0.22),
+    "right_knee": (-0.12, 0.42),
+    "left_knee": (0.12, 0.42),
+    "right_wrist": (-0.34, 0.04),
+    "left_wrist": (0.34, 0.04),
+    "right_ankle": (-0.13, 0.82),
+    "left_ankle": (0.13, 0.82),
+}
+PARTS = {
+    "torso": ("neck", "belly", "right_shoulder", "left_shoulder", "right_hip", "left_hip"),
+    "head": ("neck", "face"),
+    "right_upper_arm": ("right_shoulder", "right_elbow"),
+    "left_upper_arm": ("left_shoulder", "left_elbow"),
+    "right_lower_arm": ("right_elbow", "right_wrist"),
+    "left_lower_arm": ("left_elbow", "left_wrist"),
+    "right_upper_leg": ("right_hip", "right_knee"),
+    "left_upper_leg": ("left_hip", "left_knee"),
+    "right_lower_leg": ("right_knee", "right_ankle"),
+    "left_lower_leg": ("left_knee", "left_ankle"),
+}
+RADIUS = {"torso": 0.15, "head": 0.10, "upper_arm": 0.05, "lower_arm": 0.045, "upper_leg": 0.08, "lower_leg": 0.06}
+
+
+class CapsuleModel:
+    """Ten capsules between the fifteen joints; its prior energy is zero."""
+
+    name = "capsules"
+    tree = PartTree.from_parents(DS10_PARENTS)
+    joint_names = tuple(MEAN)
+    part_joints = tuple(tuple(list(MEAN).index(joint) for joint in joints) for joints in PARTS.values())
+    bone = np.array([joints[:2] for joints in part_joints])
+
+    def mean_joints(self):
+        """The upright person of `MEAN`."""
+        return np.array(list(MEAN.values()))
+
+    def estimate_scale(self, joints, confidence):
+        """Ratio of the joints' spread to that of the same mean joints; InputError from fewer than two places."""
+        known = np.isfinite(joints).all(axis=1) & (confidence > 0)
+        spread = np.linalg.norm(joints[known] - joints[known].mean(axis=0)) if known.sum() > 1 else 0.0
+        if not spread > 0:
+            raise InputError("the scale needs two joints apart")
+        mean = self.mean_joints()[known]
+        return float(spread / np.linalg.norm(mean - mean.mean(axis=0)))
+
+    def estimate_view(self, joints, confidence):
+        """Front when the left shoulder is right of the right one in the image."""
+        left, right = (joints[list(MEAN).index(side + "_shoulder"), 0] for side in ("left", "right"))
+        return "back" if left < right else "front"
+
+    def complete_joints(self, joints, confidence, scale, view):
+        """Unknown joints where the mean person has them around the known ones."""
+        known = np.isfinite(joints).all(axis=1)
+        mean = self.mean_joints() * scale * np.array([1.0 if view == "front" else -1.0, 1.0])
+        offset = (joints[known] - mean[known]).mean(axis=0)
+        return np.where(known[:, None], joints, mean + offset)
+
+    def puppet_from_joints(self, joints, scale, view="front"):
+        """Capsules around the bones."""
+        contours = []
+        for name, (a, b) in zip(self.tree.names, self.bone, strict=True):
+            radius = RADIUS[name.removeprefix("right_").removeprefix("left_")] * scale
+            contours.append(capsule(joints[a], joints[b], radius))
+        return PuppetShape(joints, tuple(contours), tuple(np.zeros(1) for _ in contours), scale, view)
+
+    def energy(self, shape):
+        """No prior."""
+        return 0.0
+
+
+def capsule(a, b, radius):
+    """Outline (26, 2) of the points within `radius` of the segment from a to b."""
+    along = np.arctan2(b[1] - a[1], b[0] - a[0])
+    half = np.linspace(np.pi / 2, 3 * np.pi / 2, 13) + along
+    first = a + radius * np.column_stack([np.cos(half), np.sin(half)])
+    return np.vstack([first, b + radius * np.column_stack([np.cos(half + np.pi), np.sin(half + np.pi)])])
