@@ -79,6 +79,7 @@ def child_environment(ros: tuple[Path, ...]) -> dict[str, str]:
     environment = {name: value for name, value in os.environ.items() if name not in dropped}
     environment["PATH"] = os.pathsep.join([str(VENV / "bin"), environment.get("PATH", os.defpath)])
     environment["AMENT_PREFIX_PATH"] = os.pathsep.join(str(prefix) for prefix in (VENV, *ros))
+    environment["CMAKE_PREFIX_PATH"] = environment["AMENT_PREFIX_PATH"]
     return environment
 
 
@@ -98,7 +99,9 @@ def run(command: Iterable[str | Path], environment: dict[str, str], log: str, fa
         if any(word in text for word in ("NewConnectionError", "ConnectTimeoutError", "ProxyError", "NameResolution")):
             raise SetupError("The package index cannot be reached: check the network or proxy and run make again.")
         lines = [line.strip() for line in text.splitlines() if "error" in line.lower()] or ["no error line"]
-        raise SetupError(f"{failure} ({lines[-1][:200]}); the whole output is in {path}.")
+        # pip's last error line sums up; a compiler's or CMake's first one is the cause.
+        line = lines[-1 if log == "packages" else 0][:200]
+        raise SetupError(f"{failure} ({line}); the whole output is in {path}.")
 
 
 def ensure_system_packages() -> None:
