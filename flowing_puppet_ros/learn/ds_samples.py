@@ -28,6 +28,9 @@ OTHER_POINTS_PER_SIDE = 28
 OVERLAP = 0.25
 """A face belongs to every part that carries at least this share of its skin weight, so that parts overlap at joints."""
 
+WIDE_OVERLAP = {"torso": 0.4, "head": 0.4, "right_upper_arm": 0.4, "left_upper_arm": 0.4}
+"""Larger shares, for the parts whose skin follows several bones over a wide area."""
+
 SHORTEST_BONE = 0.3
 """Poses in which a limb keeps less than this share of its length in the image are drawn again: their angle is noise."""
 
@@ -143,7 +146,8 @@ def part_faces(body: AnnyBody, tree: PartTree) -> dict[str, Array]:
                 owner[bone] = part
     share = np.stack([body.skin_weights[:, owner == part].sum(axis=1) for part in range(len(tree))], axis=1)
     weight = share[body.triangles].mean(axis=1)
-    return {name: body.triangles[weight[:, part] >= OVERLAP] for part, name in enumerate(tree.names)}
+    least = [WIDE_OVERLAP.get(name, OVERLAP) for name in tree.names]
+    return {name: body.triangles[weight[:, part] >= least[part]] for part, name in enumerate(tree.names)}
 
 
 def project(

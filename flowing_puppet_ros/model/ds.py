@@ -18,7 +18,7 @@ from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.model.ds_energy import PairwiseEnergy
 from flowing_puppet_ros.model.ds_infer import ShapeFromJoints
 from flowing_puppet_ros.model.ds_joints import JOINT_NAMES, PART_JOINTS, part_tree
-from flowing_puppet_ros.model.ds_shape import PairLayout, PartShape, PuppetShape, View, rotate
+from flowing_puppet_ros.model.ds_shape import COEFFICIENT_LIMIT, PairLayout, PartShape, PuppetShape, View, rotate
 from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.tree import PartTree
 
@@ -103,13 +103,13 @@ class DeformableStructures:
         """Draw a puppet in model space, from torso to leaves (Eqs. 11-14); the torso is upright at the origin."""
         size = self.shapes[0].basis.shape[2]
         layout = PairLayout(size)
-        coefficients = [rng.standard_normal(size)]
+        coefficients = [np.clip(rng.standard_normal(size), -COEFFICIENT_LIMIT, COEFFICIENT_LIMIT)]
         poses: list[Array] = []
         for parent, child in self.tree.edges:
             kept = layout.child + layout.angle + layout.gap
             given = self.pairwise[child - 1].condition(kept, layout.parent, coefficients[parent])
             drawn = given.sample(rng, 1)[0]
-            coefficients.append(drawn[:size])
+            coefficients.append(np.clip(drawn[:size], -COEFFICIENT_LIMIT, COEFFICIENT_LIMIT))
             poses.append(drawn[size:])
         return self._assemble(coefficients, poses)
 

@@ -87,7 +87,8 @@ def test_samples_hold_together(model: DeformableStructures) -> None:
         puppet = model.sample(rng)
         for contour, joints in zip(puppet.contours, model.part_joints, strict=True):
             assert signed_distance(contour, puppet.joints[joints[0]]) > -0.04
-            assert cv2.contourArea(np.asarray(contour, np.float32)) > 0.001
+            drawn = render_labels([500 * (contour - contour.min(axis=0))], (0,), (1000, 1000))
+            assert (drawn > 0).sum() / 500**2 > 0.0015
         order = depth_order(model)
         labels = render_labels([400 + 150 * contour for contour in puppet.contours], order, (900, 900))
         assert cv2.connectedComponents((labels > 0).astype(np.uint8))[0] == 2
