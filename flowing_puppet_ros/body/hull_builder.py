@@ -98,9 +98,7 @@ class HullBuilder:
                 f"the image of camera {name} is {image.shape[1]} x {image.shape[0]}, "
                 f"its camera_info says {camera.size[0]} x {camera.size[1]}"
             )
-        if name not in self._estimators:
-            self._estimators[name] = SilhouetteEstimator(self.settings)
-        return self._estimators[name].observe(image, labels, scale, person)
+        return self._estimator(name).observe(image, labels, scale, person)
 
     def build(self, views: Mapping[str, PuppetView]) -> HullSet:
         """Triangulate the joints and carve the hull of one set; cameras with an unusable mask are left out.
@@ -111,7 +109,7 @@ class HullBuilder:
         missing = sorted(set(views) - set(self.cameras))
         if missing:
             raise InputError(f"camera {missing[0]} has no calibration; is its camera_info published?")
-        silhouettes = {name: self._estimators[name].cut(view.observation) for name, view in views.items()}
+        silhouettes = {name: self._estimator(name).cut(view.observation) for name, view in views.items()}
         joints, confidence = self._joints(views)
         empty = np.zeros((0, 3))
         usable = [name for name, silhouette in silhouettes.items() if not silhouette.problem]
@@ -129,6 +127,9 @@ class HullBuilder:
         except PuppetError as error:
             return HullSet(empty, empty, joints, confidence, silhouettes, str(error))
         return HullSet(points, normals, joints, confidence, silhouettes)
+
+    def _estimator(self, name: str) -> SilhouetteEstimator:
+        return self._estimators.setdefault(name, SilhouetteEstimator(self.settings))
 
     def _joints(self, views: Mapping[str, PuppetView]) -> tuple[Floats, Floats]:
         if len(views) < MIN_VIEWS:

@@ -49,18 +49,22 @@ class Background:
 
     def reset(self) -> None:
         """Forget everything."""
-        self.count = np.zeros((0, 0), np.int32)
-        self.mean = np.zeros((0, 0, 3), np.float32)
-        self.variance = np.zeros((0, 0, 3), np.float32)
+        self._start((0, 0))
+
+    def resize(self, shape: tuple[int, int]) -> None:
+        """Start afresh when the images have had another `shape` (h, w) so far."""
+        if self.count.shape != shape:
+            self._start(shape)
+
+    def _start(self, shape: tuple[int, int]) -> None:
+        self.count = np.zeros(shape, np.int32)
+        self.mean = np.zeros((*shape, 3), np.float32)
+        self.variance = np.zeros((*shape, 3), np.float32)
         self._changed_frames = 0
 
     def update(self, image: Images, bare: NDArray[np.bool_]) -> None:
         """Learn from `image` (h,w,3) uint8 where `bare` (h,w) is true; another image size starts afresh."""
-        if self.count.shape != image.shape[:2]:
-            self.reset()
-            self.count = np.zeros(image.shape[:2], np.int32)
-            self.mean = np.zeros(image.shape, np.float32)
-            self.variance = np.zeros(image.shape, np.float32)
+        self.resize((image.shape[0], image.shape[1]))
         if not self._same_scene(image, bare):
             self._changed_frames += 1
             if self._changed_frames < _NEW_SCENE_FRAMES:

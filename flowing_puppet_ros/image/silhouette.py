@@ -122,6 +122,7 @@ class SilhouetteEstimator:
         """The silhouette of an observed frame; its `problem` says so when it is empty or much unlike recent ones."""
         if not observation.puppet.any():
             return Silhouette(np.zeros(observation.puppet.shape, np.uint8), "no puppet in the image")
+        self.background.resize((observation.puppet.shape[0], observation.puppet.shape[1]))
         seed = self._seed(observation)
         sure = seed == cv2.GC_FGD
         window = _crop(observation.puppet | sure, _CROP_MARGIN * observation.scale)

@@ -109,6 +109,14 @@ def test_a_moved_camera_learns_its_background_anew(ring: Ring) -> None:
     assert made.background_share("cam0") == 0
 
 
+def test_a_set_observed_before_a_reset_is_still_built(ring: Ring) -> None:
+    made = builder(ring(4))
+    views = {name: view(made, name) for name in made.cameras}
+    made.reset()
+    assert made.background_share("cam0") == 0
+    assert made.build(views).problem == ""
+
+
 def test_images_of_another_size_and_unknown_cameras_are_refused(ring: Ring) -> None:
     made = builder(ring(2))
     with pytest.raises(InputError, match="camera cam0 is 100 x 50, its camera_info says 240 x 320"):
