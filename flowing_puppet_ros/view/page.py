@@ -29,7 +29,7 @@ th[scope=row]{font-weight:600;white-space:nowrap}td.n,th.n{text-align:right;font
 figure{margin:10px 0}img{max-width:100%;height:auto;border-radius:4px;vertical-align:middle}
 .row{display:flex;flex-wrap:wrap;gap:12px;align-items:flex-start}.row figure{margin:0 0 6px;flex:0 1 auto}
 .row img{outline:1px solid var(--rule);outline-offset:-1px}.row.three figure{flex:0 1 32%}
-.row.views img{max-height:340px;width:auto}
+.row.views{flex-wrap:nowrap;overflow-x:auto}.row.views figure{flex:0 1 24%;min-width:150px}
 .strip .frame{display:none}.strip .frame.on{display:block}.strip img{max-height:78vh;width:auto}
 .strip .controls{display:flex;gap:14px;align-items:center;margin:8px 0;max-width:560px}
 .strip input{flex:1;accent-color:var(--accent)}

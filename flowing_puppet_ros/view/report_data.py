@@ -197,7 +197,8 @@ def _add_track(data: ReportData, camera: CameraRecord, given: Bag) -> None:
     stamps = sorted(camera.puppets)
     moving = moving_stamps(camera, FLOW_FRAMES)
     following = {stamp: stamps[stamps.index(stamp) + 1] for stamp in moving}
-    strip = spread_over(stamps, STRIP_FRAMES)
+    seen = [stamp for stamp in stamps if camera.puppets[stamp]]
+    strip = spread_over([stamp for stamp in stamps if seen and seen[0] <= stamp <= seen[-1]], STRIP_FRAMES)
     images = fetch(given, {camera.image_topic: {*strip, *following, *following.values()}})
     shown = {stamp: camera.puppets[stamp] for stamp in (*strip, *moving)}
     for stamp in strip:
