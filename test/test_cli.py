@@ -15,7 +15,7 @@ MISSING = {
     "correspond": ["a.npz", "b.npz", "--scan-a", "a.ply", "--scan-b", "b.ply", "--out", "pairs.npz"],
     "track": ["missing.mp4", "--out", "tracks.json"],
     "replay": ["missing.mcap", "--out", "out.mcap"],
-    "report": ["missing.mcap"],
+    "report": ["missing.mcap", "--input", "missing.mcap"],
 }
 
 
