@@ -24,7 +24,7 @@ from flowing_puppet_ros.view.report_tables import (
     settings_tables,
 )
 
-PICTURE_HEIGHT = 560
+PICTURE_HEIGHT = 440
 
 
 def write_report(
@@ -177,19 +177,23 @@ def _joints_section(data: ReportData) -> str:
 
 
 def collage(data: ReportData) -> np.ndarray:
-    """Join pictures of about one moment in a row: puppet, optical flow, puppet flow, body; (560,W,3) RGB.
+    """Join pictures of about one moment in a row: puppet, optical flow, puppet flow, body; (440,W,3) RGB.
 
-    The moment is that of the liveliest flow shown. Raises InputError when there are no pictures.
+    Raises InputError when there are no pictures.
     """
-    liveliest = max(data.flow, key=lambda shot: shot.full_scale, default=None)
-    moment = liveliest.stamp if liveliest else data.start
+    # The flow and the body that are closest in time; without bodies the liveliest flow.
+    flow = max(data.flow, key=lambda shot: shot.full_scale, default=None)
+    body = data.body_shots[len(data.body_shots) // 2] if data.body_shots else None
+    if flow and body:
+        pairs = ((one, other) for one in data.flow for other in data.body_shots)
+        flow, body = min(pairs, key=lambda pair: abs(pair[0].stamp - pair[1].stamp))
+    moment = flow.stamp if flow else body.stamp if body else data.start
     pictures = []
     if data.strip:
         pictures.append((min(data.strip, key=lambda frame: abs(frame[0] - moment))[1], "flowing puppet"))
-    if liveliest:
-        pictures += [(liveliest.flow, "optical flow"), (liveliest.puppet_flow, "puppet flow")]
-    if data.body_shots:
-        body = min(data.body_shots, key=lambda shot: abs(shot.stamp - moment))
+    if flow:
+        pictures += [(flow.flow, "optical flow"), (flow.puppet_flow, "puppet flow")]
+    if body:
         pictures.append((body.front, "stitched puppet"))
         pictures += [(image, f"seen by {name}") for name, image in body.views if name == data.shown_camera]
     if not pictures:
