@@ -21,6 +21,7 @@ from flowing_puppet_ros.flow.estimate import Flow
 type Floats = NDArray[np.float64]
 
 SAMPLES_PER_REGION = 2000
+SAMPLES_FOR_START = 200
 ITERATIONS = 8
 LEAST_FOR_AFFINE = 40
 LEAST_FOR_TRANSLATION = 8
@@ -169,9 +170,11 @@ def _fit(samples: Floats, affine: Floats) -> tuple[float, float]:
     radius = max(1.0, np.sqrt(np.var(samples[:, 0]) + np.var(samples[:, 1])))
     # Columns: translation, then the linear part in units of the region's radius.
     motion = np.zeros((2, 3))
-    motion[0, 0], motion[1, 0] = np.median(samples[:, 2]), np.median(samples[:, 3])
-    spread = np.median(np.abs(samples[:, 2] - motion[0, 0]) + np.abs(samples[:, 3] - motion[1, 0]))
-    scale = max(RESIDUAL_FLOOR, 1.5 * spread)
+    few = samples[:: max(1, len(samples) // SAMPLES_FOR_START)]
+    for axis in range(2):
+        motion[axis, 0] = _weighted_median(few[:, 2 + axis], few[:, 5])
+    apart = np.abs(few[:, 2] - motion[0, 0]) + np.abs(few[:, 3] - motion[1, 0])
+    scale = max(RESIDUAL_FLOOR, 1.5 * _weighted_median(apart, few[:, 5]))
     unknowns = 3 if len(samples) >= LEAST_FOR_AFFINE else 1
     for _ in range(ITERATIONS):
         _reweighted_step(samples, centre_x, centre_y, radius, scale, unknowns, motion)
@@ -179,6 +182,18 @@ def _fit(samples: Floats, affine: Floats) -> tuple[float, float]:
     affine[:, :2] += motion[:, 1:] / radius
     affine[:, 2] = motion[:, 0] - (motion[:, 1] * centre_x + motion[:, 2] * centre_y) / radius
     return _agreement(samples, centre_x, centre_y, radius, scale, motion)
+
+
+@njit(cache=True)
+def _weighted_median(values: Floats, weights: Floats) -> float:
+    """The smallest value below which, itself included, lies half of the weight."""
+    order = np.argsort(values)
+    half, below = 0.5 * np.sum(weights), 0.0
+    for k in order:
+        below += weights[k]
+        if below >= half:
+            return float(values[k])
+    return float(values[order[-1]])
 
 
 @njit(cache=True)

@@ -137,12 +137,16 @@ def _mix(a: Point, b: Point, share: float) -> Point:
 
 
 def _place_face(found: dict[str, Point]) -> None:
-    for pair in ("ear", "eye"):
-        if "face" not in found and f"left_{pair}" in found and f"right_{pair}" in found:
-            found["face"] = _mix(found[f"left_{pair}"], found[f"right_{pair}"], 0.5)
-    for single in ("nose", "left_ear", "right_ear"):
-        if "face" not in found and single in found:
-            found["face"] = found[single]
+    """The surer of the ears' and the eyes' middles (in profile one of a pair is a guess), else the nose or an ear."""
+    if "face" in found:
+        return
+    pairs = [(f"left_{name}", f"right_{name}") for name in ("ear", "eye")]
+    middles = [_mix(found[left], found[right], 0.5) for left, right in pairs if left in found and right in found]
+    singles = [found[name] for name in ("nose", "left_ear", "right_ear") if name in found]
+    if middles:
+        found["face"] = max(middles, key=lambda point: point[2])
+    elif singles:
+        found["face"] = singles[0]
 
 
 def _place_trunk(found: dict[str, Point], mean: dict[str, Floats]) -> None:

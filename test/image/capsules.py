@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.model.ds_shape import PuppetShape
+from flowing_puppet_ros.model.ds_shape import PuppetShape, View
 from flowing_puppet_ros.model.tree import DS10_PARENTS, PartTree
+
+type Floats = NDArray[np.float64]
 
 MEAN = {
     "neck": (0.0, -0.50),
@@ -50,11 +53,11 @@ class CapsuleModel:
     part_joints = tuple(tuple(list(MEAN).index(joint) for joint in joints) for joints in PARTS.values())
     bone = np.array([joints[:2] for joints in part_joints])
 
-    def mean_joints(self):
+    def mean_joints(self) -> Floats:
         """The upright person of `MEAN`."""
         return np.array(list(MEAN.values()))
 
-    def estimate_scale(self, joints, confidence):
+    def estimate_scale(self, joints: Floats, confidence: Floats) -> float:
         """Ratio of the joints' spread to that of the same mean joints; InputError from fewer than two places."""
         known = np.isfinite(joints).all(axis=1) & (confidence > 0)
         spread = np.linalg.norm(joints[known] - joints[known].mean(axis=0)) if known.sum() > 1 else 0.0
@@ -63,19 +66,19 @@ class CapsuleModel:
         mean = self.mean_joints()[known]
         return float(spread / np.linalg.norm(mean - mean.mean(axis=0)))
 
-    def estimate_view(self, joints, confidence):
+    def estimate_view(self, joints: Floats, confidence: Floats) -> View:
         """Front when the left shoulder is right of the right one in the image."""
         left, right = (joints[list(MEAN).index(side + "_shoulder"), 0] for side in ("left", "right"))
         return "back" if left < right else "front"
 
-    def complete_joints(self, joints, confidence, scale, view):
+    def complete_joints(self, joints: Floats, confidence: Floats, scale: float, view: View) -> Floats:
         """Unknown joints where the mean person has them around the known ones."""
         known = np.isfinite(joints).all(axis=1)
         mean = self.mean_joints() * scale * np.array([1.0 if view == "front" else -1.0, 1.0])
         offset = (joints[known] - mean[known]).mean(axis=0)
         return np.where(known[:, None], joints, mean + offset)
 
-    def puppet_from_joints(self, joints, scale, view="front"):
+    def puppet_from_joints(self, joints: Floats, scale: float, view: View = "front") -> PuppetShape:
         """Capsules around the bones."""
         contours = []
         for name, (a, b) in zip(self.tree.names, self.bone, strict=True):
@@ -83,12 +86,12 @@ class CapsuleModel:
             contours.append(capsule(joints[a], joints[b], radius))
         return PuppetShape(joints, tuple(contours), tuple(np.zeros(1) for _ in contours), scale, view)
 
-    def energy(self, shape):
+    def energy(self, shape: PuppetShape) -> float:
         """No prior."""
         return 0.0
 
 
-def capsule(a, b, radius):
+def capsule(a: Floats, b: Floats, radius: float) -> Floats:
     """Outline (26, 2) of the points within `radius` of the segment from a to b."""
     along = np.arctan2(b[1] - a[1], b[0] - a[0])
     half = np.linspace(np.pi / 2, 3 * np.pi / 2, 13) + along
