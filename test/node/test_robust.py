@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What nodes do with bad messages, jumps of time, resets, goals and bad parameters: one sentence, and they live on."""
+
+import array
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from flowing_puppet_msgs.action import FitBody
+from flowing_puppet_msgs.msg import BodyArray
+from rclpy.action import ActionClient
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
+from std_srvs.srv import Trigger
+
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.node.factory import RosMessageFactory
+from flowing_puppet_ros.stream.clouds import make_cloud
+from flowing_puppet_ros.stream.images import make_image
+from flowing_puppet_ros.stream.messages import make_header
+
+pytestmark = pytest.mark.ros
+FACTORY = RosMessageFactory()
+QUICK = ("-p", "particles:=8", "-p", "iterations:=2", "-p", "refine_iterations:=3")
+
+
+def image(number: int, encoding: str = "rgb8") -> Image:
+    """Return an image of a texture that moves two pixels to the right with each number."""
+    texture = np.kron(np.random.default_rng(0).integers(0, 255, (12, 16, 3)), np.ones((10, 10, 1))).astype(np.uint8)
+    header = make_header(FACTORY, 1_000_000_000 + number * 33_000_000, "camera")
+    return make_image(FACTORY, header, np.roll(texture, 2 * number, axis=1), encoding)
+
+
+def median(flow: Image) -> list[float]:
+    """Return the median of a flow field, rounded to a pixel."""
+    field = np.frombuffer(flow.data, "<f4").reshape(flow.height, flow.width, 2)
+    return [float(c) for c in np.round(np.median(field, axis=(0, 1)))]
+
+
+def received(peer: Any, kind: Any, topic: str) -> list[Any]:
+    """Return the list into which messages of a topic will come."""
+    found: list[Any] = []
+    peer.create_subscription(kind, topic, found.append, 50)
+    return found
+
+
+def connected(peer: Any, kind: Any, topic: str) -> Any:
+    """Return a publisher that somebody listens to."""
+    publisher = peer.create_publisher(kind, topic, 50)
+    peer.spin_until(publisher.get_subscription_count, f"a subscriber of {topic}")
+    peer.spin_for(0.5)
+    return publisher
+
+
+def kept(topic: str) -> list[str]:
+    """Return ROS arguments under which no message of a sensor topic is lost."""
+    prefix = f"qos_overrides.{topic}.subscription"
+    return ["-p", f"{prefix}.reliability:=reliable", "-p", f"{prefix}.depth:=50"]
+
+
+def test_flow_survives_bad_images_and_starts_anew_on_request(start: Callable[..., Path], peer: Any) -> None:
+    log = start("optical_flow", *kept("/image"), *kept("/image/compressed"))
+    flows = received(peer, Image, "flow/forward")
+    reports = received(peer, DiagnosticArray, "/diagnostics")
+    raw, compressed = connected(peer, Image, "image"), connected(peer, CompressedImage, "image/compressed")
+    peer.spin_until(lambda: peer.count_publishers("flow/forward"), "the output")
+    garbage = CompressedImage(header=image(1).header, format="jpeg", data=array.array("B", b"not a jpeg"))
+    short = image(2)
+    short.height += 1
+    raw.publish(image(0))
+    compressed.publish(garbage)
+    raw.publish(short)
+    raw.publish(image(2, "8UC9"))
+    raw.publish(Image())
+    peer.spin_for(1.0)
+    for number in (3, 4, 5):
+        raw.publish(image(number))
+    peer.spin_until(lambda: any(median(flow) == [2.0, 0.0] for flow in flows), "flow after bad images")
+    count = len(flows)
+    client = peer.create_client(Trigger, "optical_flow/reset")
+    answer = client.call_async(Trigger.Request())
+    peer.spin_until(answer.done, "the reset")
+    assert answer.result().success
+    raw.publish(image(9))
+    raw.publish(image(10))
+    peer.spin_until(lambda: len(flows) > count, "flow after the reset")
+    assert median(flows[count]) == [2.0, 0.0], "the pair across the reset gives no flow"
+    assert "8UC9" in log.read_text()
+    peer.spin_until(lambda: value(reports, "unusable") == "4", "the count of bad images on /diagnostics")
+
+
+def value(reports: list[Any], key: str) -> str | None:
+    """Return a value of the newest report of the node."""
+    return next((item.value for item in reports[-1].status[0].values if item.key == key), None) if reports else None
+
+
+def test_time_that_jumps_back_starts_anew(start: Callable[..., Path], peer: Any) -> None:
+    log = start("optical_flow", "-p", "use_sim_time:=true")
+    clock = connected(peer, Clock, "/clock")
+    for seconds in (100, 101, 50):
+        clock.publish(Clock(clock=clock_time(seconds)))
+        peer.spin_for(0.3)
+    peer.spin_until(lambda: "jumped back" in log.read_text(), "the notice of the jump")
+
+
+def clock_time(seconds: int) -> Any:
+    """Return a builtin_interfaces/Time."""
+    return FACTORY.make("builtin_interfaces/msg/Time", sec=seconds)
+
+
+def body_cloud(stamp: int) -> PointCloud2:
+    """Return the vertices of a sampled body as a cloud."""
+    model = StitchedPuppet.load()
+    points = model.vertices(model.sample(np.random.default_rng(3), pose_scale=0.3))
+    return make_cloud(FACTORY, make_header(FACTORY, stamp, "world"), points)
+
+
+def test_fitter_survives_bad_clouds_and_serves_goals(start: Callable[..., Path], peer: Any) -> None:
+    start("body_fitter", *QUICK, *kept("/points"))
+    bodies = received(peer, BodyArray, "bodies")
+    points = connected(peer, PointCloud2, "points")
+    points.publish(PointCloud2(header=make_header(FACTORY, 1_000_000_000, "world")))
+    points.publish(make_cloud(FACTORY, make_header(FACTORY, 2_000_000_000, "world"), np.full((50, 3), np.nan)))
+    points.publish(body_cloud(3_000_000_000))
+    peer.spin_until(lambda: len(bodies) == 3, "bodies")
+    assert [len(found.bodies) for found in bodies] == [0, 0, 1]
+    assert bodies[2].header.frame_id == "world"
+    client = ActionClient(peer, FitBody, "fit_body")
+    peer.spin_until(client.server_is_ready, "the action")
+    assert goal(peer, client, PointCloud2())[0].message
+    result, feedback = goal(peer, client, body_cloud(4_000_000_000))
+    assert result.message == ""
+    assert len(result.bodies.bodies) == 1
+    progress = [item.feedback.progress for item in feedback]
+    assert progress == sorted(progress)
+    assert progress[-1] == 1.0
+
+
+def goal(peer: Any, client: ActionClient, cloud: PointCloud2) -> tuple[FitBody.Result, list[Any]]:
+    """Send a goal; return its result and the feedback that came."""
+    feedback: list[Any] = []
+    accepted = client.send_goal_async(FitBody.Goal(cloud=cloud, seed=1), feedback.append)
+    peer.spin_until(accepted.done, "the goal's acceptance")
+    done = accepted.result().get_result_async()
+    peer.spin_until(done.done, "the goal's result")
+    return done.result().result, feedback
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "named"),
+    [
+        ("optical_flow", ["--ros-args", "-p", "max_side:=3"], "max_side"),
+        ("optical_flow", ["--ros-args", "-p", "preset:=best"], "best"),
+        ("visual_hull", [], "cameras"),
+        ("body_fitter", ["--ros-args", "--params-file", "nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_bad_parameters_are_one_sentence(name: str, given: list[str], named: str, tmp_path: Path) -> None:
+    command = [str(Path(sys.executable).with_name(name)), *given]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert done.returncode == 2
+    assert named in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_help_lists_the_parameters() -> None:
+    command = [str(Path(sys.executable).with_name("puppet_tracker")), "--help"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "overlay_side [960]" in shown
+    assert "queue [10]" in shown
