@@ -128,7 +128,7 @@ class _Replay:
         for record in self._static:
             self._take(writer, record, log_time)
         with bar:
-            for record in _paced(self._bag.messages(used), self._options.rate):
+            for record in paced(self._bag.messages(used), self._options.rate):
                 log_time = record.log_time
                 self._take(writer, record, log_time)
                 bar.update()
@@ -222,7 +222,7 @@ def _values(instance: Instance) -> dict[str, Any]:
     return {info.name: getattr(settings, info.name) for info in type(settings).describe()}
 
 
-def _paced(records: Iterator[Record], rate: float) -> Iterator[Record]:
+def paced(records: Iterator[Record], rate: float) -> Iterator[Record]:
     """Yield the records when they are due: at `rate` times the speed of the recording, at once when it is 0."""
     start: tuple[float, int] | None = None
     for record in records:

@@ -39,7 +39,8 @@ def qos_profile(kind: str) -> dict[str, Any]:
 class BagWriter:
     """A bag being written: profile ros2, zstd chunks, CDR messages, ros2msg schemas, statistics and index.
 
-    The bytes depend on the messages only: writing the same messages again gives the same file.
+    The bytes depend on the messages only: writing the same messages again gives the same file. The file gets its name
+    when it is complete.
     """
 
     def __init__(self, path: Path) -> None:
@@ -55,7 +56,8 @@ class BagWriter:
                 target = self._folder / f"{path.name}_0.mcap"
             else:
                 path.parent.mkdir(parents=True, exist_ok=True)
-            self._stream: BinaryIO = target.open("wb")
+            self._partial = target.with_name(target.name + ".partial")
+            self._stream: BinaryIO = self._partial.open("wb")
         except OSError as error:
             raise InputError(f"cannot write the bag {path}: {error.strerror}") from error
         self._target = target
@@ -118,6 +120,7 @@ class BagWriter:
         self._writer.add_metadata("rosbag2", {"serialized_metadata": _yaml(metadata)})
         self._writer.finish()
         self._stream.close()
+        self._partial.replace(self._target)
         if self._folder is not None:
             text = _yaml({"rosbag2_bagfile_information": metadata})
             (self._folder / "metadata.yaml").write_text(text, "utf8")
@@ -154,6 +157,7 @@ class BagWriter:
             self.close()
         else:
             self._stream.close()
+            self._partial.unlink()
 
 
 def _yaml(value: Any) -> str:

@@ -3,6 +3,7 @@
 
 import array
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ FACTORY = BagMessageFactory()
 DATATYPES = {"<f4": 7, "<f8": 8, ">f4": 7, ">f8": 8}
 
 
-def cloud_message(points, order, names, form, gap, height, padding):
+def cloud_message(points: Any, order: Any, names: Any, form: Any, gap: Any, height: Any, padding: Any) -> Any:
     """Build a cloud by hand: `names` in this order, `gap` bytes before each field, `padding` after each row."""
     step = sum(gap + np.dtype(form).itemsize for _ in names)
     width = len(points) // height
@@ -54,7 +55,9 @@ def cloud_message(points, order, names, form, gap, height, padding):
     st.integers(1, 3),
     st.integers(0, 9),
 )
-def test_every_layout_is_read(count, order, names, size, gap, height, padding):
+def test_every_layout_is_read(
+    count: Any, order: Any, names: Any, size: Any, gap: Any, height: Any, padding: Any
+) -> None:
     points = np.random.default_rng(count).normal(size=(count * height, 3)).astype(np.float32)
     points[::4, 1] = np.nan
     message = cloud_message(points, order, names, order + size, gap, height, padding)
@@ -63,7 +66,7 @@ def test_every_layout_is_read(count, order, names, size, gap, height, padding):
     assert normals is None
 
 
-def test_points_and_normals_come_back():
+def test_points_and_normals_come_back() -> None:
     rng = np.random.default_rng(1)
     points, normals = rng.normal(size=(50, 3)), rng.normal(size=(50, 3))
     normals[3] = np.nan
@@ -71,15 +74,16 @@ def test_points_and_normals_come_back():
     assert [field.name for field in message.fields] == ["x", "y", "z", "normal_x", "normal_y", "normal_z"]
     read, turned = decode_cloud(message)
     np.testing.assert_allclose(read, points, atol=1e-6)
+    assert turned is not None
     np.testing.assert_allclose(turned, np.nan_to_num(normals), atol=1e-6)
 
 
-def test_a_cloud_without_points_is_empty():
+def test_a_cloud_without_points_is_empty() -> None:
     read, _ = decode_cloud(make_cloud(FACTORY, FACTORY.make("std_msgs/msg/Header"), np.zeros((0, 3))))
     assert read.shape == (0, 3)
 
 
-def test_what_is_no_cloud_is_refused():
+def test_what_is_no_cloud_is_refused() -> None:
     message = make_cloud(FACTORY, FACTORY.make("std_msgs/msg/Header"), np.ones((4, 3)))
     message.data = message.data[:-1]
     with pytest.raises(InputError, match="4x1 points has point_step 12, row_step 48 and 47 bytes"):

@@ -3,6 +3,7 @@
 
 import array
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,13 +17,13 @@ FACTORY = BagMessageFactory()
 HEADER = FACTORY.make("std_msgs/msg/Header", frame_id="cam")
 
 
-def ramp(height=12, width=16):
+def ramp(height: int = 12, width: int = 16) -> Any:
     """A smooth colour picture, so that subsampled and mosaic encodings lose little."""
     y, x = np.mgrid[:height, :width]
     return np.stack([40 + 8 * x, 60 + 6 * y, 200 - 5 * x], axis=2).astype(np.uint8)
 
 
-def message(pixels, encoding, padding=0, big=False):
+def message(pixels: Any, encoding: Any, padding: int = 0, big: bool = False) -> Any:
     """A raw image message as a driver may send it: padded rows, data as array.array."""
     rows = np.ascontiguousarray(pixels).reshape(len(pixels), -1).view(np.uint8)
     padded = np.pad(rows, ((0, 0), (0, padding)), constant_values=99)
@@ -37,7 +38,7 @@ def message(pixels, encoding, padding=0, big=False):
     )
 
 
-def test_packed_colours_come_back_exactly():
+def test_packed_colours_come_back_exactly() -> None:
     rgb = ramp()
     alpha = np.dstack([rgb, np.full(rgb.shape[:2], 7, np.uint8)])
     for encoding, pixels in {
@@ -53,7 +54,7 @@ def test_packed_colours_come_back_exactly():
 
 
 @pytest.mark.parametrize("big", [False, True])
-def test_grey_becomes_three_equal_channels(big):
+def test_grey_becomes_three_equal_channels(big: Any) -> None:
     grey = ramp()[:, :, 0]
     np.testing.assert_array_equal(images.decode_image(message(grey, "mono8", 3)), np.dstack([grey] * 3))
     deep = (grey.astype(np.uint16) << 8) + 17
@@ -62,7 +63,7 @@ def test_grey_becomes_three_equal_channels(big):
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("yuv422", "uyvy"), ("yuv422_yuy2", "yuyv"), ("uyvy", "uyvy")])
-def test_yuv422_packs_one_colour_for_two_pixels(encoding, order):
+def test_yuv422_packs_one_colour_for_two_pixels(encoding: Any, order: Any) -> None:
     rgb = ramp()
     yuv = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV).astype(float)
     u, v = (yuv[:, 0::2, k] / 2 + yuv[:, 1::2, k] / 2 for k in (1, 2))
@@ -74,7 +75,7 @@ def test_yuv422_packs_one_colour_for_two_pixels(encoding, order):
 
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
-def test_bayer_mosaics_give_the_colours_back(pattern):
+def test_bayer_mosaics_give_the_colours_back(pattern: Any) -> None:
     rgb = ramp()
     mosaic = np.zeros(rgb.shape[:2], np.uint8)
     for k, letter in enumerate(pattern):
@@ -84,7 +85,7 @@ def test_bayer_mosaics_give_the_colours_back(pattern):
     assert np.abs(decoded - rgb)[2:-2, 2:-2].max() < 12
 
 
-def test_compressed_images_are_rgb():
+def test_compressed_images_are_rgb() -> None:
     rgb = ramp(16, 24)
     jpeg = FACTORY.make("sensor_msgs/msg/CompressedImage", format="jpeg", data=images.jpeg(rgb, 98))
     assert np.abs(images.decode_image(jpeg).astype(int) - rgb).max() < 16
@@ -94,13 +95,13 @@ def test_compressed_images_are_rgb():
 
 
 @pytest.mark.parametrize("data", [b"", b"no picture", bytes(1000)])
-def test_broken_compressed_images_are_refused(data):
+def test_broken_compressed_images_are_refused(data: Any) -> None:
     broken = FACTORY.make("sensor_msgs/msg/CompressedImage", format="jpeg", data=np.frombuffer(data, np.uint8))
     with pytest.raises(InputError, match=f"'jpeg' and {len(data)} bytes cannot be decoded"):
         images.decode_image(broken)
 
 
-def test_unknown_encodings_and_wrong_sizes_are_refused_by_name():
+def test_unknown_encodings_and_wrong_sizes_are_refused_by_name() -> None:
     with pytest.raises(InputError, match="the image encoding 'pixels9' is not one of rgb8"):
         images.decode_image(message(ramp(), "pixels9"))
     short = message(ramp(), "rgb8")
@@ -109,7 +110,7 @@ def test_unknown_encodings_and_wrong_sizes_are_refused_by_name():
         images.decode_image(short)
 
 
-def test_labels_and_flow_come_back_exactly():
+def test_labels_and_flow_come_back_exactly() -> None:
     labels = np.arange(30, dtype=np.uint8).reshape(5, 6)
     np.testing.assert_array_equal(images.decode_labels(images.make_image(FACTORY, HEADER, labels, "mono8")), labels)
     flow = np.random.default_rng(0).normal(size=(4, 7, 2)).astype(np.float32)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stamps, rotations and the tree of static frames."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,12 +17,12 @@ FACTORY = BagMessageFactory()
 
 
 @given(st.integers(0, 2**31 * 10**9 - 1))
-def test_stamps_come_back_to_the_nanosecond(nanoseconds):
+def test_stamps_come_back_to_the_nanosecond(nanoseconds: Any) -> None:
     assert messages.header_ns(messages.make_header(FACTORY, nanoseconds, "f")) == nanoseconds
 
 
 @given(st.integers(0, 10**6))
-def test_quaternions_agree_with_scipy(seed):
+def test_quaternions_agree_with_scipy(seed: Any) -> None:
     rotation = Rotation.random(rng=np.random.default_rng(seed))
     expected = rotation.as_quat(canonical=True)
     found = messages.quaternion(rotation.as_matrix())
@@ -30,12 +32,12 @@ def test_quaternions_agree_with_scipy(seed):
 
 
 @pytest.mark.parametrize("q", [(0, 0, 0, 0), (float("nan"), 0, 0, 1)])
-def test_what_is_no_quaternion_is_refused(q):
+def test_what_is_no_quaternion_is_refused(q: Any) -> None:
     with pytest.raises(InputError, match="is not a quaternion"):
         messages.rotation_matrix(q)
 
 
-def chain(links):
+def chain(links: Any) -> Any:
     """A TFMessage of parent, child, position, rotation."""
     return FACTORY.make(
         "tf2_msgs/msg/TFMessage",
@@ -46,7 +48,7 @@ def chain(links):
     )
 
 
-def test_frames_multiply_along_the_tree():
+def test_frames_multiply_along_the_tree() -> None:
     rng = np.random.default_rng(2)
     turns = Rotation.random(3, rng=rng).as_matrix()
     places = rng.normal(size=(3, 3))
@@ -56,15 +58,19 @@ def test_frames_multiply_along_the_tree():
     assert tree.root("left") == "world"
     point = rng.normal(size=3)
     in_world = turns[0] @ (turns[1] @ point + places[1]) + places[0]
-    position, rotation = tree.pose("left", "world")
+    in_world_frame = tree.pose("left", "world")
+    assert in_world_frame is not None
+    position, rotation = in_world_frame
     np.testing.assert_allclose(rotation @ point + position, in_world)
-    position, rotation = tree.pose("left", "right")
+    in_right_frame = tree.pose("left", "right")
+    assert in_right_frame is not None
+    position, rotation = in_right_frame
     in_right = turns[2].T @ (turns[0].T @ (in_world - places[0]) - places[2])
     np.testing.assert_allclose(rotation @ point + position, in_right)
     assert tree.pose("left", "moon") is None
 
 
-def test_a_loop_of_frames_is_refused():
+def test_a_loop_of_frames_is_refused() -> None:
     tree = messages.FrameTree()
     tree.add(chain([("a", "b", np.zeros(3), np.eye(3)), ("b", "a", np.zeros(3), np.eye(3))]))
     with pytest.raises(InputError, match="loop"):

@@ -2,6 +2,7 @@
 """Pairing by stamps: against a brute-force reference, in any interleaving, over restarts, in bounded memory."""
 
 from itertools import pairwise
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -32,7 +33,7 @@ def reference(streams: list[list[int]], slop: int) -> list[tuple[int, ...]]:
 
 @settings(max_examples=300, deadline=None)
 @given(st.lists(stamps, min_size=2, max_size=3), st.randoms(use_true_random=False))
-def test_sets_are_those_of_the_reference_in_every_interleaving(streams, random):
+def test_sets_are_those_of_the_reference_in_every_interleaving(streams: Any, random: Any) -> None:
     names = tuple("abc"[: len(streams)])
     pairing = Pairing(names, SLOP)
     left = {name: list(stream) for name, stream in zip(names, streams, strict=True)}
@@ -48,20 +49,20 @@ def test_sets_are_those_of_the_reference_in_every_interleaving(streams, random):
     assert pairing.counters["unpaired"] == sum(map(len, streams)) - len(sets) * len(names)
 
 
-def test_an_exact_set_is_made_at_once():
+def test_an_exact_set_is_made_at_once() -> None:
     pairing = Pairing(("image", "labels"))
     assert pairing.add("image", 7, "i") == []
     assert pairing.add("labels", 7, "l") == [{"image": (7, "i"), "labels": (7, "l")}]
 
 
-def test_nearest_waits_until_nothing_nearer_can_come():
+def test_nearest_waits_until_nothing_nearer_can_come() -> None:
     pairing = Pairing(("a", "b"), slop_ns=10)
     pairing.add("b", 93, "early")
     assert pairing.add("a", 100, "lead") == []
     assert [each["b"] for each in pairing.add("b", 104, "late")] == [(104, "late")]
 
 
-def test_a_recording_that_starts_again_pairs_again():
+def test_a_recording_that_starts_again_pairs_again() -> None:
     pairing = Pairing(("a", "b"), slop_ns=1)
     second = 10 * BACKWARD_JUMP_NS
     found = []
@@ -73,7 +74,7 @@ def test_a_recording_that_starts_again_pairs_again():
     assert pairing.counters["restarts"] == 2
 
 
-def test_slightly_disordered_and_repeated_stamps_are_left_out():
+def test_slightly_disordered_and_repeated_stamps_are_left_out() -> None:
     pairing = Pairing(("a", "b"))
     for stamp in (1000, 1000, 999):
         pairing.add("a", stamp, stamp)
@@ -82,7 +83,7 @@ def test_slightly_disordered_and_repeated_stamps_are_left_out():
 
 
 @pytest.mark.parametrize("depth", [1, 4])
-def test_memory_is_bounded_and_the_newest_are_kept(depth):
+def test_memory_is_bounded_and_the_newest_are_kept(depth: Any) -> None:
     pairing = Pairing(("a", "b"), depth=depth)
     for stamp in range(100):
         pairing.add("a", stamp, stamp)
@@ -91,7 +92,7 @@ def test_memory_is_bounded_and_the_newest_are_kept(depth):
     assert pairing.add("b", 99, "b") == [{"a": (99, 99), "b": (99, "b")}]
 
 
-def test_reset_forgets_what_waits():
+def test_reset_forgets_what_waits() -> None:
     pairing = Pairing(("a", "b"))
     pairing.add("a", 5, "old")
     pairing.reset()
