@@ -42,9 +42,10 @@ def test_a_shift_of_the_frame_shifts_the_motion() -> None:
     rng = np.random.default_rng(3)
     points = rng.uniform(0, 60, (300, 2))
     vectors = transform(MOTION, points) - points + rng.normal(0, 0.5, (300, 2))
+    shift = np.array([1000.0, 500.0])
     here, _, _ = fit_affine(points, vectors)
-    there, _, _ = fit_affine(points + [1000, 500], vectors)
-    np.testing.assert_allclose(transform(there, points + [1000, 500]), transform(here, points) + [1000, 500], atol=1e-6)
+    there, _, _ = fit_affine(points + shift, vectors)
+    np.testing.assert_allclose(transform(there, points + shift), transform(here, points) + shift, atol=1e-6)
 
 
 @pytest.mark.parametrize("count", [LEAST_FOR_TRANSLATION, 39])

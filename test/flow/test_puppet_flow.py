@@ -20,7 +20,7 @@ def test_field_follows_the_layers_and_explains_them() -> None:
     labels, flow = layered()
     result = puppet_flow(labels, flow)
     np.testing.assert_allclose(result.field, flow, atol=0.05)
-    np.testing.assert_allclose(result.background, [[1, 0, 0], [0, 1, -0.5]], atol=1e-3)
+    np.testing.assert_allclose(result.background, np.array([[1, 0, 0], [0, 1, -0.5]]), atol=1e-3)
     assert result.affine.shape == (3, 2, 3)
     assert result.explained == 1.0
 

@@ -1,12 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A body model of capsules with the interface of the Deformable Structures model: the tracker is tested alone."""
+"""People drawn with capsules that move in known ways, and a body model of capsules to track them with.
+
+The model has the interface of the Deformable Structures model, so that the tracker is tested alone.
+"""
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.keypoints import Keypoints
+from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackerSettings, TrackResult
 from flowing_puppet_ros.model.ds_shape import PuppetShape, View
 from flowing_puppet_ros.model.tree import DS10_PARENTS, PartTree
 
@@ -97,3 +103,52 @@ def capsule(a: Floats, b: Floats, radius: float) -> Floats:
     half = np.linspace(np.pi / 2, 3 * np.pi / 2, 13) + along
     first = a + radius * np.column_stack([np.cos(half), np.sin(half)])
     return np.vstack([first, b + radius * np.column_stack([np.cos(half + np.pi), np.sin(half + np.pi)])])
+
+
+NAMES = tuple(MEAN)
+SCALE = 160.0
+SIZE = (320, 240)
+rng = np.random.default_rng(11)
+NOISE = {name: rng.integers(40, 255, (48, 48, 3)).astype(np.uint8) for name in CapsuleModel.tree.names}
+BACKGROUND = cv2.resize(rng.integers(0, 200, (60, 80, 3)).astype(np.uint8), SIZE, interpolation=cv2.INTER_CUBIC)
+
+
+def pose(time: float, offset: tuple[float, float] = (150, 118)) -> Floats:
+    """Joints (15, 2) px: the person walks right, and the left forearm swings about its elbow."""
+    joints = CapsuleModel().mean_joints() * SCALE + offset + [1.5 * time, 0.0]
+    elbow, wrist = NAMES.index("left_elbow"), NAMES.index("left_wrist")
+    angle = -0.05 * time
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    joints[wrist] = joints[elbow] + turn @ (joints[wrist] - joints[elbow])
+    return np.asarray(joints)
+
+
+def draw(*people: Floats) -> NDArray[np.uint8]:
+    """A picture in which every capsule carries its own texture along."""
+    image = BACKGROUND.copy()
+    for joints in people:
+        shape = CapsuleModel().puppet_from_joints(joints, SCALE)
+        for part, contour in enumerate(shape.contours):
+            a, b = joints[CapsuleModel.bone[part]]
+            along = (b - a) / np.linalg.norm(b - a)
+            texture = cv2.resize(NOISE[CapsuleModel.tree.names[part]], None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+            move = np.column_stack([along, [-along[1], along[0]], a - 96 * (along + np.array([-along[1], along[0]]))])
+            mask = cv2.fillPoly(np.zeros(SIZE[::-1], np.uint8), [np.round(contour).astype(np.int32)], 1)
+            cv2.copyTo(cv2.warpAffine(texture, move, SIZE), mask, image)
+    return image
+
+
+def detection(joints: Floats, confidence: float = 0.9) -> Keypoints:
+    """The person as a detector reports it."""
+    return Keypoints(NAMES, joints.copy(), np.full(len(joints), confidence))
+
+
+def tracker(**settings: float) -> FlowingPuppetTracker:
+    """A tracker with the capsule model."""
+    return FlowingPuppetTracker(CapsuleModel(), TrackerSettings(**settings))  # type: ignore[arg-type]
+
+
+def error(result: TrackResult, truth: Floats, name: str) -> float:
+    """Distance in px of the only puppet's joint from where it is."""
+    (puppet,) = result.puppets
+    return float(np.linalg.norm((puppet.joints - truth)[NAMES.index(name)]))
