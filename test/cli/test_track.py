@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The track verb from keypoints to tracks, with the shipped body model, and its one-sentence refusals."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.cli import main
+from flowing_puppet_ros.model.ds import DeformableStructures
+
+MODEL = DeformableStructures.load()
+PUPPET = MODEL.puppet_from_joints(MODEL.mean_joints() * 150 + [150, 110], 150.0)
+
+
+def draw(shift: float) -> np.ndarray:
+    """The mean puppet with a texture of its own, `shift` px to the right, over a still background."""
+    rng = np.random.default_rng(3)
+    pictures = [cv2.resize(rng.integers(0, 255, (40, 60, 3)).astype(np.uint8), (320, 240)) for _ in range(2)]
+    mask = np.zeros((240, 320), np.uint8)
+    for contour in PUPPET.contours:
+        cv2.fillPoly(mask, [np.round(contour).astype(np.int32)], 1)
+    move = np.array([[1, 0, shift], [0, 1, 0]], float)
+    image = pictures[0]
+    cv2.copyTo(cv2.warpAffine(pictures[1], move, (320, 240)), cv2.warpAffine(mask, move, (320, 240)), image)
+    return image
+
+
+@pytest.fixture
+def frames(tmp_path: Path) -> Path:
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for k in range(6):
+        cv2.imwrite(str(folder / f"{k}.png"), draw(2.0 * k))
+    return folder
+
+
+def write_keypoints(path: Path, frames: Any, names: Any = MODEL.joint_names) -> Path:
+    path.write_text(json.dumps({"joint_names": names, "frames": frames}))
+    return path
+
+
+def start() -> list[list[float]]:
+    return [[float(x), float(y), 0.9] for x, y in PUPPET.joints]
+
+
+def test_tracks_follow_the_person_and_say_all_that_the_format_promises(frames: Path, tmp_path: Path) -> None:
+    init, out = write_keypoints(tmp_path / "k.json", {"0": [start()]}), tmp_path / "new" / "tracks.json"
+    assert main(["track", str(frames), "--init", str(init), "--out", str(out)]) == 0
+    tracks = json.loads(out.read_text())
+    assert tracks["joint_names"] == list(MODEL.joint_names)
+    assert tracks["fps"] == 30.0
+    assert [frame["index"] for frame in tracks["frames"]] == list(range(6))
+    assert tracks["frames"][3]["stamp_ns"] == 100_000_000
+    assert tracks["frames"][3]["path"].endswith("3.png")
+    (puppet,) = tracks["frames"][5]["puppets"]
+    assert puppet["id"] == "a1"
+    moved = np.array(puppet["joints"])[:, :2] - PUPPET.joints
+    inside = PUPPET.joints[:, 1] < 235
+    np.testing.assert_allclose(np.median(moved[inside], axis=0), [10, 0], atol=1.0)
+    assert [part["name"] for part in puppet["parts"]] == list(MODEL.tree.names)
+    assert sorted(part["depth"] for part in puppet["parts"]) == list(range(10))
+    assert np.array(puppet["parts"][0]["contour"]).shape[1] == 2
+
+
+def test_same_bits_twice_and_another_seed_another_id(frames: Path, tmp_path: Path) -> None:
+    init = write_keypoints(tmp_path / "k.json", {"1": [start()]})
+    texts = []
+    for name, seed in (("a", "0"), ("b", "0"), ("c", "1")):
+        arguments = ["track", str(frames), "--init", str(init), "--out", str(tmp_path / name), "--seed", seed]
+        assert main(arguments) == 0
+        texts.append((tmp_path / name).read_text())
+    assert texts[0] == texts[1]
+    assert json.loads(texts[2])["frames"][1]["puppets"][0]["id"] == "b1"
+    assert json.loads(texts[0])["frames"][0]["puppets"] == []
+
+
+def test_json_prints_one_object(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    init = write_keypoints(tmp_path / "k.json", {"0": [start()], "2": []})
+    assert main(["track", str(frames), "--init", str(init), "--out", str(tmp_path / "o.json"), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["frames"] == 6
+    assert summary["ids"] == ["a1"]
+
+
+def test_null_joints_are_unknown_and_none_is_written_as_nan(frames: Path, tmp_path: Path) -> None:
+    person: list[Any] = start()
+    person[MODEL.joint_names.index("left_wrist")] = [None, None, None]
+    init = write_keypoints(tmp_path / "k.json", {"0": [person]})
+    assert main(["track", str(frames), "--init", str(init), "--out", str(tmp_path / "o.json")]) == 0
+    text = (tmp_path / "o.json").read_text()
+    assert "NaN" not in text
+    assert len(json.loads(text)["frames"][0]["puppets"]) == 1
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[]",
+        "{}",
+        '{"joint_names": ["neck"], "frames": []}',
+        '{"joint_names": 3, "frames": {}}',
+        '{"joint_names": ["tail"], "frames": {}}',
+        '{"joint_names": ["neck"], "frames": {"x": []}}',
+        '{"joint_names": ["neck"], "frames": {"0": [3]}}',
+        '{"joint_names": ["neck"], "frames": {"0": [[[1, 2]]]}}',
+        '{"joint_names": ["neck"], "frames": {"0": [[["a", "b", "c"]]]}}',
+        '{"joint_names": ["neck"], "frames": {"99": [[[1, 2, 1]]]}}',
+    ],
+)
+def test_bad_keypoints_are_one_sentence(
+    text: str, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    init = tmp_path / "k.json"
+    init.write_text(text)
+    assert main(["track", str(frames), "--init", str(init), "--out", str(tmp_path / "o.json")]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "k.json" in line
+
+
+def test_missing_input_and_missing_keypoints(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["track", str(tmp_path / "none.mp4"), "--out", "o.json"]) == 2
+    assert "none.mp4 does not exist" in capsys.readouterr().err
+    assert main(["track", str(frames), "--out", "o.json"]) == 2
+    assert "--init" in capsys.readouterr().err
+    assert main(["track", str(frames), "--out", "o.json", "--init", str(tmp_path / "none.json")]) == 2
+    assert "none.json cannot be read" in capsys.readouterr().err
