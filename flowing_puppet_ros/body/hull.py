@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +18,7 @@ from scipy import ndimage
 
 from flowing_puppet_ros.body.camera import Camera
 from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.image.distance import signed_distance
 from flowing_puppet_ros.settings import Settings, setting
 
 Floats = NDArray[np.float64]
@@ -118,13 +118,7 @@ class _View:
 
     @classmethod
     def of(cls, camera: Camera, mask: NDArray[np.uint8]) -> _View:
-        # Distances run to the nearest pixel centre of the other side; the outline lies half a pixel before it.
-        inside = np.ascontiguousarray(mask > 0).astype(np.uint8)
-        inward = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        outward = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        if inside.all():
-            inward[:] = sum(mask.shape)
-        return cls(camera.resized(mask.shape[::-1]), np.where(inside > 0, 0.5 - inward, outward - 0.5))
+        return cls(camera.resized(mask.shape[::-1]), signed_distance(mask).astype(np.float32))
 
 
 def _distance_field(views: list[_View], corners: Floats, settings: HullSettings) -> NDArray[np.float32]:

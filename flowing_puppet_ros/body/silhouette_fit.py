@@ -12,15 +12,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.camera import Camera
 from flowing_puppet_ros.body.correspondence import Quadratic
 from flowing_puppet_ros.body.geometry import vertex_normals
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.distance import signed_distance
 
 Floats = NDArray[np.float64]
 
@@ -48,16 +49,14 @@ class Outline:
     @classmethod
     def of(cls, camera: Camera, mask: NDArray[np.uint8]) -> Outline:
         """Prepare a mask (h,w) uint8, positive on the body; InputError when it is empty or full."""
-        inside = (mask > 0).astype(np.uint8)
+        inside = mask > 0
         if inside.all() or not inside.any():
             raise InputError(f"a mask of {mask.shape[1]} x {mask.shape[0]} pixels is empty or full: it has no outline")
-        outward = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
-        inward = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) - 0.5
-        signed = np.where(inside > 0, -inward, outward).astype(np.float64)
-        distance = cv2.GaussianBlur(signed, (0, 0), _SMOOTHING)
+        signed = signed_distance(mask)
+        distance = ndimage.gaussian_filter(signed, _SMOOTHING, mode="nearest")
         slope = np.stack(np.gradient(distance)[::-1], axis=-1)
         slope /= np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-9)
-        edge = (inside > 0) & (inward <= 0.5)
+        edge = inside & (signed >= -0.5)
         edge[:2] = edge[-2:] = False
         edge[:, :2] = edge[:, -2:] = False
         rows, columns = (side[::_OUTLINE_STEP] for side in np.nonzero(edge))

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.background import Background, BackgroundSettings
+from flowing_puppet_ros.image.distance import distance_to
 from flowing_puppet_ros.settings import setting
 
 Mask = NDArray[np.uint8]
@@ -115,7 +116,7 @@ class SilhouetteEstimator:
         puppet = cv2.resize(person, size, interpolation=cv2.INTER_NEAREST) > 0
         observation = Observation(small, puppet, everybody & ~puppet, scale * factor)
         if everybody.any():
-            self.background.update(small, _distance_outside(everybody) > _BARE_DISTANCE * observation.scale)
+            self.background.update(small, distance_to(everybody) > _BARE_DISTANCE * observation.scale)
         return observation
 
     def cut(self, observation: Observation) -> Silhouette:
@@ -146,11 +147,11 @@ class SilhouetteEstimator:
         seed[known & (levels > _DOUBTFUL[0]) & (ratio > _DOUBTFUL[1])] = cv2.GC_PR_FGD
         seed[other] = cv2.GC_FGD
         seed[same] = cv2.GC_BGD
-        distance = _distance_outside(puppet)
+        distance = distance_to(puppet)
         seed[distance > _POSSIBLE_FRINGE * scale] = cv2.GC_BGD
         # A limb that the puppet has elsewhere still hangs on the body and is no shadow.
         stray = other & ~self.background.shadow(observation.image) & (distance <= _STRAY_REACH * scale)
-        stray &= _distance_outside(observation.others) > _BARE_DISTANCE * scale
+        stray &= distance_to(observation.others) > _BARE_DISTANCE * scale
         seed[_connected(stray | puppet, puppet) & stray] = cv2.GC_FGD
         # Where a misplaced part of the puppet shows the bare background, colour decides.
         core = _eroded(puppet, _SURE_CORE * scale)
@@ -185,13 +186,8 @@ def _disc(radius: float) -> Mask:
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
 
 
-def _distance_outside(mask: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """Distance (h,w) in pixels to the nearest pixel of `mask`; very large everywhere when there is none."""
-    return cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-
-
 def _eroded(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    return _distance_outside(~mask) > radius
+    return distance_to(~mask) > radius
 
 
 def _crop(puppet: NDArray[np.bool_], margin: float) -> tuple[slice, slice]:
