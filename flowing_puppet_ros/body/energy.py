@@ -21,7 +21,7 @@ class JointTargets:
 
     Attributes:
         points: (J, 3) metres in the model's joint order; anything where the weight is 0.
-        weight: (J,) at least 0, confidence times strength.
+        weight: (J,) at least 0, confidence times strength (per squared metre of distance).
     """
 
     points: np.ndarray
@@ -32,6 +32,10 @@ class JointTargets:
         """No beliefs."""
         count = len(model.joint_names)
         return cls(np.zeros((count, 3)), np.zeros(count))
+
+    def scaled(self, strength: float) -> JointTargets:
+        """The same places believed `strength` times as much."""
+        return JointTargets(self.points, strength * self.weight)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -42,7 +42,7 @@ class FitterSettings(Settings):
     lm_steps: int = setting(4, "Levenberg-Marquardt steps a new particle", low=0, high=50)
     refine_iterations: int = setting(25, "Gauss-Newton steps of the finish", low=0, high=200)
     cloud_points: int = setting(10000, "points that a cloud is thinned to", low=200, high=200000)
-    joint_strength: float = setting(0.3, "pull of the initial joints, per squared metre", low=0.0, high=100.0)
+    joint_strength: float = setting(0.02, "pull of an initial joint against the whole cloud's", low=0.0, high=100.0)
     clip_factor: float = setting(2.0, "limb radii around the initial joints' axes that a cloud is clipped to, 0: none",
                                  low=0.0, high=20.0)  # fmt: skip
     seed: int = setting(0, "seed of all that is random", low=0)
@@ -148,7 +148,7 @@ class BodyFitter:
         progress: Progress,
     ) -> BodyFit:
         """Start from the body that the joints describe, on the part of the cloud around its limbs."""
-        targets = joint_targets(self.model, initial, self.settings.joint_strength)
+        targets = joint_targets(self.model, initial)
         body = body_from_joints(self.model, self._refiner, targets)
         if self.settings.clip_factor > 0:
             joints = self.model.joints(self.model.vertices(body))
@@ -161,6 +161,7 @@ class BodyFitter:
             points, normals = points[near], None if normals is None else normals[near]
         cloud = self._cloud(points, normals, viewpoint)
         grid = CloudGrid.build(cloud.points, cloud.normals)
+        targets = targets.scaled(self.settings.joint_strength)
         found = self._local_search(body, grid, targets, rng, lambda done: progress(0.1 + 0.7 * done))
         body = self._finish(found, cloud, targets)
         progress(1.0)

@@ -35,13 +35,16 @@ TRUNK = (
     "nose",
     "head_top",
 )
-JOINTS_ONLY = RefineWeights(stitch=1.0, pose=1e-5, shape=3e-5, pairwise=1e-5, iterations=15)
+START_STRENGTH = 0.1
+JOINTS_ONLY = RefineWeights(
+    stitch=1.0, pose=1e-5, shape=3e-5, pairwise=1e-5, sigma_start=0.4, sigma_end=0.08, iterations=15
+)
 
 
-def joint_targets(
-    model: StitchedPuppet, initial: Mapping[str, tuple[float, float, float, float]], strength: float
-) -> JointTargets:
-    """Turn named joints (x, y, z in metres, confidence 0 to 1) into targets; unknown names and NaN are left out.
+def joint_targets(model: StitchedPuppet, initial: Mapping[str, tuple[float, float, float, float]]) -> JointTargets:
+    """Turn named joints (x, y, z in metres, confidence 0 to 1) into targets weighted by confidence.
+
+    Unknown names and joints with NaN are left out.
 
     Raises:
         InputError: when fewer than four joints remain or the trunk's do not span a plane, so that no body is placed.
@@ -50,7 +53,7 @@ def joint_targets(
     for name, values in initial.items():
         if name in model.joint_names and np.all(np.isfinite(values)) and values[3] > 0:
             points[model.joint_names.index(name)] = values[:3]
-            weight[model.joint_names.index(name)] = strength * min(float(values[3]), 1.0)
+            weight[model.joint_names.index(name)] = min(float(values[3]), 1.0)
     if np.count_nonzero(weight) < 4:
         raise InputError(
             f"only {np.count_nonzero(weight)} of the {len(initial)} initial joints are known to the body model and"
@@ -68,7 +71,7 @@ def body_from_joints(model: StitchedPuppet, refiner: Refiner, targets: JointTarg
     start = _trunk(model, targets)
     for part in range(1, len(model.tree)):
         _attach(model, start, part, targets)
-    return refiner.run(start, None, targets, JOINTS_ONLY)
+    return refiner.run(start, None, targets.scaled(START_STRENGTH), JOINTS_ONLY)
 
 
 def _trunk(model: StitchedPuppet, targets: JointTargets) -> BodyState:

@@ -21,6 +21,8 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 MAX_COEFFICIENT = 3.5
 MAX_TURN = 0.5
+# Joints are believed this many times more widely than closest points are.
+JOINT_WIDTH = 2.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +41,7 @@ class RefineWeights:
 
     stitch: float = 0.3
     pose: float = 1e-6
-    shape: float = 1e-6
+    shape: float = 3e-6
     pairwise: float = 1e-6
     sigma_start: float = 0.10
     sigma_end: float = 0.03
@@ -97,7 +99,7 @@ class Refiner:
         vertices = self._merge(world)
         if cloud is not None:
             self._add_quadratic(attract(vertices, self._model.faces, cloud, sigma), jacobians, hessian, gradient)
-        self._add_joints(targets, vertices, jacobians, hessian, gradient)
+        self._add_joints(targets, JOINT_WIDTH * sigma, vertices, jacobians, hessian, gradient)
         self._add_stitching(weights.stitch, world, jacobians, hessian, gradient)
         self._add_priors(state, weights, hessian, gradient)
         hessian[np.diag_indices(size)] += 1e-9 + 1e-3 * hessian.diagonal()
@@ -138,6 +140,7 @@ class Refiner:
     def _add_joints(
         self,
         targets: JointTargets,
+        width: float,
         vertices: np.ndarray,
         jacobians: list[np.ndarray],
         hessian: np.ndarray,
@@ -146,14 +149,15 @@ class Refiner:
         chosen = np.flatnonzero(targets.weight > 0)
         if not len(chosen):
             return
+        gap = self._regressor[chosen] @ vertices - targets.points[chosen]
+        trust = (width**2 / (width**2 + (gap**2).sum(axis=1))) ** 2
         rows = np.zeros((len(chosen), 3, len(gradient)))
         for part, jacobian in enumerate(jacobians):
             vertex = self._model.part_vertices[part]
             share = self._regressor[np.ix_(chosen, vertex)] * self._share[vertex]
             rows[:, :, self._block(part)] += np.tensordot(share, jacobian, 1)
-        gap = self._regressor[chosen] @ vertices - targets.points[chosen]
         flat = rows.reshape(-1, len(gradient))
-        weight = np.repeat(targets.weight[chosen], 3)
+        weight = np.repeat(trust * targets.weight[chosen], 3)
         hessian += (flat * weight[:, None]).T @ flat
         gradient += flat.T @ (weight * gap.reshape(-1))
 
