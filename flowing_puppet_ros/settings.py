@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """One source for settings: frozen dataclasses from which ROS parameters, YAML and command-line flags are made.
 
-    @dataclass(frozen=True, slots=True)
-    class FlowSettings(Settings):
-        preset: str = setting("medium", "DIS preset", choices=("ultrafast", "fast", "medium"))
-        max_side: int = setting(640, "longest image side the flow is computed at", unit="px", low=32, high=8192)
+@dataclass(frozen=True, slots=True)
+class FlowSettings(Settings):
+    preset: str = setting("medium", "DIS preset", choices=("ultrafast", "fast", "medium"))
+    max_side: int = setting(640, "longest image side the flow is computed at", unit="px", low=32, high=8192)
 """
 
 from __future__ import annotations

@@ -12,6 +12,8 @@ from flowing_puppet_ros.settings import Settings, setting
 
 @dataclass(frozen=True, slots=True)
 class Example(Settings):
+    """One setting of every kind."""
+
     particles: int = setting(30, "particles a part", low=2, high=500)
     noise: float = setting(0.04, "random walk", unit="m", low=0.0)
     preset: str = setting("fast", "what to favour", choices=("fast", "exact"))
@@ -24,7 +26,7 @@ def parse(*words: str) -> Example:
     return Example.from_arguments(parser.parse_args(words))
 
 
-def test_description_tells_unit_range_and_choices():
+def test_description_tells_unit_range_and_choices() -> None:
     texts = {info.name: info.description for info in Example.describe()}
     assert texts == {
         "particles": "particles a part (2 to 500)",
@@ -34,13 +36,13 @@ def test_description_tells_unit_range_and_choices():
     }
 
 
-def test_flags_give_the_same_settings_as_the_constructor():
+def test_flags_give_the_same_settings_as_the_constructor() -> None:
     assert parse() == Example()
     flags = ("--particles", "80", "--noise", "1", "--preset", "exact", "--mirror")
     assert parse(*flags) == Example(80, 1.0, "exact", True)
 
 
-def test_integers_are_welcome_where_floats_are_wanted():
+def test_integers_are_welcome_where_floats_are_wanted() -> None:
     assert isinstance(Example(noise=1).noise, float)
 
 
@@ -55,7 +57,7 @@ def test_integers_are_welcome_where_floats_are_wanted():
         ({"speed": 3}, "unknown setting 'speed'; known are mirror, noise, particles, preset"),
     ],
 )
-def test_bad_values_are_refused_by_name(values, sentence):
+def test_bad_values_are_refused_by_name(values: dict[str, object], sentence: str) -> None:
     with pytest.raises(InputError) as caught:
         Example.from_mapping(values)
     assert str(caught.value) == sentence
