@@ -68,7 +68,7 @@ class SettingInfo:
         if self.type in (int, float):
             low = -math.inf if self.low is None else self.low
             high = math.inf if self.high is None else self.high
-            if not low <= value <= high:
+            if not low <= float(value) <= high:
                 raise InputError(f"{self.name} is {value}, outside {_bound(self.low)} to {_bound(self.high)}")
         return value
 
