@@ -65,10 +65,10 @@ class SettingInfo:
             raise InputError(f"{self.name} is {value!r}, which is not a {self.type.__name__}")
         if self.choices and value not in self.choices:
             raise InputError(f"{self.name} is {value!r}, which is not one of {', '.join(self.choices)}")
-        if self.type in (int, float):
+        if isinstance(value, int | float):
             low = -math.inf if self.low is None else self.low
             high = math.inf if self.high is None else self.high
-            if not low <= float(value) <= high:
+            if not low <= value <= high:
                 raise InputError(f"{self.name} is {value}, outside {_bound(self.low)} to {_bound(self.high)}")
         return value
 
