@@ -31,6 +31,7 @@ from flowing_puppet_ros.view.pictures import shrink, to_height
 
 STRIP_HEIGHT, FLOW_HEIGHT, VIEW_HEIGHT = 760, 400, 400
 BODY_SIZE = (360, 520)
+VIEW_ASPECT = 0.75
 POINT_COLOUR = (20, 90, 200)
 
 
@@ -101,17 +102,22 @@ class Box:
     bottom: int
 
     @classmethod
-    def around(cls, points: np.ndarray, shape: tuple[int, ...], margin: float) -> Box:
-        """The box of the finite points (N,2), wider by `margin` times its longer side, inside an image (H,W,...)."""
+    def around(cls, points: np.ndarray, shape: tuple[int, ...], margin: float, aspect: float = 0.0) -> Box:
+        """The box of the finite points (N,2), wider by `margin` times its longer side, inside an image (H,W,...).
+
+        A positive `aspect` is the width by the height that the box is grown to, as far as the image has room.
+        """
         points = points[np.isfinite(points).all(axis=1)]
-        height, width = shape[:2]
+        room = np.array(shape[1::-1], float)
         if not len(points):
-            return cls(0, 0, width, height)
+            return cls(0, 0, int(room[0]), int(room[1]))
         low, high = points.min(axis=0), points.max(axis=0)
-        more = margin * float((high - low).max())
-        left, top = (int(value) for value in np.clip(np.floor(low - more), 0, (width - 2, height - 2)))
-        right, bottom = (int(value) for value in np.clip(np.ceil(high + more), (left + 2, top + 2), (width, height)))
-        return cls(left, top, right, bottom)
+        size = high - low + 2 * margin * float((high - low).max())
+        if aspect > 0:
+            size = np.maximum(size, [size[1] * aspect, size[0] / aspect])
+        size = np.clip(np.ceil(size), 2, room)
+        left, top = (int(value) for value in np.clip(np.floor((low + high - size) / 2), 0, room - size))
+        return cls(left, top, left + int(size[0]), top + int(size[1]))
 
     def scaled(self, factor: float) -> Box:
         """The same part of the image resized by `factor`."""
@@ -213,7 +219,7 @@ def body_shot(stamp: int, body: Any, mesh: BodyMesh, images: Sequence[tuple[str,
     front, side = (_from_side(mesh, -direction, up) for direction in (forward, left))
     views = []
     for name, camera, image in images:
-        box = Box.around(camera.project(mesh.vertices)[0], image.shape, 0.12)
+        box = Box.around(camera.project(mesh.vertices)[0], image.shape, 0.08, VIEW_ASPECT)
         small = shrink(box.cut(image), VIEW_HEIGHT)
         size = (small.shape[1], small.shape[0])
         canvas = Canvas(_cropped(camera, box).resized(size), size)

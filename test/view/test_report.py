@@ -17,7 +17,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.from_bag import read_recording
 from flowing_puppet_ros.view.report import collage, report_page, write_report
 from flowing_puppet_ros.view.report_data import gather
-from flowing_puppet_ros.view.report_pictures import facing
+from flowing_puppet_ros.view.report_pictures import Box, facing
 
 type Replay = Callable[..., tuple[Path, Path]]
 
@@ -217,3 +217,15 @@ def test_facing_finds_up_in_other_frames() -> None:
     optical = {name: np.array([p[1], -p[2], 3 - p[0]]) for name, p in upright.items()}
     assert np.allclose(facing(optical), [[0, 0, -1], [1, 0, 0], [0, -1, 0]])
     assert np.allclose(facing({}), np.eye(3))
+
+
+@pytest.mark.parametrize("points", [[[30, 40], [50, 90]], [[-80, 5], [20, 10]], [[90, 70], [130, 500]]])
+def test_boxes_hold_their_points_and_stay_in_the_image(points: list[list[float]]) -> None:
+    shape = (120, 100, 3)
+    box = Box.around(np.array([*points, [np.nan, 3.0]]), shape, 0.1, aspect=0.75)
+    assert 0 <= box.left < box.right <= 100 and 0 <= box.top < box.bottom <= 120
+    inside = np.clip(points, 0, (99, 119))
+    assert (inside >= (box.left, box.top)).all() and (inside < (box.right, box.bottom)).all()
+    part = box.cut(np.zeros(shape))
+    assert part.shape[1] / part.shape[0] == pytest.approx(0.75, abs=0.02) or 100 in part.shape or 120 in part.shape
+    assert Box.around(np.full((2, 2), np.nan), shape, 0.1) == Box(0, 0, 100, 120)
