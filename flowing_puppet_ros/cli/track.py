@@ -36,6 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", help="video file, folder of images, or bag (.mcap, .db3 or a rosbag2 folder)")
     parser.add_argument("--out", required=True, help="tracks.json to write")
     parser.add_argument("--init", help="keypoints.json, people of one or more frames; needed unless a bag has them")
+    parser.add_argument("--topic", default="", help="image topic of a bag [the first camera with detections]")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
     parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object")
@@ -48,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     model = DeformableStructures.load(arguments.model, arguments.parts)
     settings = TrackerSettings.from_arguments(arguments), FlowSettings.from_arguments(arguments)
     tracker = FlowingPuppetTracker(model, *settings)
-    detected, fps, count = _open(Path(arguments.input), arguments.init)
+    detected, fps, count = _open(Path(arguments.input), arguments.init, arguments.topic)
     frames: list[dict[str, Any]] = []
     began, last = time.monotonic(), ""
     for frame, detections in tqdm(detected, total=count or None, unit="frame", disable=None):
@@ -65,10 +66,10 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _open(path: Path, init: str | None) -> tuple[Iterable[Detected], float, int]:
+def _open(path: Path, init: str | None, topic: str) -> tuple[Iterable[Detected], float, int]:
     """The input's frames with the keypoints given for them, its frame rate and its number of frames (0 unknown)."""
     if is_bag(path):
-        return _open_bag(path, init)
+        return _open_bag(path, init, topic)
     source = open_frames(path)
     if init is None:
         raise InputError(f"{path} says nothing about where people are; give keypoints of one frame with --init")
@@ -80,15 +81,17 @@ def _open(path: Path, init: str | None) -> tuple[Iterable[Detected], float, int]
 
 def is_bag(path: Path) -> bool:
     """Whether `path` is a bag file or a folder that rosbag2 wrote."""
-    return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file()
+    return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
 
 
-def _open_bag(path: Path, init: str | None) -> tuple[Iterable[Detected], float, int]:
+def _open_bag(path: Path, init: str | None, topic: str) -> tuple[Iterable[Detected], float, int]:
     # Only bags need the bag stack, which takes a while to import.
     from flowing_puppet_ros.bag.frames import open_bag_frames
 
-    source = open_bag_frames(path)
+    source = open_bag_frames(path, topic)
     if init is None:
+        if not source.detections:
+            raise InputError(f"{path} has no detections beside {source.topic}; give keypoints of one image with --init")
         return source, source.fps, source.count
     keypoints = read_keypoints(init)
     return ((frame, keypoints.get(frame.index)) for frame, _ in source), source.fps, source.count

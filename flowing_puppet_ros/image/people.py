@@ -33,9 +33,6 @@ class TrackerSettings(Settings):
     )
     gate: float = setting(3.5, "deviations beyond which a detected joint is doubted", low=1.0, high=100.0)
     patience: int = setting(3, "detections in agreement that outvote the gate", low=1, high=100)
-    memory: int = setting(
-        5, "images after which a joint carried by flow alone yields to any detection", unit="images", low=1, high=1000
-    )
     match_distance: float = setting(0.5, "largest median joint distance to match", unit="m", low=0.01, high=10.0)
     least_joints: int = setting(5, "known joints that a detection needs to start a person", low=3, high=15)
     most_people: int = setting(8, "people tracked at once", low=1, high=100)
@@ -128,8 +125,9 @@ class Person:
         """Fuse detected joints (J, 2), NaN unknown: precision-weighted means, behind a gate with patience.
 
         A detected joint farther than `gate` deviations from the carried one is left out, until `patience` detections
-        in a row agree with each other, or flow alone has carried the joint for longer than `memory` images: then the
-        joint jumps there. Sets `detection_energy`, half the squared
+        in a row agree with each other, or the gate, which opens with every image that flow alone carries the joint
+        (flow errs in proportion to the motion, again and again in one direction), has reached it: then the joint jumps
+        there. Sets `detection_energy`, half the squared
         distance in deviations summed over the joints that were fused.
         """
         seen = np.isfinite(joints).all(axis=1) & (confidence > 0)
@@ -140,7 +138,7 @@ class Person:
         again = doubtful & (_squared(joints - self.doubted) <= settings.gate**2 * total)
         self.doubts = np.where(seen, np.where(again, self.doubts + 1, doubtful.astype(np.int64)), self.doubts)
         self.doubted[seen] = np.where(doubtful[:, None], joints, np.nan)[seen]
-        jump = doubtful & ((self.doubts >= settings.patience) | (self.age > settings.memory))
+        jump = doubtful & ((self.doubts >= settings.patience) | (distance <= (settings.gate * self.age) ** 2))
         good = seen & ~doubtful
         gain = np.where(jump, 1.0, np.where(good, self.variance / total, 0.0))
         self.mean = self.mean + gain[:, None] * np.where(seen[:, None], joints - self.mean, 0.0)

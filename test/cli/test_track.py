@@ -12,6 +12,7 @@ import pytest
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.model.ds import DeformableStructures
 
+GOLDEN = Path(__file__).parents[2] / "bags" / "golden" / "golden.mcap"
 MODEL = DeformableStructures.load()
 PUPPET = MODEL.puppet_from_joints(MODEL.mean_joints() * 150 + [150, 110], 150.0)
 
@@ -129,3 +130,22 @@ def test_missing_input_and_missing_keypoints(frames: Path, tmp_path: Path, capsy
     assert "--init" in capsys.readouterr().err
     assert main(["track", str(frames), "--out", "o.json", "--init", str(tmp_path / "none.json")]) == 2
     assert "none.json cannot be read" in capsys.readouterr().err
+
+
+def test_a_bag_brings_its_own_detections(tmp_path: Path) -> None:
+    out = tmp_path / "tracks.json"
+    assert main(["track", str(GOLDEN), "--out", str(out), "--topic", "/cam2/image/compressed"]) == 0
+    tracks = json.loads(out.read_text())
+    assert len(tracks["frames"]) == 8
+    assert all(frame["puppets"] for frame in tracks["frames"]), "two images have no detection: flow carries the person"
+    assert tracks["fps"] > 1
+    assert {puppet["id"] for frame in tracks["frames"] for puppet in frame["puppets"]} == {"a1"}
+
+
+def test_bags_without_the_topic_or_broken_are_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    broken = tmp_path / "broken.mcap"
+    broken.write_text("no bag")
+    for arguments, says in (([str(GOLDEN), "--topic", "/x"], "/cam1/image/compressed"), ([str(broken)], "broken.mcap")):
+        assert main(["track", *arguments, "--out", str(tmp_path / "o.json")]) == 2
+        (line,) = capsys.readouterr().err.strip().splitlines()
+        assert says in line

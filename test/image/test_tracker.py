@@ -68,6 +68,18 @@ def test_one_wild_detection_does_not_take_the_limb_away_but_persistent_ones_do()
     assert error(result, wild(pose(0)), "left_wrist") < 5
 
 
+def test_the_gate_opens_while_no_detection_comes() -> None:
+    still, apart = draw(pose(0)), (0.0, -16.0)
+    for missed, accepted in ((0, False), (4, True)):
+        follower = tracker()
+        for time in range(3):
+            follower.step(still, time, [detection(pose(0))])
+        for time in range(3, 3 + missed):
+            follower.step(still, time, None)
+        result = follower.step(still, 3 + missed, [detection(wild(pose(0), apart))])
+        assert (error(result, wild(pose(0), apart), "left_wrist") < 3) == accepted
+
+
 def test_wild_detections_that_disagree_are_not_persistent() -> None:
     follower = tracker()
     still = draw(pose(0))

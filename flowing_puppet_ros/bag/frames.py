@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The images of one camera in a bag, each with the detections of its stamp."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from flowing_puppet_ros.bag.reader import open_bag
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.keypoints import Keypoints
+from flowing_puppet_ros.image.video import Frame
+from flowing_puppet_ros.stream.component import COMPRESSED_IMAGE, IMAGE, PUPPETS
+from flowing_puppet_ros.stream.images import decode_image
+from flowing_puppet_ros.stream.messages import stamp_ns
+from flowing_puppet_ros.stream.people import keypoints_of
+
+
+@dataclass(frozen=True, slots=True)
+class BagFrames:
+    """Iterate for (frame, its detections or None); `fps` from the first and last stamp, `count` images."""
+
+    path: Path
+    topic: str
+    detections: dict[int, list[Keypoints]]
+    fps: float
+    count: int
+
+    def __iter__(self) -> Iterator[tuple[Frame, list[Keypoints] | None]]:
+        """Read the images in the order of the bag; a stamp without detections had no detector run on it."""
+        with open_bag(self.path) as bag:
+            for index, record in enumerate(bag.messages([self.topic])):
+                stamp = stamp_ns(record.message)
+                frame = Frame(index, stamp, decode_image(record.message), "")
+                yield frame, self.detections.get(stamp)
+
+
+def open_bag_frames(path: Path, topic: str = "") -> BagFrames:
+    """Open the images on `topic`, or on the first image topic whose namespace has detections.
+
+    InputError lists the image topics when there is no such topic, and when the topic has no message.
+    """
+    with open_bag(path) as bag:
+        images = sorted(name for name, kind in bag.topics.items() if kind in (IMAGE, COMPRESSED_IMAGE))
+        people_topics = [name for name, kind in bag.topics.items() if kind == PUPPETS and name.endswith("/detections")]
+        detected = {name.removesuffix("/detections"): name for name in people_topics}
+        chosen = [topic] if topic else [name for name in images if _namespace(name) in detected]
+        chosen = chosen or images
+        if not chosen or chosen[0] not in images:
+            listed = ", ".join(images) or "none"
+            raise InputError(f"{path} has no images on {topic or 'any topic'}; its image topics are: {listed}")
+        source = detected.get(_namespace(chosen[0]), "")
+        people = {stamp_ns(r.message): keypoints_of(r.message) for r in bag.messages([source])} if source else {}
+        stamps = [stamp_ns(record.message) for record in bag.messages([chosen[0]])]
+    if not stamps:
+        raise InputError(f"{path} has no message on {chosen[0]}")
+    span = (max(stamps) - min(stamps)) * 1e-9
+    fps = (len(stamps) - 1) / span if span > 0 else 0.0
+    return BagFrames(path, chosen[0], people, fps, len(stamps))
+
+
+def _namespace(image: str) -> str:
+    """The camera's namespace: /cam01 of /cam01/image_raw/compressed."""
+    return image.removesuffix("/compressed").rpartition("/")[0]
