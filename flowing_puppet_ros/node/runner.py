@@ -54,6 +54,7 @@ def _parser(name: str, description: str | None) -> argparse.ArgumentParser:
 
 
 def _spin(name: str, make_node: Callable[[str], Any]) -> int:
+    import rclpy
     from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 
     node = make_node(name)
@@ -62,13 +63,15 @@ def _spin(name: str, make_node: Callable[[str], Any]) -> int:
     executor.add_node(node)
     node.get_logger().info("ready")
     try:
-        while True:
+        while rclpy.ok():
             try:
                 executor.spin_once()
             except (KeyboardInterrupt, ExternalShutdownException):
-                return 0
+                break
             except Exception as error:
-                # A message of another type under the same topic name must not end the node.
-                node.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=5.0)
+                # A message of another type under the same topic name must not end the node; a shut-down context does.
+                if rclpy.ok():
+                    node.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=5.0)
+        return 0
     finally:
         node.destroy_node()
