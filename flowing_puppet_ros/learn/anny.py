@@ -65,6 +65,9 @@ class AnnyBody:
         self.mirror_vertex = cKDTree(vertices).query(vertices * [1, -1, 1])[1]
         self.mirror_bone = np.array([self.bone_names.index(_mirrored_bone(name)) for name in self.bone_names])
         weights = np.asarray(self._anny.skin_weights, dtype=np.float64)
+        # body-models 0.26.2 overwrites the first bone's weights with the padding of a table: they are what is missing.
+        weights[:, 0] += np.maximum(1.0 - weights.sum(axis=1), 0.0)
+        weights /= weights.sum(axis=1, keepdims=True)
         self.skin_weights = (weights + weights[self.mirror_vertex][:, self.mirror_bone]) / 2
         self._landmark_vertices = self._find_landmarks(vertices)
 
@@ -99,15 +102,16 @@ class AnnyBody:
     def sample_phenotype(self, rng: np.random.Generator) -> Array:
         """A random adult (6,), from thin to very heavy, 1.45 to 2.0 m tall.
 
-        Half of the weights are drawn uniformly, because a bell shape alone leaves puppets too thin for heavy people.
+        Half of the weights and muscles are drawn uniformly: a bell shape alone leaves puppets too thin for heavy
+        people, and Anny is heavy only where there is much weight and little muscle.
         """
         while True:
             female = float(rng.random() < 0.5) if self.gender == "neutral" else float(self.gender == "female")
             phenotype = np.empty(6)
             phenotype[GENDER] = abs(female - min(abs(rng.normal(0, 0.15)), 0.5))
             phenotype[AGE] = rng.uniform(0.6, 0.95)
-            phenotype[MUSCLE] = np.clip(rng.normal(0.5, 0.22), 0, 1)
-            phenotype[WEIGHT] = rng.random() if rng.random() < 0.5 else np.clip(rng.normal(0.5, 0.2), 0, 1)
+            for trait in (MUSCLE, WEIGHT):
+                phenotype[trait] = rng.random() if rng.random() < 0.5 else np.clip(rng.normal(0.5, 0.2), 0, 1)
             phenotype[PROPORTIONS] = np.clip(rng.normal(0.5, 0.2), 0, 1)
             mean, deviation = STATURE["female" if female else "male"]
             stature = float(np.clip(rng.normal(mean, deviation), *STATURE_LIMITS))

@@ -26,9 +26,9 @@ FLIP_TURN = 0.9  # cosine between the two faces of an edge that may be flipped
 def decimate(vertices: Array, faces: Array, spacing: Array, group: Array, inner: Array, count: int) -> Array:
     """Faces (F',3) of a coarser mesh over about `count` of the `vertices` (V,3), which keep their numbers.
 
-    faces: (F,3) of an oriented manifold with or without boundary. spacing: (V,) wanted edge length, metres. group: (V,),
-    a vertex only collapses onto one of its own group. inner: (V,) bool, vertices that go first, whatever it costs in
-    quality (the inside of a mouth). Boundary vertices stay on the boundary, and no inner edge joins two of them, so
+    faces: (F,3) of an oriented manifold with or without boundary. spacing: (V,) wanted edge length, metres. group:
+    (V,), a vertex only collapses onto one of its own group. inner: (V,) bool, vertices that go first, whatever it costs
+    in quality (the inside of a mouth). Boundary vertices stay on the boundary, and no inner edge joins two of them, so
     that two halves can be welded there. Fewer collapses happen where no more are possible.
     """
     faces = np.ascontiguousarray(faces, dtype=np.int64).copy()
@@ -234,7 +234,7 @@ def _collapse(vertices, faces, fan, alive, boundary, spacing, group, inner, coun
             costs[u], targets[u] = _best_collapse(u, vertices, faces, fan, boundary, spacing, group, inner, quadrics)
     first, second = np.empty(4 * VALENCE_LIMIT, np.int64), np.empty(4 * VALENCE_LIMIT, np.int64)
     while True:
-        u = np.argmin(costs)
+        u = int(np.argmin(costs))
         if costs[u] == np.inf or (remaining <= count and costs[u] > -1e5):
             return
         v = targets[u]

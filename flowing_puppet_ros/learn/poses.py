@@ -136,18 +136,19 @@ class PoseSampler:
         body, align = self._body, self._alignment()
         turned = np.empty((len(frames), len(body.bone_names), 3, 3))
         for bone, name in enumerate(body.bone_names):
-            parent = body.bone_parents[bone]
-            joint = MOCAP_OF_BONE.get(name)
-            turned[:, bone] = turned[:, parent] if joint is None else world[:, joint] @ align.get(name, np.eye(3))
+            source = MOCAP_OF_BONE.get(name)
+            turned[:, bone] = (
+                turned[:, body.bone_parents[bone]] if source is None else world[:, source] @ align.get(name, np.eye(3))
+            )
         relative = turned.copy()
-        for bone, parent in enumerate(body.bone_parents):
-            if parent >= 0:
-                relative[:, bone] = np.swapaxes(turned[:, parent], -1, -2) @ turned[:, bone]
+        for bone, above in enumerate(body.bone_parents):
+            if above >= 0:
+                relative[:, bone] = np.swapaxes(turned[:, above], -1, -2) @ turned[:, bone]
         return relative
 
     def _alignment(self) -> dict[str, Array]:
         # From Anny's rest pose to the T-pose: arms by direction and elbow hinge, legs by
-        # direction only; hands follow the lower arm; spine, clavicles and feet point alike in both.
+        # direction only; hands follow the lower arm; spine and clavicles point alike in both.
         body, rest = self._body, self._rest
         upper = _direction(body, rest, "LeftArm", "LeftForeArm")
         align = {"LeftArm": _frame(T_ARM, T_HINGE) @ _frame(upper, self._hinge).T}
@@ -155,6 +156,9 @@ class PoseSampler:
         align["LeftHand"] = align["LeftFingerBase"] = align["LeftForeArm"]
         for name, below in (("LeftUpLeg", "LeftLeg"), ("LeftLeg", "LeftFoot")):
             align[name] = _between(_direction(body, rest, name, below), _unit(T_LEG))
+        # The motion capture has no sideways tilt of the ankle, so the feet of the T-pose are as square to the legs.
+        shin = _direction(body, rest, "LeftLeg", "LeftFoot") * [0.0, 1.0, 1.0]
+        align["LeftFoot"] = align["LeftToeBase"] = _between(_unit(shin), _unit(T_LEG))
         flip = np.diag([1.0, -1.0, 1.0])
         return align | {name.replace("Left", "Right"): flip @ turn @ flip for name, turn in align.items()}
 

@@ -32,11 +32,11 @@ LIMB_CUTS = (  # the two parts, the bones above and below the cut, the bone whos
     ("left_lower_leg", "left_foot", "LeftLeg", "LeftFoot", None),
 )
 CAP_LENGTH = 0.3  # of the upper arm: how far the shoulder part reaches down the arm
-COLLAR_TILT, COLLAR_HEIGHT = 0.45, 0.0  # metres a metre, metres: the cut of the head above the neck joint
-CAP_INNER = (0.52, -0.02)  # of the shoulder's y, and metres above the neck joint: upper end of the shoulder's inner cut
-CAP_LOWER = (1.0, -0.135)  # of the shoulder's y, and metres above the shoulder joint: its lower end, under the armpit
-LEG_INNER = 0.03  # metres: half the width of the strip of torso between the legs
-LEG_OUTER = (0.2, 0.05)  # metres, y and height above the hip joint of the outer end of the leg's cut
+COLLAR_TILT, COLLAR_HEIGHT = 0.45, -0.005  # metres a metre, metres: the cut of the head above the neck joint
+CAP_INNER = (0.6, 0.0)  # of the shoulder's y, and metres above the neck joint: upper end of the shoulder's inner cut
+CAP_LOWER = (0.92, -0.16)  # of the shoulder's y, and metres above the shoulder joint: its lower end, under the armpit
+LEG_INNER = 0.02  # metres: half the width of the strip of torso between the legs
+LEG_OUTER = (0.2, 0.09)  # metres, y and height above the hip joint of the outer end of the leg's cut
 LEG_TILT = 0.3  # metres a metre: how much lower the leg's cut is behind than in front
 
 

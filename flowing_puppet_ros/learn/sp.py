@@ -11,26 +11,19 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.learn.anny import AnnyBody, RestBody
-from flowing_puppet_ros.learn.pca import MIRROR, Space, mirrored_space, principal_space
+from flowing_puppet_ros.learn.pca import MIRROR, Space, principal_space
 from flowing_puppet_ros.learn.poses import PoseSampler
 from flowing_puppet_ros.learn.sp_joints import regress_joints
+from flowing_puppet_ros.learn.sp_pose import TREE, learn_pairwise, local_mirror, pose_parts, pose_spaces
 from flowing_puppet_ros.learn.template import Template, make_template
-from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.gaussian import Gaussian
-from flowing_puppet_ros.model.sp import MIRROR_AXIS, PartTopology
-from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
+from flowing_puppet_ros.model.sp import PartTopology
 from flowing_puppet_ros.settings import Settings, setting
 
 Array = np.ndarray[Any, Any]
 Progress = Callable[[str], None]
 
-TREE = PartTree.from_parents(SP_PARENTS)
-POSE_COUNTS = {"torso": 12, "shoulder": 8, "upper_arm": 8}  # by the name without its side; all other parts have 5
-OTHER_POSE_COUNT = 5
 STRETCH = 0.8  # Eq. 48: weight of the front of the knee and the back of the elbow
-LIMIT_TAIL, LIMIT_MARGIN = 0.001, np.radians(5.0)  # share of training poses beyond a joint limit; what is added to it
-BORDER = 4.0  # how much more than the others the vertices that parts share count in the pose deformations
-BATCH = 250
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,14 +34,6 @@ class LearnSettings(Settings):
     poses: int = setting(4000, "poses of the average body", low=200, high=100000)
     shape_count: int = setting(10, "intrinsic shape coefficients", low=1, high=29)
     seed: int = setting(0, "seed of everything random", low=0, high=2**31 - 1)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PartPoses:
-    """The training poses of the average body, part by part: rotations (n,16,3,3) and local deformations (n,N_i,3)."""
-
-    rotations: Array
-    deformations: tuple[Array, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,13 +62,15 @@ def learn(gender: str, settings: LearnSettings, mocap: Path | None, progress: Pr
     people = [body.rest(body.sample_phenotype(rng)) for _ in range(settings.shapes)]
     shape_space, rest_center = _shape_space(people, template, topology, area, settings.shape_count)
     progress(f"{settings.poses} poses")
-    posed = _pose_parts(body, template, topology, poses.sample(rng, settings.poses), area)
-    progress("pose deformations of 16 parts")
-    spaces, signs = _pose_spaces(posed, template, topology, area)
-    pairwise, low, high = _pairwise(posed, spaces, signs, template, topology)
+    posed = pose_parts(body, template, topology, poses.sample(rng, settings.poses), area)
+    progress("pose deformations of the parts")
+    spaces, signs = pose_spaces(posed, template, topology, area)
+    pairwise, low, high = learn_pairwise(posed, spaces, signs)
     progress("joints")
     names, joint_index, joint_weight, error = _joints(body, people, poses, template, rng)
-    arrays = _arrays(template, topology, shape_space, spaces) | {
+    stretch = _interface_weights(body, template, topology)
+    arrays = _topology_arrays(template) | _space_arrays(topology, shape_space, spaces, signs)
+    arrays |= _edge_arrays(pairwise, stretch) | {
         "rest_center": rest_center.astype(np.float32),
         "limit_low": low.astype(np.float32),
         "limit_high": high.astype(np.float32),
@@ -91,12 +78,6 @@ def learn(gender: str, settings: LearnSettings, mocap: Path | None, progress: Pr
         "joint_index": joint_index,
         "joint_weight": joint_weight.astype(np.float32),
     }
-    for part, sign in enumerate(signs):
-        arrays[f"pose_mirror_{part}"] = sign.astype(np.int8)
-    for edge, (gaussian, weight) in enumerate(zip(pairwise, _interface_weights(body, template, topology), strict=True)):
-        arrays[f"pair_mean_{edge}"] = gaussian.mean.astype(np.float32)
-        arrays[f"pair_covariance_{edge}"] = gaussian.covariance.astype(np.float32)
-        arrays[f"interface_weight_{edge}"] = weight.astype(np.float32)
     return Learned(arrays, shape_space, spaces, error)
 
 
@@ -105,13 +86,6 @@ def vertex_area(vertices: Array, faces: Array) -> Array:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
     return np.asarray(np.bincount(faces.ravel(), np.repeat(area, 3), minlength=len(vertices)))
-
-
-def local_mirror(template: Template, topology: PartTopology, part: int) -> Array:
-    """For every vertex (N_i,) of a part the local index of its mirror image in the part on the other side."""
-    return np.searchsorted(
-        topology.part_vertices[TREE.mirror[part]], template.mirror_vertex[topology.part_vertices[part]]
-    )
 
 
 def _shape_space(
@@ -130,67 +104,6 @@ def _shape_space(
     centre = centres.mean(axis=0)
     centre = (centre + centre[list(TREE.mirror)] * MIRROR) / 2
     return Space(mean, basis, weight, space.share, space.residual), centre
-
-
-def _pose_parts(body: AnnyBody, template: Template, topology: PartTopology, rotations: Array, area: Array) -> PartPoses:
-    rest = body.rest(body.mean_phenotype())
-    own = [rest.vertices[template.anny_vertex[ids]] for ids in topology.part_vertices]
-    own = [points - points.mean(axis=0) for points in own]
-    turned, moved = np.empty((len(rotations), len(TREE), 3, 3)), []
-    deformations = [np.empty((len(rotations), *points.shape), np.float32) for points in own]
-    for start in range(0, len(rotations), BATCH):
-        rows = slice(start, start + BATCH)
-        meshes = body.pose(rest, rotations[rows], template.anny_vertex)[0]
-        for i, ids in enumerate(topology.part_vertices):
-            moved = meshes[:, ids]
-            turned[rows, i], shift = rotation.procrustes(own[i], moved, area[ids])
-            deformations[i][rows] = (moved - shift[:, None]) @ turned[rows, i] - own[i]
-    return PartPoses(turned, tuple(deformations))
-
-
-def _pose_count(part: int) -> int:
-    return POSE_COUNTS.get(TREE.names[part].removeprefix("left_").removeprefix("right_"), OTHER_POSE_COUNT)
-
-
-def _pose_spaces(
-    posed: PartPoses, template: Template, topology: PartTopology, area: Array
-) -> tuple[tuple[Space, ...], tuple[Array, ...]]:
-    # A left part learns from itself and the mirrored right one; the right part's space is the left one's mirror image.
-    copies = np.bincount(np.concatenate(topology.part_vertices), minlength=len(area))
-    weighted = area * np.where(copies > 1, BORDER, 1.0)
-    spaces: list[Any] = [None] * len(TREE)
-    signs = [np.ones(_pose_count(i)) for i in range(len(TREE))]
-    for i, other in enumerate(TREE.mirror):
-        across, weight = local_mirror(template, topology, i), weighted[topology.part_vertices[i]]
-        own = posed.deformations[i].astype(np.float64)
-        if other == i:
-            spaces[i], signs[i] = mirrored_space(own, across, weight, _pose_count(i))
-        elif TREE.names[i].startswith("left_"):
-            images = posed.deformations[other][:, across] * MIRROR
-            space = principal_space(np.concatenate([own, images]), weight, _pose_count(i))
-            back = local_mirror(template, topology, other)
-            mirrored_mean, mirrored_basis = space.mean[back] * MIRROR, space.basis[back] * MIRROR[:, None]
-            spaces[i] = space
-            spaces[other] = Space(mirrored_mean, mirrored_basis, weight[back], space.share, space.residual)
-    return tuple(spaces), tuple(signs)
-
-
-def _pairwise(
-    posed: PartPoses, spaces: tuple[Space, ...], signs: tuple[Array, ...], template: Template, topology: PartTopology
-) -> tuple[list[Gaussian], Array, Array]:
-    """Eq. 49 and joint limits of every edge, each from its own samples and the mirror image of the other side's."""
-    d = [spaces[i].project(posed.deformations[i]) for i in range(len(TREE))]
-    samples = []
-    for parent, child in TREE.edges:
-        relative = np.swapaxes(posed.rotations[:, parent], -1, -2) @ posed.rotations[:, child]
-        samples.append(np.concatenate([rotation.log(relative), d[parent], d[child]], axis=1))
-    gaussians, low, high = [], np.empty((len(samples), 3)), np.empty((len(samples), 3))
-    for edge, (parent, child) in enumerate(TREE.edges):
-        flip = np.concatenate([MIRROR_AXIS, signs[parent], signs[child]])
-        both = np.concatenate([samples[edge], samples[TREE.mirror[child] - 1] * flip])
-        gaussians.append(Gaussian.from_samples(both, ridge=1e-6))
-        low[edge], high[edge] = np.quantile(both[:, :3], [LIMIT_TAIL, 1 - LIMIT_TAIL], axis=0)
-    return gaussians, low - LIMIT_MARGIN, high + LIMIT_MARGIN
 
 
 def _interface_weights(body: AnnyBody, template: Template, topology: PartTopology) -> list[Array]:
@@ -227,15 +140,19 @@ def _joints(
     return names, index, weight, error
 
 
-def _arrays(
-    template: Template, topology: PartTopology, shape_space: Space, spaces: tuple[Space, ...]
-) -> dict[str, Array]:
-    arrays: dict[str, Array] = {
+def _topology_arrays(template: Template) -> dict[str, Array]:
+    return {
         "faces": template.faces,
         "part_of_vertex": template.part_of_vertex,
         "part_of_face": template.part_of_face,
         "mirror_vertex": template.mirror_vertex.astype(np.int32),
     }
+
+
+def _space_arrays(
+    topology: PartTopology, shape_space: Space, spaces: tuple[Space, ...], signs: tuple[Array, ...]
+) -> dict[str, Array]:
+    arrays: dict[str, Array] = {}
     start = 0
     for i, ids in enumerate(topology.part_vertices):
         rows = slice(start, start + len(ids))
@@ -243,5 +160,15 @@ def _arrays(
         arrays[f"shape_basis_{i}"] = shape_space.basis[rows].astype(np.float32)
         arrays[f"mean_pose_{i}"] = spaces[i].mean.astype(np.float32)
         arrays[f"pose_basis_{i}"] = spaces[i].basis.astype(np.float32)
+        arrays[f"pose_mirror_{i}"] = signs[i].astype(np.int8)
         start += len(ids)
+    return arrays
+
+
+def _edge_arrays(pairwise: list[Gaussian], stretch: list[Array]) -> dict[str, Array]:
+    arrays: dict[str, Array] = {}
+    for edge, (gaussian, weight) in enumerate(zip(pairwise, stretch, strict=True)):
+        arrays[f"pair_mean_{edge}"] = gaussian.mean.astype(np.float32)
+        arrays[f"pair_covariance_{edge}"] = gaussian.covariance.astype(np.float32)
+        arrays[f"interface_weight_{edge}"] = weight.astype(np.float32)
     return arrays

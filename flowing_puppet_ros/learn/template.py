@@ -11,6 +11,7 @@ from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from flowing_puppet_ros.errors import PuppetError
 from flowing_puppet_ros.learn.anny import AnnyBody
 from flowing_puppet_ros.learn.decimate import decimate
 from flowing_puppet_ros.learn.segmentation import part_of_vertex
@@ -51,7 +52,9 @@ def make_template(body: AnnyBody, vertices: int = VERTICES) -> Template:
     words = [name.split("_")[-1] for name in SP_PARENTS]
     spacing = SPACING * np.array([FINER.get(word, 1.0) for word in words])[part]
     coarse = decimate(rest, half, spacing, part, inner, vertices // 2)
-    return _joined(rest, coarse, part, body.mirror_vertex)
+    template = _joined(rest, coarse, part, body.mirror_vertex)
+    _check_contacts(template)
+    return template
 
 
 def _skin(triangles: Array, n: int) -> Array:
@@ -137,3 +140,15 @@ def _part_of_face(owners: Array, parents: Array) -> Array:
         links = [sum(parents[x] == y or parents[y] == x for y in trio) for x in trio]
         chosen[face] = trio[int(np.argmax(links))]
     return chosen.astype(np.uint8)
+
+
+def _check_contacts(template: Template) -> None:
+    tree = PartTree.from_parents(SP_PARENTS)
+    touching = np.zeros((len(template.part_of_vertex), len(tree)), dtype=np.int64)
+    for corner in template.faces.T:
+        touching[corner, template.part_of_face] = 1
+    contact = touching.T @ touching
+    for i, j in zip(*np.nonzero(np.triu(contact, 1)), strict=True):
+        if tree.parents[j] != i:
+            names = tree.names[i], tree.names[j]
+            raise PuppetError(f"{names[0]} and {names[1]} touch in the template; make the part between them wider")
