@@ -175,9 +175,9 @@ def _fit(samples: Floats, affine: Floats) -> tuple[float, float]:
         motion[axis, 0] = _weighted_median(few[:, 2 + axis], few[:, 5])
     apart = np.abs(few[:, 2] - motion[0, 0]) + np.abs(few[:, 3] - motion[1, 0])
     scale = max(RESIDUAL_FLOOR, 1.5 * _weighted_median(apart, few[:, 5]))
-    unknowns = 3 if len(samples) >= LEAST_FOR_AFFINE else 1
+    linear = len(samples) >= LEAST_FOR_AFFINE
     for _ in range(ITERATIONS):
-        _reweighted_step(samples, centre_x, centre_y, radius, scale, unknowns, motion)
+        _reweighted_step(samples, centre_x, centre_y, radius, scale, linear, motion)
         scale = max(RESIDUAL_FLOOR, 0.7 * scale)
     affine[:, :2] += motion[:, 1:] / radius
     affine[:, 2] = motion[:, 0] - (motion[:, 1] * centre_x + motion[:, 2] * centre_y) / radius
@@ -198,7 +198,7 @@ def _weighted_median(values: Floats, weights: Floats) -> float:
 
 @njit(cache=True)
 def _reweighted_step(
-    samples: Floats, centre_x: float, centre_y: float, radius: float, scale: float, unknowns: int, motion: Floats
+    samples: Floats, centre_x: float, centre_y: float, radius: float, scale: float, linear: bool, motion: Floats
 ) -> None:
     """One iteration: weigh every sample by its misfit to `motion` (2, 3), then solve for a new `motion`."""
     normal, right = np.zeros((3, 3)), np.zeros((3, 2))
@@ -207,18 +207,29 @@ def _reweighted_step(
         u, v = samples[k, 2], samples[k, 3]
         misfit_x = u - motion[0, 0] - motion[0, 1] * x - motion[0, 2] * y
         misfit_y = v - motion[1, 0] - motion[1, 1] * x - motion[1, 2] * y
-        weight = samples[k, 5] / (1.0 + (misfit_x * misfit_x + misfit_y * misfit_y) / (scale * scale)) ** 2
-        row = (1.0, x, y)
-        for i in range(unknowns):
-            for j in range(unknowns):
-                normal[i, j] += weight * row[i] * row[j]
-            right[i, 0] += weight * row[i] * u
-            right[i, 1] += weight * row[i] * v
+        w = samples[k, 5] / (1.0 + (misfit_x * misfit_x + misfit_y * misfit_y) / (scale * scale)) ** 2
+        normal[0, 0] += w
+        normal[0, 1] += w * x
+        normal[0, 2] += w * y
+        normal[1, 1] += w * x * x
+        normal[1, 2] += w * x * y
+        normal[2, 2] += w * y * y
+        right[0, 0] += w * u
+        right[0, 1] += w * v
+        right[1, 0] += w * x * u
+        right[1, 1] += w * x * v
+        right[2, 0] += w * y * u
+        right[2, 1] += w * y * v
+    if normal[0, 0] <= 1e-9:
+        return
+    if not linear:
+        motion[:, 0] = right[0] / normal[0, 0]
+        return
+    normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
     prior = CORRELATED_PIXELS * (RESIDUAL_FLOOR / (DEFORMATION * radius)) ** 2
-    for i in range(1, 3):
-        normal[i, i] += prior
-    if normal[0, 0] > 1e-9:
-        motion[:] = np.linalg.solve(normal, right).T
+    normal[1, 1] += prior
+    normal[2, 2] += prior
+    motion[:] = np.linalg.solve(normal, right).T
 
 
 @njit(cache=True)

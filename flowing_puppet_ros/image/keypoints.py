@@ -44,6 +44,7 @@ PAIRED = {
 # Puppets that people posed on 31 annotated JHMDB clips, against a detector's joints on the same images:
 TRUNK_LOWERED = 0.06  # shoulders and hips lie lower, share of the trunk's length
 SHOULDER_INWARDS = 0.04  # shoulders lie further in, share of their distance
+EARS_HEIGHT = 0.54  # of the head's centre on the way from the neck to the top of the head, in the learned model
 FARTHEST = 1e5  # px; no camera sees a keypoint beyond
 
 
@@ -137,8 +138,14 @@ def _mix(a: Point, b: Point, share: float) -> Point:
 
 
 def _place_face(found: dict[str, Point]) -> None:
-    """The surer of the ears' and the eyes' middles (in profile one of a pair is a guess), else the nose or an ear."""
+    """Between upper neck and top of the head; else the surer of the ears' and the eyes' middles, the nose or an ear.
+
+    In profile one of a pair is a guess, and its confidence says so.
+    """
     if "face" in found:
+        return
+    if "upper_neck" in found and "head_top" in found:
+        found["face"] = _mix(found["upper_neck"], found["head_top"], EARS_HEIGHT)
         return
     pairs = [(f"left_{name}", f"right_{name}") for name in ("ear", "eye")]
     middles = [_mix(found[left], found[right], 0.5) for left, right in pairs if left in found and right in found]

@@ -90,6 +90,12 @@ def test_upper_neck_is_the_puppets_neck_and_a_mid_shoulder_neck_is_not() -> None
     np.testing.assert_array_equal(middle, plain)
 
 
+def test_top_of_the_head_and_upper_neck_tell_its_centre() -> None:
+    xy = np.vstack([FRONTAL, [[200, 120], [220, 20]]])
+    joints, _ = joints_from_keypoints(MODEL, person([*COCO, "UpperNeck", "HeadTop"], xy))
+    np.testing.assert_allclose(joint(joints, "face"), [210.8, 66])
+
+
 def test_a_puppets_own_joints_are_kept() -> None:
     own = np.random.default_rng(0).uniform(0, 300, (len(MODEL.joint_names), 2))
     joints, _ = joints_from_keypoints(MODEL, person(list(MODEL.joint_names), own))
