@@ -145,11 +145,14 @@ def open_bag(path: Path | str, salvage: bool = False) -> Bag:
     path = Path(path)
     if not path.exists():
         raise InputError(f"there is no bag {path}")
-    if path.is_dir() and not (path / "metadata.yaml").exists():
+    if path.is_dir():
         files = sorted(path.glob("*.mcap")) + sorted(path.glob("*.db3"))
-        if len(files) != 1:
+        complete = (path / "metadata.yaml").exists()
+        if not complete and len(files) != 1:
             raise InputError(f"the folder {path} is no bag: it has no metadata.yaml and {len(files)} bag files")
-        path = files[0]
+        # A recorder that was stopped by force leaves no metadata, or metadata of a file that is cut off.
+        if len(files) == 1 and (not complete or is_truncated(files[0])):
+            path = files[0]
     return Bag(path, salvage)
 
 

@@ -120,6 +120,18 @@ def test_a_truncated_file_names_the_way_out_and_is_salvaged(bag: Any, tmp_path: 
     assert summary(bag, salvage=True) == summary(bag)
 
 
+@pytest.mark.parametrize("metadata", [True, False])
+def test_a_truncated_file_in_a_folder_is_salvaged_too(tmp_path: Path, metadata: bool) -> None:
+    folder = write(tmp_path / "b")
+    cut = folder / "b_0.mcap"
+    cut.write_bytes(cut.read_bytes()[:-50])
+    if not metadata:
+        (folder / "metadata.yaml").unlink()
+    with pytest.raises(InputError, match=r"b_0.mcap is cut off before its end: add --salvage"):
+        open_bag(folder)
+    assert len(summary(folder, salvage=True)) == 16
+
+
 @pytest.mark.parametrize("keep", [0, 3, 8, 12, 60])
 def test_next_to_nothing_left_is_no_traceback(bag: Any, tmp_path: Path, keep: Any) -> None:
     cut = tmp_path / "cut.mcap"
