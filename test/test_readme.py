@@ -59,6 +59,11 @@ def test_every_block_parses() -> None:
         assert done.returncode == 0, f"{code}\n{done.stderr}"
 
 
+def test_named_launch_files_exist() -> None:
+    named = set(re.findall(r"[a-z_]+\.launch\.py", (ROOT / "README.md").read_text()))
+    assert named <= {path.name for path in (ROOT / "launch").iterdir()}
+
+
 def test_tested_blocks_run(folder: Path) -> None:
     tested = [code for info, code in readme_blocks() if info == "bash test"]
     assert tested, "README.md has no block fenced as `bash test`"

@@ -82,7 +82,7 @@ def described(name: str, **chosen: str) -> list[Node]:
 
 @pytest.mark.usefixtures("stand_ins")
 def test_tracking_starts_flow_and_tracker() -> None:
-    nodes = described("track.launch.py")
+    nodes = described("puppet_tracker.launch.py")
     assert [node.named["executable"] for node in nodes] == ["optical_flow", "puppet_tracker"]
     assert "condition" in nodes[0].named
 
@@ -105,7 +105,7 @@ def test_bodies_from_cameras() -> None:
     assert dict(nodes[3].named["remappings"]) == {"points": "hull", "initial": "hull/joints"}
 
 
-@pytest.mark.parametrize("name", ["track.launch.py", "bodies.launch.py"])
+@pytest.mark.parametrize("name", ["puppet_tracker.launch.py", "bodies.launch.py"])
 def test_without_launch_one_sentence(name: str) -> None:
     done = subprocess.run([sys.executable, "-P", LAUNCH / name], capture_output=True, text=True, cwd="/")
     if done.returncode == 0:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Track the people of one camera: `ros2 launch flowing_puppet_ros track.launch.py image:=/camera/image_raw`.
+"""Track the people of one camera: `ros2 launch flowing_puppet_ros puppet_tracker.launch.py image:=/camera/image_raw`.
 
 The optical flow is computed in the tracker, unless `flow:=true` runs it as a node of its own.
 """
@@ -17,7 +17,7 @@ try:
     from launch_ros.actions import Node
 except ImportError as error:
     sys.exit(
-        f"track.launch.py: {error}; launch files need a sourced ROS 2 Jazzy, without it start the nodes themselves"
+        f"puppet_tracker.launch.py: {error}; launch files need a sourced ROS 2 Jazzy, without it start the nodes themselves"
     )
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
