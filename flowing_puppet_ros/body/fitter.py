@@ -81,7 +81,6 @@ class BodyFitter:
         self._search = Search(model, points, SearchWeights(lm_steps=settings.lm_steps))
         self._proposer = Proposer(model, points)
         self._refiner = Refiner(model)
-        self._refine_weights = RefineWeights(iterations=settings.refine_iterations)
 
     def fit(
         self,
@@ -180,7 +179,12 @@ class BodyFitter:
         return self._search.run(start, grid, targets, stages, iterations, rng, progress).state
 
     def _finish(self, body: BodyState, cloud: Cloud, targets: JointTargets) -> BodyState:
-        return self._refiner.run(body, cloud, targets, self._refine_weights)
+        steps = self.settings.refine_iterations
+        weights = RefineWeights(iterations=steps)
+        if cloud.viewpoint is not None:
+            # What is hidden is only known from the joints' usual angles and from usual shapes.
+            weights = RefineWeights(shape=3e-5, pairwise=1e-5, iterations=steps)
+        return self._refiner.run(body, cloud, targets, weights)
 
     def _distance(self, state: BodyState, cloud: Cloud) -> float:
         return two_way_distance(self.model.vertices(state), self.model.faces, cloud)

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits to a man made of capsules, whose surface and joints owe nothing to the learned body model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.io import write_ply
+from flowing_puppet_ros.cli import main
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+LIMB_JOINTS = tuple(
+    f"{side}_{name}" for side in ("left", "right") for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+)
+YAW = 2.0
+TURN = np.array([[np.cos(YAW), -np.sin(YAW), 0.0], [np.sin(YAW), np.cos(YAW), 0.0], [0.0, 0.0, 1.0]])
+PLACE = np.array([1.0, -2.0, 0.9])
+Joints = dict[str, np.ndarray]
+
+HEIGHTS = {"pelvis": 0.0, "belly": 0.12, "neck": 0.5, "face": 0.66, "head_top": 0.8}
+LIMBS = (
+    ("left_shoulder", "left_elbow", 0.055, 0.045),
+    ("left_elbow", "left_wrist", 0.045, 0.032),
+    ("left_wrist", "left_hand", 0.035, 0.035),
+    ("left_hip", "left_knee", 0.085, 0.058),
+    ("left_knee", "left_ankle", 0.055, 0.042),
+    ("left_ankle", "left_toe", 0.045, 0.04),
+)
+TRUNK = (
+    ("left_shoulder", "right_shoulder", 0.07, 0.07),
+    ("neck", "face", 0.06, 0.09),
+    ("face", "head_top", 0.09, 0.06),
+    ("left_hip", "right_hip", 0.1, 0.1),
+)
+
+
+def joints_of(bend: float = 0.3, raise_left: float = 0.6, raise_right: float = 0.3) -> dict[str, np.ndarray]:
+    """Joints in metres: facing +x, left at +y; arms raised sideways by angles (rad), elbows bent forward."""
+    joints = {name: np.array([0.0, 0.0, height]) for name, height in HEIGHTS.items()}
+    joints["face"] = np.array([0.04, 0.0, HEIGHTS["face"]])
+    for side, sign, lift in (("left", 1.0, raise_left), ("right", -1.0, raise_right)):
+        shoulder = np.array([0.0, 0.17 * sign, 0.43])
+        upper = np.array([0.0, sign * np.sin(lift), -np.cos(lift)])
+        lower = np.cos(bend) * upper + np.sin(bend) * np.array([1.0, 0.0, 0.0])
+        joints[f"{side}_shoulder"] = shoulder
+        joints[f"{side}_elbow"] = shoulder + 0.28 * upper
+        joints[f"{side}_wrist"] = joints[f"{side}_elbow"] + 0.25 * lower
+        joints[f"{side}_hand"] = joints[f"{side}_wrist"] + 0.13 * lower
+        joints[f"{side}_hip"] = np.array([0.0, 0.09 * sign, -0.04])
+        joints[f"{side}_knee"] = np.array([0.03, 0.11 * sign, -0.44])
+        joints[f"{side}_ankle"] = np.array([0.0, 0.13 * sign, -0.83])
+        joints[f"{side}_toe"] = np.array([0.16, 0.15 * sign, -0.87])
+    return joints
+
+
+def cloud_of(joints: dict[str, np.ndarray], count: int = 6000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Outer surface points (count, 3) and normals (count, 3) of the capsules along the joints."""
+    mirrored = [(a.replace("left", "right"), b.replace("left", "right"), ra, rb) for a, b, ra, rb in LIMBS]
+    capsules = [(joints[a], joints[b], ra, rb) for a, b, ra, rb in (*LIMBS, *mirrored, *TRUNK)]
+    for sign in (1.0, -1.0):
+        low, high = np.array([0.0, 0.06 * sign, 0.0]), np.array([0.0, 0.08 * sign, 0.4])
+        capsules.append((low, high, 0.1, 0.11))
+    rng = np.random.default_rng(seed)
+    points, normals = [], []
+    sizes = np.array([(np.linalg.norm(b - a) + ra + rb) * (ra + rb) for a, b, ra, rb in capsules])
+    for size, (a, b, ra, rb) in zip(sizes, capsules, strict=True):
+        new, outward = _capsule(a, b, ra, rb, int(3 * count * size / sizes.sum()) + 1, rng)
+        points.append(new)
+        normals.append(outward)
+    every, directions = np.concatenate(points), np.concatenate(normals)
+    outside = np.ones(len(every), dtype=bool)
+    for capsule in capsules:
+        outside &= _depth(every, *capsule) < 1e-6
+    chosen = rng.permutation(np.flatnonzero(outside))[:count]
+    return every[chosen], directions[chosen]
+
+
+def _capsule(
+    a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float, count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    axis = (b - a) / np.linalg.norm(b - a)
+    along = rng.uniform(-radius_a, np.linalg.norm(b - a) + radius_b, count)
+    inside = np.clip(along, 0, np.linalg.norm(b - a))
+    radius = radius_a + (radius_b - radius_a) * inside / np.linalg.norm(b - a)
+    across = rng.normal(size=(count, 3))
+    across -= np.outer(across @ axis, axis)
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    beyond = (along - inside) / radius
+    normal = beyond[:, None] * axis + np.sqrt(np.maximum(1 - beyond**2, 0))[:, None] * across
+    return a + inside[:, None] * axis + radius[:, None] * normal, normal
+
+
+def _depth(points: np.ndarray, a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> np.ndarray:
+    axis = b - a
+    along = np.clip((points - a) @ axis / (axis @ axis), 0, 1)
+    gap = np.linalg.norm(points - a - along[:, None] * axis, axis=1)
+    return radius_a + along * (radius_b - radius_a) - gap
+
+
+@pytest.fixture(scope="module")
+def man() -> tuple[np.ndarray, np.ndarray, Joints]:
+    """Points, normals and joints of a man who stands turned by 2 rad, away from the origin."""
+    joints = joints_of()
+    points, normals = cloud_of(joints)
+    return points @ TURN.T + PLACE, normals @ TURN.T, {name: TURN @ at + PLACE for name, at in joints.items()}
+
+
+@pytest.fixture(scope="module")
+def fitter() -> BodyFitter:
+    return BodyFitter(StitchedPuppet.load("neutral"), FitterSettings())
+
+
+def errors_of(fitter: BodyFitter, fit: BodyFit, joints: Joints) -> np.ndarray:
+    found = dict(zip(fitter.model.joint_names, fit.joints, strict=True))
+    return np.array([np.linalg.norm(found[name] - joints[name]) for name in LIMB_JOINTS])
+
+
+def started(
+    joints: Joints, noise: float, without: tuple[str, ...] = ()
+) -> dict[str, tuple[float, float, float, float]]:
+    rng = np.random.default_rng(3)
+    initial = {}
+    for name, at in joints.items():
+        x, y, z = at + rng.normal(0, noise, 3)
+        initial[name] = (np.nan, np.nan, np.nan, 0.0) if name in without else (float(x), float(y), float(z), 1.0)
+    return initial
+
+
+def test_unknown_yaw_is_found_and_sides_are_right(
+    fitter: BodyFitter, man: tuple[np.ndarray, np.ndarray, Joints]
+) -> None:
+    points, normals, joints = man
+    done: list[float] = []
+    fit = fitter.fit(points, normals, progress=done.append)
+    errors = errors_of(fitter, fit, joints)
+    assert errors.mean() < 0.08
+    assert errors.max() < 0.2
+    assert fit.two_way_distance < 0.04
+    assert done == sorted(done) and done[-1] == 1.0
+    assert 0 < fit.confidence <= 1 and np.all((fit.part_confidence >= 0) & (fit.part_confidence <= 1))
+    np.testing.assert_allclose(fit.state.shape, np.tile(fit.state.shape[0], (16, 1)))
+
+
+def test_rough_joints_with_gaps_are_improved(fitter: BodyFitter, man: tuple[np.ndarray, np.ndarray, Joints]) -> None:
+    points, normals, joints = man
+    floor = np.random.default_rng(0).uniform([-1, -4, 0], [3, 0, 0.02], (800, 3))
+    points = np.concatenate([points, floor])
+    normals = np.concatenate([normals, np.tile([0.0, 0.0, 1.0], (800, 1))])
+    initial = started(joints, 0.03, without=("left_wrist", "right_knee", "neck"))
+    fit = fitter.fit(points, normals, initial=initial | {"tail": (0.0, 0.0, 0.0, 1.0)})
+    errors = errors_of(fitter, fit, joints)
+    assert errors.mean() < 0.07
+    assert errors.max() < 0.17
+
+
+def test_one_side_is_enough_for_a_body(fitter: BodyFitter, man: tuple[np.ndarray, np.ndarray, Joints]) -> None:
+    points, normals, joints = man
+    sensor = PLACE + TURN @ np.array([3.0, 0.5, 0.2])
+    facing = ((sensor - points) * normals).sum(axis=1) > 0
+    fit = fitter.fit(points[facing], None, viewpoint=sensor)
+    assert errors_of(fitter, fit, joints).mean() < 0.15
+
+
+def test_same_seed_gives_the_same_bits_on_any_number_of_threads(man: tuple[np.ndarray, np.ndarray, Joints]) -> None:
+    points, normals, _ = man
+    small = FitterSettings(particles=8, iterations=6, local_particles=6, local_iterations=3, refine_iterations=4)
+    fitter = BodyFitter(StitchedPuppet.load("neutral"), small)
+    runs = []
+    for threads in (1, 2):
+        with threadpool_limits(limits=threads):
+            runs.append(fitter.fit(points, normals, seed=5))
+    assert np.array_equal(runs[0].vertices, runs[1].vertices)
+    assert runs[0].energy == runs[1].energy
+    assert not np.array_equal(runs[0].vertices, fitter.fit(points, normals, seed=6).vertices)
+
+
+def test_unusable_clouds_are_refused_in_one_sentence(fitter: BodyFitter) -> None:
+    cloud = np.random.default_rng(0).normal(size=(100, 3))
+    for bad, words in (
+        (np.empty((0, 3)), "0 finite points"),
+        (cloud[:3], "3 finite points"),
+        (np.full((100, 3), np.nan), "0 finite points"),
+        (cloud[:, :2], "shape"),
+        (np.zeros((100, 3)), "coincide"),
+    ):
+        with pytest.raises(InputError, match=words):
+            fitter.fit(bad)
+    with pytest.raises(InputError, match="normals"):
+        fitter.fit(cloud, cloud[:50])
+    with pytest.raises(InputError, match="initial joints"):
+        fitter.fit(cloud, initial={"nose": (0, 0, 0, 1), "neck": (np.nan, 0, 0, 1)})
+    far = {name: (50.0 + k, 0.0, float(k % 3), 1.0) for k, name in enumerate(LIMB_JOINTS)}
+    with pytest.raises(InputError, match="around the initial joints"):
+        fitter.fit(cloud, initial=far)
+
+
+def test_fit_verb_writes_the_contract_and_goes_on_after_a_bad_input(
+    tmp_path: Path, man: tuple[np.ndarray, np.ndarray, Joints], capsys: pytest.CaptureFixture[str]
+) -> None:
+    points, normals, _ = man
+    np.save(tmp_path / "man.npy", 100 * np.concatenate([points, normals], axis=1))
+    (tmp_path / "empty.xyz").write_bytes(b"")
+    flags = ["--particles", "8", "--iterations", "6", "--local-particles", "6", "--local-iterations", "2"]
+    flags += ["--up", "z", "--json", "--out"]
+    status = main(["fit", str(tmp_path / "empty.xyz"), str(tmp_path / "man.npy"), *flags, str(tmp_path / "fits")])
+    assert status == 2
+    output = capsys.readouterr()
+    failed, good = (json.loads(line) for line in output.out.splitlines())
+    assert "empty.xyz" in failed["error"] and "empty.xyz" in output.err
+    assert good["metres_per_unit"] == 0.01
+    with np.load(tmp_path / "fits" / "man.npz") as fit:
+        model = StitchedPuppet.load("neutral")
+        count = len(model.part_of_vertex)
+        assert fit["vertices"].shape == (count, 3) and fit["vertices"].dtype == np.float32
+        assert np.array_equal(fit["faces"], model.faces) and fit["part_of_vertex"].shape == (count,)
+        assert fit["part_names"].tolist() == list(model.tree.names)
+        assert fit["part_rotation"].shape == (16, 3, 3) and fit["part_center"].shape == (16, 3)
+        assert fit["joint_names"].tolist() == list(model.joint_names)
+        assert fit["joints"].shape == (len(model.joint_names), 3)
+        assert fit["shape_coefficients"].shape == (16, 4) and fit["pose_coefficients"].shape == (16, 12)
+        assert fit["energy"] > 0 and fit["seconds"] > 0
+        np.testing.assert_allclose(fit["vertices"].mean(axis=0), 100 * points.mean(axis=0), atol=15)
+        torso = fit["vertices"][fit["part_of_vertex"] == 0]
+        assert np.linalg.norm(torso.mean(axis=0) - fit["part_center"][0]) < 10
+    assert (tmp_path / "fits" / "man.ply").stat().st_size > 10000
+
+    cloud, fitted = str(tmp_path / "man.npy"), str(tmp_path / "fits" / "man.npz")
+    pairs = tmp_path / "pairs.npz"
+    assert main(["correspond", fitted, fitted, "--scan-a", cloud, "--scan-b", cloud, "--out", str(pairs)]) == 0
+    with np.load(pairs) as found:
+        assert found["points"].shape == (len(points), 3)
+        assert np.median(np.linalg.norm(found["points"] - 100 * points, axis=1)) < 10
+
+
+def test_verbs_refuse_bad_arguments_in_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    triangle = np.eye(3), np.array([[0, 1, 2]])
+    write_ply(tmp_path / "a.ply", *triangle)
+    for arguments in (
+        ["fit", str(tmp_path / "missing.ply"), "--out", str(tmp_path / "o")],
+        ["fit", str(tmp_path / "a.ply"), str(tmp_path / "b" / "a.obj"), "--out", str(tmp_path / "o")],
+        ["fit", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.ply")],
+        ["fit", str(tmp_path / "a.ply"), "--out", str(tmp_path / "o"), "--particles", "1"],
+        ["correspond", *[str(tmp_path / "a.ply")] * 2, "--scan-a", "a", "--scan-b", "b", "--out", "c"],
+    ):
+        assert main(arguments) == 2
+        lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("flowing-puppet")]
+        assert len(lines) == 1
