@@ -17,6 +17,9 @@ ADULT_EXTENT = (0.6, 2.6)
 # Columns are the images of x, y and z: y up becomes z up and z, where such people look, becomes x.
 Y_UP = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 Z_UP = np.eye(3)
+# Optical frames have y down, z away from the camera (REP-103); the people in them look along -z or so.
+Y_DOWN = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+UP_NAMES = {"y": Y_UP, "z": Z_UP, "-y": Y_DOWN}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,12 +75,15 @@ def _is_closed(scan: Scan) -> bool:
     return bool(np.mean(count == 2) > 0.97)
 
 
-def up_candidates(scan: Scan, scale: float) -> list[np.ndarray]:
-    """Rotations to try for an unknown up axis, the likelier first; one when the longest side leaves no doubt.
+def up_candidates(scan: Scan, scale: float, one_sided: bool) -> list[str]:
+    """Names of the up axes to try, see `UP_NAMES`, the likelier first; one when the longest side leaves no doubt.
 
-    A standing person is longest upwards; with arms spread the sides are alike and only a fit can tell.
+    A standing person is longest upwards; with arms spread the sides are alike and only a fit can tell. A cloud from one
+    side may be in an optical frame, so that with y the other way round is tried too.
     """
     extent = np.ptp(scan.points, axis=0) * scale
-    first, second = (Y_UP, Z_UP) if extent[1] > extent[2] else (Z_UP, Y_UP)
+    order = ["y", "z"] if extent[1] > extent[2] else ["z", "y"]
     ratio = max(extent[1], extent[2]) / max(min(extent[1], extent[2]), 1e-9)
-    return [first] if ratio > 1.35 and max(extent[1], extent[2]) > 0.9 * extent[0] else [first, second]
+    if ratio > 1.35 and max(extent[1], extent[2]) > 0.9 * extent[0]:
+        order = order[:1]
+    return [*order, "-y"] if one_sided and "y" in order else order

@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
-from flowing_puppet_ros.body.frames import UNITS, Y_UP, Z_UP, Frame, guess_scale, up_candidates
+from flowing_puppet_ros.body.frames import UNITS, UP_NAMES, Frame, guess_scale, up_candidates
 from flowing_puppet_ros.body.io import Scan, read_scan, write_ply
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -31,7 +31,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--model", choices=("neutral", "female", "male"), default="neutral", help="body model [neutral]"
     )
     FitterSettings.add_arguments(parser)
-    parser.add_argument("--up", choices=("y", "z", "auto"), default="auto", help="the input's up axis [auto]")
+    parser.add_argument(
+        "--up",
+        choices=(*UP_NAMES, "auto"),
+        default="auto",
+        help="the input's up axis; --up=-y in optical frames [auto]",
+    )
     parser.add_argument("--unit", choices=(*UNITS, "auto"), default="auto", help="the input's unit [auto]")
     parser.add_argument(
         "--view",
@@ -70,13 +75,31 @@ def _fit_file(path: Path, fitter: BodyFitter, arguments: argparse.Namespace) -> 
     started = time.perf_counter()
     scan = read_scan(path)
     with tqdm(total=100, desc=path.name, unit="%", file=sys.stderr, leave=not arguments.json) as bar:
-        frame, fit = _best_fit(scan, fitter, arguments, bar)
+        up, frame, fit = _best_fit(scan, fitter, arguments, bar)
     seconds = time.perf_counter() - started
-    stem = arguments.out / path.stem
+    output = arguments.out / f"{path.stem}.npz"
+    try:
+        _write(output, fitter.model, frame, fit, seconds)
+    except OSError as error:
+        raise PuppetError(f"{output} cannot be written: {error.strerror}") from error
+    return {
+        "input": str(path),
+        "output": str(output),
+        "model": fitter.model.name,
+        "energy": fit.energy,
+        "confidence": fit.confidence,
+        "two_way_distance_m": fit.two_way_distance,
+        "metres_per_unit": frame.scale,
+        "up": up,
+        "seconds": seconds,
+    }
+
+
+def _write(output: Path, model: StitchedPuppet, frame: Frame, fit: BodyFit, seconds: float) -> None:
+    """Write the fit in the scan's frame and unit as `output` and as a mesh beside it."""
     vertices = frame.to_scan(fit.vertices).astype(np.float32)
-    model = fitter.model
     np.savez_compressed(
-        stem.with_name(path.stem + ".npz"),
+        output,
         vertices=vertices,
         faces=model.faces,
         part_of_vertex=model.part_of_vertex,
@@ -95,40 +118,34 @@ def _fit_file(path: Path, fitter: BodyFitter, arguments: argparse.Namespace) -> 
         seconds=seconds,
         model=model.name,
     )
-    colours = part_colours(model.tree.names)[model.part_of_vertex]
-    write_ply(stem.with_name(path.stem + ".ply"), vertices, model.faces, colours)
-    return {
-        "input": str(path),
-        "output": str(stem.with_name(path.stem + ".npz")),
-        "model": model.name,
-        "energy": fit.energy,
-        "confidence": fit.confidence,
-        "two_way_distance_m": fit.two_way_distance,
-        "metres_per_unit": frame.scale,
-        "up": "y" if np.array_equal(frame.rotation, Y_UP) else "z",
-        "seconds": seconds,
-    }
+    write_ply(
+        output.with_name(f"{output.stem}.ply"),
+        vertices,
+        model.faces,
+        part_colours(model.tree.names)[model.part_of_vertex],
+    )
 
 
-def _best_fit(scan: Scan, fitter: BodyFitter, arguments: argparse.Namespace, bar: tqdm) -> tuple[Frame, BodyFit]:
-    """Fit in every frame that the scan may have and keep the closest body."""
+def _best_fit(scan: Scan, fitter: BodyFitter, arguments: argparse.Namespace, bar: tqdm) -> tuple[str, Frame, BodyFit]:
+    """Fit in every frame that the scan may have and keep the closest body, with the name of the axis that is up."""
     scale = guess_scale(scan) if arguments.unit == "auto" else UNITS[arguments.unit]
-    rotations = up_candidates(scan, scale) if arguments.up == "auto" else [{"y": Y_UP, "z": Z_UP}[arguments.up]]
+    single = arguments.view == "single"
+    ups = up_candidates(scan, scale, single) if arguments.up == "auto" else [arguments.up]
     rng = np.random.default_rng(fitter.settings.seed)
     points, normals = scan.surface(fitter.settings.cloud_points, rng)
-    sensor = _sensor(points, normals) if arguments.view == "single" else None
+    sensor = _sensor(points, normals) if single else None
     fits = []
-    for turn, rotation in enumerate(rotations):
-        frame = Frame(scale, rotation)
+    for turn, up in enumerate(ups):
+        frame = Frame(scale, UP_NAMES[up])
         viewpoint = None if sensor is None else frame.to_body(sensor)
         fit = fitter.fit(
             frame.to_body(points),
-            None if normals is None else normals @ rotation.T,
+            None if normals is None else normals @ frame.rotation.T,
             viewpoint=viewpoint,
-            progress=_shown(bar, turn, len(rotations)),
+            progress=_shown(bar, turn, len(ups)),
         )
-        fits.append((frame, fit))
-    return min(fits, key=lambda pair: pair[1].two_way_distance)
+        fits.append((up, frame, fit))
+    return min(fits, key=lambda triple: triple[2].two_way_distance)
 
 
 def _shown(bar: tqdm, turn: int, turns: int) -> Progress:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.frames import Y_UP, Z_UP, Frame, guess_scale, up_candidates
+from flowing_puppet_ros.body.frames import UP_NAMES, Y_UP, Frame, guess_scale, up_candidates
 from flowing_puppet_ros.body.io import Scan, read_scan, write_ply
 from flowing_puppet_ros.errors import InputError
 
@@ -118,7 +118,12 @@ def test_frame_there_and_back() -> None:
     points = np.random.default_rng(0).normal(size=(5, 3))
     np.testing.assert_allclose(frame.to_scan(frame.to_body(points)), points)
     np.testing.assert_allclose(frame.to_body(np.array([[0.0, 100.0, 0.0]])), [[0.0, 0.0, 1.0]])
-    assert np.linalg.det(Y_UP) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(("name", "up"), [("y", [0, 1, 0]), ("z", [0, 0, 1]), ("-y", [0, -1, 0])])
+def test_every_up_axis_becomes_z(name: str, up: list[float]) -> None:
+    assert np.linalg.det(UP_NAMES[name]) == pytest.approx(1)
+    np.testing.assert_allclose(UP_NAMES[name] @ up, [0, 0, 1])
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.01, 0.001])
@@ -140,8 +145,7 @@ def test_closed_surface_of_no_usual_size_is_scaled_to_an_adult() -> None:
 def test_up_is_the_long_side_and_open_when_two_are_alike() -> None:
     rng = np.random.default_rng(0)
     cloud = rng.uniform(0, 1, (500, 3))
-    (only,) = up_candidates(Scan(cloud * [0.5, 0.4, 1.7]), 1.0)
-    assert np.array_equal(only, Z_UP)
-    (only,) = up_candidates(Scan(cloud * [0.5, 1.7, 0.4]), 1.0)
-    assert np.array_equal(only, Y_UP)
-    assert len(up_candidates(Scan(cloud * [0.3, 1.7, 1.75]), 1.0)) == 2
+    assert up_candidates(Scan(cloud * [0.5, 0.4, 1.7]), 1.0, False) == ["z"]
+    assert up_candidates(Scan(cloud * [0.5, 1.7, 0.4]), 1.0, False) == ["y"]
+    assert up_candidates(Scan(cloud * [0.5, 1.7, 0.4]), 1.0, True) == ["y", "-y"]
+    assert up_candidates(Scan(cloud * [0.3, 1.7, 1.75]), 1.0, False) == ["z", "y"]

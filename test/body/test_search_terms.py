@@ -249,7 +249,7 @@ def test_finish_draws_a_disturbed_body_to_the_surface_of_another_shape(model: St
     vertices = model.vertices(truth)
     cloud = Cloud.of(vertices, vertex_normals(vertices, model.faces))
     center = truth.center + rng.normal(0, 0.02, truth.center.shape)
-    turned = so3.exp(rng.normal(0, 0.1, truth.center.shape)) @ truth.rotation
+    turned = so3.exp(rng.normal(0, 0.1, (16, 3))) @ truth.rotation
     start = BodyState(center, turned, np.zeros_like(truth.pose), np.zeros_like(truth.shape))
     refined = Refiner(model).run(start, cloud, JointTargets.none(model), RefineWeights())
     before = np.linalg.norm(model.vertices(start) - vertices, axis=1).mean()
