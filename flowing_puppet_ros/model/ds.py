@@ -197,8 +197,9 @@ class DeformableStructures:
         """Joints (J,2) in pixels with the unknown ones (NaN or confidence 0) at their most likely place.
 
         The known joints stay as they are. The others are the mean of the joint Gaussian given the known ones, whose
-        noise grows as the confidence falls; bones that this mean leaves shorter than usual, because it averages over
-        directions, get their usual length. InputError when no joint is known.
+        noise grows as the confidence falls; hands and feet follow the limb they end (Eq. 10's mean angle); bones that
+        this mean leaves shorter than usual, because it averages over directions, get their usual length. InputError
+        when no joint is known.
         """
         joints, known = self._checked(joints), self._known(joints, confidence)
         if not known.any():
@@ -216,12 +217,34 @@ class DeformableStructures:
         if not known.all():
             rest = noisy.condition(index[~known].ravel(), index[known].ravel(), given).mean.reshape(-1, 2)
             filled[~known] = rest * to_pixels + origin
+        self._lay_extremities(filled, known, to_pixels)
         return self._with_usual_lengths(filled, known, scale)
+
+    def _lay_extremities(self, joints: Array, known: Array, to_pixels: Array) -> None:
+        """Put unknown hands and feet at their angle to a known limb; the joint Gaussian would average over angles."""
+        for part in self._extremities:
+            near, far = self.part_joints[part][:2]
+            limb = list(self.part_joints[self.tree.parents[part]][:2])
+            if known[far] or not known[limb].all():
+                continue
+            start, end = joints[limb] / to_pixels
+            along = (end - start) / max(np.hypot(*(end - start)), np.finfo(float).tiny)
+            sine, cosine = self.pairwise[part - 1].mean[PairLayout(self.shapes[part].basis.shape[2]).angle]
+            turned = np.array([cosine * along[0] - sine * along[1], sine * along[0] + cosine * along[1]])
+            joints[far] = joints[near] + turned / np.hypot(sine, cosine) * self._bone_length(part) * to_pixels
+
+    @property
+    def _extremities(self) -> tuple[int, ...]:
+        return tuple(k for k, name in enumerate(self.tree.names) if name.endswith(("_hand", "_foot")))
+
+    def _bone_length(self, part: int) -> float:
+        """Length of a part's bone in its mean shape, metres."""
+        return float(np.ptp(self.shapes[part].mean[-2:, 0]))
 
     def _with_usual_lengths(self, joints: Array, known: Array, scale: float) -> Array:
         for part in range(1, len(self.tree)):
             near, far = self.part_joints[part][:2]
-            usual = scale * np.ptp(self.shapes[part].mean[-2:, 0])
+            usual = scale * self._bone_length(part)
             bone = joints[far] - joints[near]
             length = np.hypot(*bone)
             if not known[far] and 0 < length < usual:

@@ -216,6 +216,19 @@ def test_completed_legs_hang_below_an_upper_body(model: DeformableStructures) ->
     assert np.linalg.norm(filled[legs] - joints[legs], axis=1).max() < 0.25 * SCALE
 
 
+@pytest.mark.parametrize("view", ["front", "back"])
+@pytest.mark.parametrize("degrees", range(0, 360, 45))
+def test_a_hidden_hand_extends_the_forearm_wherever_it_points(view: View, degrees: int) -> None:
+    model = DeformableStructures.load("neutral", 14)
+    side = np.array([1.0 if view == "front" else -1.0, 1.0])
+    joints, index = standing(model) * side, {name: k for k, name in enumerate(model.joint_names)}
+    reach = np.array([np.cos(np.radians(degrees)), np.sin(np.radians(degrees))])
+    joints[index["left_wrist"]] = joints[index["left_elbow"]] + 0.2 * SCALE * reach
+    joints[index["left_hand"]] = np.nan
+    hand = model.complete_joints(joints, np.ones(len(joints)), SCALE, view)[index["left_hand"]]
+    assert np.linalg.norm(hand - joints[index["left_wrist"]] - 0.08 * SCALE * reach) < 0.02 * SCALE
+
+
 def test_doubtful_joints_pull_less(neutral: DeformableStructures) -> None:
     joints, index = standing(neutral), {name: k for k, name in enumerate(neutral.joint_names)}
     joints[index["left_hip"]] = np.nan
