@@ -22,7 +22,7 @@ def test_images_come_with_the_detections_of_their_stamps() -> None:
         pictures = [decode_image(record.message) for record in bag.messages(["/cam3/image/compressed"])]
     for index, ((frame, people), picture) in enumerate(zip(source, pictures, strict=True)):
         assert frame.index == index
-        np.testing.assert_array_equal(frame.rgb, picture)
+        np.testing.assert_array_equal(frame.image, picture)
         assert (people is None) == (index in (3, 6))
         assert people is None or [len(person.names) for person in people] == [17]
 
