@@ -16,9 +16,7 @@ try:
     from launch.substitutions import LaunchConfiguration
     from launch_ros.actions import Node
 except ImportError as error:
-    sys.exit(
-        f"puppet_tracker.launch.py: {error}; launch files need a sourced ROS 2 Jazzy, without it start the nodes themselves"
-    )
+    sys.exit(f"puppet_tracker.launch.py: {error}; launch files need a sourced ROS 2 Jazzy: without it start the nodes")
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
 
