@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -167,7 +168,7 @@ def _read_mocap(path: Path) -> Array:
     try:
         with np.load(path, allow_pickle=False) as archive:
             sequences = [archive[key] for key in archive.files]
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, BadZipFile) as error:
         raise InputError(f"{path} cannot be read as motion capture (.npz of exponential maps): {error}") from error
     if not sequences or any(s.ndim != 2 or s.shape[1] != 3 + 3 * MOCAP_JOINTS for s in sequences):
         raise InputError(f"{path} holds no (T,{3 + 3 * MOCAP_JOINTS}) arrays of exponential maps; give expmap_20hz.npz")

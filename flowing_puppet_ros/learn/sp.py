@@ -142,6 +142,7 @@ def _joints(
 
 def _topology_arrays(template: Template) -> dict[str, Array]:
     return {
+        "anny_vertex": template.anny_vertex.astype(np.int32),
         "faces": template.faces,
         "part_of_vertex": template.part_of_vertex,
         "part_of_face": template.part_of_face,
