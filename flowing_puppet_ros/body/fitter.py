@@ -45,6 +45,8 @@ class FitterSettings(Settings):
     joint_strength: float = setting(0.02, "pull of an initial joint against the whole cloud's", low=0.0, high=100.0)
     clip_factor: float = setting(2.0, "limb radii around the initial joints' axes that a cloud is clipped to, 0: none",
                                  low=0.0, high=20.0)  # fmt: skip
+    restarts: int = setting(2, "searches from new starts while no body comes close to the cloud", low=0, high=20)
+    restart_distance: float = setting(0.02, "two-way distance at which a body is close", unit="m", low=0.0, high=1.0)
     seed: int = setting(0, "seed of all that is random", low=0)
 
 
@@ -120,22 +122,32 @@ class BodyFitter:
         return Cloud.of(points, normals, viewpoint)
 
     def _fit_unknown(self, cloud: Cloud, rng: np.random.Generator, progress: Progress) -> BodyFit:
-        """Search with unknown yaw, then let the body compete with itself turned around."""
-        grid, none = CloudGrid.build(cloud.points, cloud.normals), JointTargets.none(self.model)
-        center = _body_center(cloud)
-        bodies = sampled_bodies(self.model, center, self.settings.particles, rng)
+        """Search with unknown yaw; start again, some times, while no body comes close to the cloud."""
+        grid = CloudGrid.build(cloud.points, cloud.normals)
+        tries = 1 + self.settings.restarts
+        bodies: list[BodyState] = []
+        for turn in range(tries):
+            bodies += self._two_bodies(cloud, grid, rng, _part_of(progress, turn / tries, (turn + 1) / tries))
+            best = min(bodies, key=lambda state: self._distance(state, cloud))
+            if self._distance(best, cloud) < self.settings.restart_distance:
+                break
+        progress(1.0)
+        return self._result(best, cloud, grid)
+
+    def _two_bodies(
+        self, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator, progress: Progress
+    ) -> tuple[BodyState, BodyState]:
+        """Search with unknown yaw; the body found, and the best one that faces the other way."""
+        none = JointTargets.none(self.model)
+        bodies = sampled_bodies(self.model, _body_center(cloud), self.settings.particles, rng)
         noise = WalkNoise(center=0.05, rotation=0.1, pose=0.0, shape=0.0)
         start = [self._proposer.walk(group, noise, rng) for group in particles_of(self.model, bodies)]
         stages, iterations = four_stages(self.model.tree), self.settings.iterations
-        found = self._search.run(start, grid, none, stages, iterations, rng, lambda done: progress(0.6 * done))
+        found = self._search.run(start, grid, none, stages, iterations, rng, _part_of(progress, 0.0, 0.6))
         body = self._finish(found.state, cloud, none)
-        other = self._local_search(
-            turned_around(self.model, body), grid, none, rng, lambda done: progress(0.65 + 0.25 * done)
-        )
-        other = self._finish(other, cloud, none)
-        best = min(body, other, key=lambda state: self._distance(state, cloud))
-        progress(1.0)
-        return self._result(best, cloud, grid)
+        turned = turned_around(self.model, body)
+        turned = self._local_search(turned, grid, none, rng, _part_of(progress, 0.65, 0.95))
+        return body, self._finish(turned, cloud, none)
 
     def _fit_from_joints(
         self,
@@ -161,7 +173,7 @@ class BodyFitter:
         cloud = self._cloud(points, normals, viewpoint)
         grid = CloudGrid.build(cloud.points, cloud.normals)
         targets = targets.scaled(self.settings.joint_strength)
-        found = self._local_search(body, grid, targets, rng, lambda done: progress(0.1 + 0.7 * done))
+        found = self._local_search(body, grid, targets, rng, _part_of(progress, 0.1, 0.8))
         body = self._finish(found, cloud, targets)
         progress(1.0)
         return self._result(body, cloud, grid)
@@ -183,7 +195,7 @@ class BodyFitter:
         weights = RefineWeights(iterations=steps)
         if cloud.viewpoint is not None:
             # What is hidden is only known from the joints' usual angles and from usual shapes.
-            weights = RefineWeights(shape=3e-5, pairwise=1e-5, iterations=steps)
+            weights = RefineWeights(shape=1e-5, pairwise=4e-6, iterations=steps)
         return self._refiner.run(body, cloud, targets, weights)
 
     def _distance(self, state: BodyState, cloud: Cloud) -> float:
@@ -251,6 +263,11 @@ def _body_center(cloud: Cloud) -> np.ndarray:
         return center
     away = center - cloud.viewpoint
     return center + 0.1 * away / max(float(np.linalg.norm(away)), 1e-9)
+
+
+def _part_of(progress: Progress, low: float, high: float) -> Progress:
+    """Progress of one stretch of the work."""
+    return lambda done: progress(low + (high - low) * done)
 
 
 def _silent(done: float) -> None:

@@ -23,6 +23,8 @@ MAX_TURN = 0.6
 MAX_POSE = 3.0
 POSE_PRIOR = 5e-5
 CONTRADICTING_WEIGHT = 0.3
+# Points, normals, nearest indices, origin and cell of a CloudGrid.
+CloudArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
 
 
 def improve(
@@ -56,7 +58,18 @@ def improve(
 
 
 @njit(cache=True)
-def _improve_all(center, rotation, pose, mean, basis, normals, weight, target, cloud, steps):  # type: ignore[no-untyped-def]
+def _improve_all(
+    center: np.ndarray,
+    rotation: np.ndarray,
+    pose: np.ndarray,
+    mean: np.ndarray,
+    basis: np.ndarray,
+    normals: np.ndarray,
+    weight: np.ndarray,
+    target: np.ndarray,
+    cloud: CloudArrays,
+    steps: int,
+) -> None:
     unknowns = 6 + pose.shape[1]
     for p in range(len(center)):
         damping = DAMPING
@@ -89,7 +102,19 @@ def _improve_all(center, rotation, pose, mean, basis, normals, weight, target, c
 
 
 @njit(cache=True)
-def _assemble(center, rotation, pose, mean, basis, normals, weight, target, cloud, hessian, gradient):  # type: ignore[no-untyped-def]
+def _assemble(
+    center: np.ndarray,
+    rotation: np.ndarray,
+    pose: np.ndarray,
+    mean: np.ndarray,
+    basis: np.ndarray,
+    normals: np.ndarray,
+    weight: np.ndarray,
+    target: np.ndarray,
+    cloud: CloudArrays,
+    hessian: np.ndarray,
+    gradient: np.ndarray,
+) -> float:
     """Fill the normal equations and return half the weighted sum of squares."""
     points, point_normals, nearest, origin, cell = cloud
     count, surface, deformations = len(mean), len(normals), len(pose)
@@ -138,7 +163,9 @@ def _assemble(center, rotation, pose, mean, basis, normals, weight, target, clou
 
 
 @njit(cache=True)
-def _accumulate(jacobian, residual, weight, hessian, gradient):  # type: ignore[no-untyped-def]
+def _accumulate(
+    jacobian: np.ndarray, residual: np.ndarray, weight: float, hessian: np.ndarray, gradient: np.ndarray
+) -> float:
     unknowns = jacobian.shape[1]
     for row in range(unknowns):
         slope = weight * jacobian[0, row], weight * jacobian[1, row], weight * jacobian[2, row]
@@ -151,7 +178,7 @@ def _accumulate(jacobian, residual, weight, hessian, gradient):  # type: ignore[
 
 
 @njit(cache=True)
-def _rotation(vector):  # type: ignore[no-untyped-def]
+def _rotation(vector: np.ndarray) -> np.ndarray:
     """Rodrigues' formula for one vector."""
     angle = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     cross = np.zeros((3, 3))

@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-NEIGHBOURS = 24
+NEIGHBOURS = (9, 24)
+POINTS_A_NEIGHBOUR = 100
 
 
 def thinned(points: np.ndarray, normals: np.ndarray | None, limit: int) -> tuple[np.ndarray, np.ndarray | None]:
@@ -48,12 +49,13 @@ def estimated_normals(points: np.ndarray, viewpoint: np.ndarray | None) -> np.nd
     import open3d as o3d
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(min(NEIGHBOURS, len(points))))
+    # A neighbourhood must stay smaller than a limb, however few the points are.
+    neighbours = int(np.clip(len(points) // POINTS_A_NEIGHBOUR, *NEIGHBOURS))
+    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
     if viewpoint is not None:
         cloud.orient_normals_towards_camera_location(viewpoint)
         return np.asarray(cloud.normals).copy()
-    if len(points) > NEIGHBOURS:
-        cloud.orient_normals_consistent_tangent_plane(NEIGHBOURS // 2)
+    cloud.orient_normals_consistent_tangent_plane(neighbours // 2 + 2)
     normals = np.asarray(cloud.normals).copy()
     # Around a limb the mean of a neighbourhood lies inside it, so that outward normals point away from it.
     near = cKDTree(points).query_ball_point(points[:: max(1, len(points) // 500)], 0.12)
