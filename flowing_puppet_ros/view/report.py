@@ -181,12 +181,11 @@ def collage(data: ReportData) -> np.ndarray:
 
     Raises InputError when there are no pictures.
     """
-    # The flow and the body that are closest in time; without bodies the liveliest flow.
-    flow = max(data.flow, key=lambda shot: shot.full_scale, default=None)
     body = data.body_shots[len(data.body_shots) // 2] if data.body_shots else None
-    if flow and body:
-        pairs = ((one, other) for one in data.flow for other in data.body_shots)
-        flow, body = min(pairs, key=lambda pair: abs(pair[0].stamp - pair[1].stamp))
+    if body:
+        flow = min(data.flow, key=lambda shot: abs(shot.stamp - body.stamp), default=None)
+    else:
+        flow = max(data.flow, key=lambda shot: shot.full_scale, default=None)
     moment = flow.stamp if flow else body.stamp if body else data.start
     pictures = []
     if data.strip:
