@@ -70,12 +70,12 @@ def _agreement(
 def view_of(
     builder: HullBuilder, name: str, image: NDArray[np.uint8], labels: NDArray[np.uint8], puppet: Any
 ) -> PersonView:
-    """Observe one camera's image (H,W,3) with the part labels (H,W) of one of the people in it."""
+    """Observe one camera's image (H,W,3) with the part labels (H,W) of all people; cut out the one that `puppet` is."""
     region = np.zeros(labels.shape, np.uint8)
     for part in puppet.parts:
         contour = np.asarray(part.contour, float).reshape(-1, 2)
         cv2.fillPoly(region, [np.rint(contour).astype(np.int32)], 1)
-    observation = builder.observe(name, image, labels * region, float(puppet.scale))
+    observation = builder.observe(name, image, labels, float(puppet.scale), person=labels * region)
     joints, confidence = joint_table(puppet)
     names = tuple(joint.name for joint in puppet.joints)
     return PersonView(names, PuppetView(observation, joints, confidence))
