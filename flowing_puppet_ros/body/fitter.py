@@ -28,6 +28,8 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
 
 MIN_POINTS = 50
+# Widest sides, in metres, between which a cloud may be a person or a part of one, with some surroundings.
+PERSON_EXTENT = (0.1, 20.0)
 Progress = Callable[[float], None]
 
 
@@ -58,7 +60,7 @@ class BodyFit:
         state: the model's variables.
         vertices: (V, 3) metres, in the cloud's frame.
         joints: (J, 3) metres, in the order of the model's `joint_names`.
-        energy: Eq. 50 of the body before the finish, lower is better.
+        energy: Eq. 50 of the body, lower is better.
         part_confidence: (16,) 0 to 1, how much of each part lies on the cloud.
         confidence: 0 to 1, parts on the cloud and cloud on the body together.
         two_way_distance: mean distance between body and cloud over both ways, metres.
@@ -106,7 +108,7 @@ class BodyFitter:
             progress: called with the fraction done, 0 to 1.
 
         Raises:
-            InputError: when the cloud has too few finite points or the initial joints are too few.
+            InputError: when the cloud cannot be the surface of a person or the initial joints place no body.
         """
         rng = np.random.default_rng(self.settings.seed if seed is None else seed)
         with threadpool_limits(limits=1):
@@ -116,7 +118,18 @@ class BodyFitter:
             return self._fit_from_joints(points, normals, initial, viewpoint, rng, progress or _silent)
 
     def _cloud(self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None) -> Cloud:
+        """Thin and index the points; InputError when they cannot be the surface of a person."""
+        extent = float(np.ptp(points, axis=0).max())
+        if not PERSON_EXTENT[0] <= extent <= PERSON_EXTENT[1]:
+            raise InputError(
+                f"the cloud is {extent:.3g} m wide, which is no person; check the unit or cut out one person"
+            )
         points, normals = thinned(points, normals, self.settings.cloud_points)
+        places = len(np.unique(points, axis=0))
+        if places < MIN_POINTS:
+            raise InputError(
+                f"the cloud's points lie in {places} places and a fit needs {MIN_POINTS}; give the surface of a person"
+            )
         if normals is None:
             normals = estimated_normals(points, viewpoint)
         return Cloud.of(points, normals, viewpoint)
@@ -235,7 +248,7 @@ def checked_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.nd
     """Return float64 arrays without the points that are not finite.
 
     Raises:
-        InputError: when shapes are wrong, too few points are left, or all of them coincide.
+        InputError: when shapes are wrong or too few points are left.
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -251,8 +264,6 @@ def checked_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.nd
     points = points[finite]
     if len(points) < MIN_POINTS:
         raise InputError(f"the cloud has {len(points)} finite points, a fit needs at least {MIN_POINTS} on one person")
-    if float(np.ptp(points, axis=0).max()) < 1e-6:
-        raise InputError(f"all {len(points)} points of the cloud coincide; give the surface of a person")
     return points, normals
 
 

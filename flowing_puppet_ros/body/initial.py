@@ -36,6 +36,8 @@ TRUNK = (
     "head_top",
 )
 START_STRENGTH = 0.1
+# Metres, root of the summed squares: joints of a person seen from the side are this far off their common line.
+OFF_LINE = 0.05
 JOINTS_ONLY = RefineWeights(
     stitch=1.0, pose=1e-5, shape=3e-5, pairwise=1e-5, sigma_start=0.4, sigma_end=0.08, iterations=15
 )
@@ -47,7 +49,7 @@ def joint_targets(model: StitchedPuppet, initial: Mapping[str, tuple[float, floa
     Unknown names and joints with NaN are left out.
 
     Raises:
-        InputError: when fewer than four joints remain or the trunk's do not span a plane, so that no body is placed.
+        InputError: when fewer than four joints remain or they all lie on a line, so that no body is placed.
     """
     points, weight = np.zeros((len(model.joint_names), 3)), np.zeros(len(model.joint_names))
     for name, values in initial.items():
@@ -59,6 +61,8 @@ def joint_targets(model: StitchedPuppet, initial: Mapping[str, tuple[float, floa
             f"only {np.count_nonzero(weight)} of the {len(initial)} initial joints are known to the body model and"
             " finite, and a start needs 4; give more joints or none"
         )
+    if not _span_a_plane(points[weight > 0]):
+        raise InputError("the initial joints lie on a line, so that the body's front is unknown; give more or none")
     return JointTargets(points, weight)
 
 
@@ -68,41 +72,45 @@ def body_from_joints(model: StitchedPuppet, refiner: Refiner, targets: JointTarg
     The trunk is aligned by Procrustes, every other part is turned the shortest way towards its far joint, and a
     Gauss-Newton without a cloud settles lengths, twists and bends. Parts without targets follow their parents.
     """
-    start = _trunk(model, targets)
+    rest = model.rest_state()
+    template = model.joints(model.vertices(rest))
+    start = _trunk(model, rest, template, targets)
     for part in range(1, len(model.tree)):
-        _attach(model, start, part, targets)
+        _attach(model, start, part, rest, template, targets)
     return refiner.run(start, None, targets.scaled(START_STRENGTH), JOINTS_ONLY)
 
 
-def _trunk(model: StitchedPuppet, targets: JointTargets) -> BodyState:
-    """The template body moved rigidly so that its trunk's joints lie on the targets."""
-    rest = model.rest_state()
-    joints = model.joints(model.vertices(rest))
+def _span_a_plane(points: np.ndarray) -> bool:
+    """Whether points (K, 3) in metres lie wide enough off a common line to tell which way a body faces."""
+    return len(points) >= 3 and float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]) > OFF_LINE
+
+
+def _trunk(model: StitchedPuppet, rest: BodyState, template: np.ndarray, targets: JointTargets) -> BodyState:
+    """The body `rest` with joints `template` (J, 3) moved rigidly so that its trunk's joints lie on the targets."""
     known = targets.weight > 0
     trunk = known & np.array([name in TRUNK for name in model.joint_names])
-    used = trunk if np.count_nonzero(trunk) >= 3 else known
-    rotation, center = so3.procrustes(joints[used], targets.points[used], targets.weight[used])
+    used = trunk if _span_a_plane(targets.points[trunk]) else known
+    rotation, center = so3.procrustes(template[used], targets.points[used], targets.weight[used])
     return BodyState(rest.center @ rotation.T + center, rotation @ rest.rotation, rest.pose.copy(), rest.shape.copy())
 
 
-def _attach(model: StitchedPuppet, state: BodyState, part: int, targets: JointTargets) -> None:
+def _attach(
+    model: StitchedPuppet, state: BodyState, part: int, rest: BodyState, template: np.ndarray, targets: JointTargets
+) -> None:
     """Hang a part on its parent, in place, and turn it towards the target of its far joint."""
     parent, name = model.tree.parents[part], model.tree.names[part]
     interface = model.interfaces[part - 1]
-    parent_rows = model.local_vertices(
-        parent, state.pose[parent, : model.pose_basis[parent].shape[2]], state.shape[parent]
+    above = model.part_mesh(
+        parent, state.center[parent], state.rotation[parent], state.pose[parent], state.shape[parent]
     )
-    near = (parent_rows[interface.parent_index] @ state.rotation[parent].T + state.center[parent]).mean(axis=0)
-    rows = model.local_vertices(part, state.pose[part, : model.pose_basis[part].shape[2]], state.shape[part])
-    own_near = rows[interface.child_index].mean(axis=0)
-    rest = model.rest_state()
+    near = above[interface.parent_index].mean(axis=0)
+    own_near = model.local_vertices(part, state.pose[part], state.shape[part])[interface.child_index].mean(axis=0)
     rotation = state.rotation[parent] @ rest.rotation[parent].T @ rest.rotation[part]
     side, _, kind = name.partition("_")
     far = f"{side}_{FAR_JOINT[kind]}" if kind else "face"
     joint = model.joint_names.index(far) if far in model.joint_names else -1
     if joint >= 0 and targets.weight[joint] > 0:
-        template = model.joints(model.vertices(rest))[joint]
-        own_far = (template - rest.center[part]) @ rest.rotation[part]
+        own_far = (template[joint] - rest.center[part]) @ rest.rotation[part]
         rotation = _shortest_turn(rotation @ (own_far - own_near), targets.points[joint] - near) @ rotation
     state.rotation[part] = rotation
     state.center[part] = near - rotation @ own_near

@@ -6,6 +6,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from flowing_puppet_ros.errors import InputError
+
 NEIGHBOURS = (9, 24)
 POINTS_A_NEIGHBOUR = 100
 
@@ -45,17 +47,29 @@ def estimated_normals(points: np.ndarray, viewpoint: np.ndarray | None) -> np.nd
 
     Seen from one place they turn towards it. Otherwise they are made consistent over tangent planes (Hoppe et al.
     1992), and all are turned over when most point towards the body's inside.
+
+    Raises:
+        InputError: when the points lie in a plane or on a line, where no side is outside.
     """
     import open3d as o3d
 
+    # The Delaunay graph behind the consistent orientation loses its digits far from the origin.
+    center = points.mean(axis=0)
+    points = points - center
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     # A neighbourhood must stay smaller than a limb, however few the points are.
     neighbours = int(np.clip(len(points) // POINTS_A_NEIGHBOUR, *NEIGHBOURS))
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
     if viewpoint is not None:
-        cloud.orient_normals_towards_camera_location(viewpoint)
+        cloud.orient_normals_towards_camera_location(viewpoint - center)
         return np.asarray(cloud.normals).copy()
-    cloud.orient_normals_consistent_tangent_plane(neighbours // 2 + 2)
+    try:
+        cloud.orient_normals_consistent_tangent_plane(neighbours // 2 + 2)
+    except RuntimeError as error:
+        raise InputError(
+            f"the {len(points)} points of the cloud lie in a plane or on a line, so their normals are unknown;"
+            " give the surface of a person"
+        ) from error
     normals = np.asarray(cloud.normals).copy()
     # Around a limb the mean of a neighbourhood lies inside it, so that outward normals point away from it.
     near = cKDTree(points).query_ball_point(points[:: max(1, len(points) // 500)], 0.12)

@@ -14,6 +14,7 @@ from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
 from flowing_puppet_ros.body.io import write_ply
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.body.normals import estimated_normals
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 LIMB_JOINTS = tuple(
@@ -188,7 +189,12 @@ def test_unusable_clouds_are_refused_in_one_sentence(fitter: BodyFitter) -> None
         (cloud[:3], "3 finite points"),
         (np.full((100, 3), np.nan), "0 finite points"),
         (cloud[:, :2], "shape"),
-        (np.zeros((100, 3)), "coincide"),
+        (np.zeros((100, 3)), "0 m wide"),
+        (1e300 * cloud, "m wide"),
+        (np.concatenate([cloud, [[1e5, 0, 0]]]), "1e[+]05 m wide"),
+        (np.repeat(cloud[:40], 30, axis=0), "40 places"),
+        (np.outer(np.linspace(0, 2, 100), [1, 2, 3]), "on a line"),
+        (np.pad(cloud[:, :2], ((0, 0), (0, 1))), "in a plane"),
     ):
         with pytest.raises(InputError, match=words):
             fitter.fit(bad)
@@ -199,6 +205,16 @@ def test_unusable_clouds_are_refused_in_one_sentence(fitter: BodyFitter) -> None
     far = {name: (50.0 + k, 0.0, float(k % 3), 1.0) for k, name in enumerate(LIMB_JOINTS)}
     with pytest.raises(InputError, match="around the initial joints"):
         fitter.fit(cloud, initial=far)
+
+
+def test_normals_do_not_depend_on_how_far_off_the_origin_is(man: tuple[np.ndarray, np.ndarray, Joints]) -> None:
+    points, normals, _ = man
+    for viewpoint in (None, np.array([3.0, 0.5, 0.2])):
+        here = estimated_normals(points, viewpoint)
+        map_origin = np.array([5e5, 5.5e6, 300.0])
+        there = estimated_normals(points + map_origin, None if viewpoint is None else viewpoint + map_origin)
+        assert ((here * there).sum(axis=1) > 0.999).mean() > 0.98
+    assert ((estimated_normals(points, None) * normals).sum(axis=1) > 0.7).mean() > 0.9
 
 
 def test_fit_verb_writes_the_contract_and_goes_on_after_a_bad_input(

@@ -243,6 +243,20 @@ def test_too_few_joints_are_refused(model: StitchedPuppet) -> None:
         joint_targets(model, {"neck": (0, 0, 0, 1), "face": (np.nan, 0, 0, 1), "wing": (0, 0, 0, 1)})
 
 
+def test_a_trunk_on_a_line_faces_where_the_limbs_say(model: StitchedPuppet) -> None:
+    turn = so3.exp(np.array([0.0, 0.0, 2.5]))
+    spine = ("neck", "belly", "pelvis")
+    goal = {name: turn @ at for name, at in squatting(model).items() if "shoulder" not in name and "hip" not in name}
+    rest = dict(zip(model.joint_names, model.joints(model.vertices(model.rest_state())), strict=True))
+    goal = {name: at for name, at in goal.items() if name != "face"} | {name: turn @ rest[name] for name in spine}
+    body = body_from_joints(
+        model, Refiner(model), joint_targets(model, {name: (*at, 1.0) for name, at in goal.items()})
+    )
+    assert (body.rotation[0] @ [1, 0, 0]) @ (turn @ [1, 0, 0]) > 0.9
+    with pytest.raises(InputError, match="on a line"):
+        joint_targets(model, {name: (0, 0, float(k), 1) for k, name in enumerate((*spine, "face"))})
+
+
 def test_finish_draws_a_disturbed_body_to_the_surface_of_another_shape(model: StitchedPuppet) -> None:
     rng = np.random.default_rng(2)
     truth = model.sample(rng, shape_scale=1.0, pose_scale=0.5)
