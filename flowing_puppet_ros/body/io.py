@@ -45,8 +45,8 @@ class Scan:
         """Points spread evenly over a mesh with the normals of their faces, or the cloud as it is."""
         if self.faces is None:
             return self.points, self.normals
-        areas = self._face_areas()
-        chosen = self.faces[np.searchsorted(np.cumsum(areas) / areas.sum(), rng.random(count), side="right")]
+        share = np.cumsum(self._face_areas())
+        chosen = self.faces[np.searchsorted(share / share[-1], rng.random(count), side="right")]
         u, v = rng.random((2, count, 1))
         u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
         a, b, c = (self.points[chosen[:, k]] for k in range(3))
@@ -168,6 +168,18 @@ def _unit(normals: np.ndarray) -> np.ndarray | None:
     return normals / length if len(normals) and np.all(np.isfinite(length) & (length > 0)) else None
 
 
+def storable(points: np.ndarray) -> np.ndarray:
+    """Points (N, 3) as float32; as float64 where float32 would move them by more than 1e-5 of their extent.
+
+    So far from the origin are, for example, people in the frame of a map.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if not points.size:
+        return points.astype(np.float32)
+    step = float(np.spacing(np.float32(np.abs(points).max())))
+    return points if step > 1e-5 * float(np.ptp(points, axis=0).max()) else points.astype(np.float32)
+
+
 def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray | None = None) -> None:
     """Write a binary PLY mesh.
 
@@ -177,18 +189,20 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colours: np.n
         faces: (F, 3).
         colours: (V, 3) 0 to 255, or None.
     """
-    fields: list[tuple[str, str]] = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+    vertices = storable(vertices)
+    kind = f"<f{vertices.itemsize}"
+    fields: list[tuple[str, str]] = [("x", kind), ("y", kind), ("z", kind)]
     if colours is not None:
         fields += [("red", "u1"), ("green", "u1"), ("blue", "u1")]
     rows = np.zeros(len(vertices), dtype=fields)
-    for name, column in zip(("x", "y", "z"), np.asarray(vertices).T, strict=True):
+    for name, column in zip(("x", "y", "z"), vertices.T, strict=True):
         rows[name] = column
     if colours is not None:
         for name, column in zip(("red", "green", "blue"), np.asarray(colours).T, strict=True):
             rows[name] = column
     triangles = np.zeros(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
     triangles["count"], triangles["index"] = 3, faces
-    types = {"<f4": "float", "u1": "uchar"}
+    types = {"<f4": "float", "<f8": "double", "u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     header += [f"property {types[kind]} {name}" for name, kind in fields]
     header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header", ""]

@@ -121,7 +121,7 @@ def _closest_on_triangle(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     pa, pc = np.dot(ap, ab), np.dot(ap, ac)
     determinant = aa * cc - bb * bb
     place = np.zeros(3)
-    if determinant > 1e-20:
+    if determinant > 1e-12 * aa * cc:
         v, w = (cc * pa - bb * pc) / determinant, (aa * pc - bb * pa) / determinant
         if v >= 0 and w >= 0 and v + w <= 1:
             place[0], place[1], place[2] = 1 - v - w, v, w

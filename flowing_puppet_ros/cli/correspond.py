@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.body.io import read_scan
+from flowing_puppet_ros.body.io import read_scan, storable
 from flowing_puppet_ros.body.surface import correspond
 from flowing_puppet_ros.errors import InputError
 
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     points, distance = correspond(vertices_a, vertices_b, faces_a, scan_a, scan_b)
     try:
         with arguments.out.open("wb") as file:
-            np.savez_compressed(file, points=points.astype(np.float32), distance=distance.astype(np.float32))
+            np.savez_compressed(file, points=storable(points), distance=distance.astype(np.float32))
     except OSError as error:
         raise InputError(f"--out {arguments.out} cannot be written: {error.strerror}") from error
     if arguments.json:
@@ -47,6 +47,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _read_fit(path: Path) -> tuple[np.ndarray, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as arrays:
-            return arrays["vertices"].astype(np.float64), arrays["faces"].astype(np.int64)
+            vertices, faces = arrays["vertices"].astype(np.float64), arrays["faces"].astype(np.int64)
+        if not (vertices.shape[1:] == faces.shape[1:] == (3,) and faces.min() >= 0 and faces.max() < len(vertices)):
+            raise ValueError("vertices and faces do not make a mesh")
+        return vertices, faces
     except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"{path} is no fit; make it with `flowing-puppet fit`") from error

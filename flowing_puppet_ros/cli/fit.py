@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.frames import UNITS, UP_NAMES, Frame, guess_scale, up_candidates
-from flowing_puppet_ros.body.io import Scan, read_scan, write_ply
+from flowing_puppet_ros.body.io import Scan, read_scan, storable, write_ply
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.view.palette import part_colours
@@ -97,7 +97,7 @@ def _fit_file(path: Path, fitter: BodyFitter, arguments: argparse.Namespace) -> 
 
 def _write(output: Path, model: StitchedPuppet, frame: Frame, fit: BodyFit, seconds: float) -> None:
     """Write the fit in the scan's frame and unit as `output` and as a mesh beside it."""
-    vertices = frame.to_scan(fit.vertices).astype(np.float32)
+    vertices = storable(frame.to_scan(fit.vertices))
     np.savez_compressed(
         output,
         vertices=vertices,
@@ -105,10 +105,10 @@ def _write(output: Path, model: StitchedPuppet, frame: Frame, fit: BodyFit, seco
         part_of_vertex=model.part_of_vertex,
         part_names=np.array(model.tree.names),
         part_rotation=(frame.rotation.T @ fit.state.rotation).astype(np.float32),
-        part_center=frame.to_scan(fit.state.center).astype(np.float32),
+        part_center=frame.to_scan(fit.state.center).astype(vertices.dtype),
         part_confidence=fit.part_confidence.astype(np.float32),
         joint_names=np.array(model.joint_names),
-        joints=frame.to_scan(fit.joints).astype(np.float32),
+        joints=frame.to_scan(fit.joints).astype(vertices.dtype),
         shape_coefficients=fit.state.shape[:, :WRITTEN_SHAPES].astype(np.float32),
         all_shape_coefficients=fit.state.shape.astype(np.float32),
         pose_coefficients=fit.state.pose.astype(np.float32),

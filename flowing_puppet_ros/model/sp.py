@@ -14,7 +14,7 @@ import numpy as np
 
 from flowing_puppet_ros.model import rotation, weights
 from flowing_puppet_ros.model.gaussian import Gaussian
-from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree, mirrored_name
+from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
 
 Array = np.ndarray[Any, Any]
 
@@ -109,6 +109,7 @@ class StitchedPuppet:
         """Build from the arrays of a weights file, as `learn.sp` writes them."""
         tree = PartTree.from_parents(SP_PARENTS)
         topology = PartTopology.from_faces(arrays["faces"], arrays["part_of_face"], tree)
+        joint_weight = arrays["joint_weight"].astype(np.float64)
         parts, edges = range(len(tree)), range(len(tree) - 1)
         return cls(
             name=name,
@@ -130,7 +131,8 @@ class StitchedPuppet:
             limit_high=arrays["limit_high"].astype(np.float64),
             joint_names=tuple(str(joint) for joint in arrays["joint_names"]),
             joint_index=arrays["joint_index"],
-            joint_weight=arrays["joint_weight"].astype(np.float64),
+            # Rounded weights miss a sum of 1 by enough to move joints that are far from the origin.
+            joint_weight=joint_weight / joint_weight.sum(axis=1, keepdims=True),
             mirror_vertex=arrays["mirror_vertex"],
             pose_mirror=tuple(arrays[f"pose_mirror_{i}"].astype(np.float64) for i in parts),
         )
@@ -235,7 +237,7 @@ class StitchedPuppet:
 
     def mirrored(self, state: BodyState) -> BodyState:
         """The state of the same body seen in the mirror plane y = 0: left and right swapped."""
-        other = np.array([self.tree.index(mirrored_name(name)) for name in self.tree.names])
+        other = list(self.tree.mirror)
         pose = state.pose[..., other, :].copy()
         for i, signs in enumerate(self.pose_mirror):
             pose[..., i, : len(signs)] *= signs

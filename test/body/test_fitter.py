@@ -12,9 +12,9 @@ from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
 from flowing_puppet_ros.body.io import write_ply
+from flowing_puppet_ros.body.normals import estimated_normals
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.body.normals import estimated_normals
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 LIMB_JOINTS = tuple(

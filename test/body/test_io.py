@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.frames import UP_NAMES, Y_UP, Frame, guess_scale, up_candidates
-from flowing_puppet_ros.body.io import Scan, read_scan, write_ply
+from flowing_puppet_ros.body.io import Scan, read_scan, storable, write_ply
 from flowing_puppet_ros.errors import InputError
 
 BOX = np.array([[x, y, z] for x in (0, 0.5) for y in (0, 0.3) for z in (0, 1.7)], dtype=float)
@@ -51,9 +51,20 @@ def test_written_ply_reads_back_and_inside_out_faces_are_turned(tmp_path: Path, 
     assert scan.area == pytest.approx(2 * (0.5 * 0.3 + 0.5 * 1.7 + 0.3 * 1.7))
 
 
+def test_places_far_from_the_origin_keep_their_digits(tmp_path: Path) -> None:
+    far = BOX + np.array([5e5, 5.5e6, 300.0])
+    assert storable(BOX).dtype == np.float32
+    np.testing.assert_array_equal(storable(far), far)
+    write_ply(tmp_path / "a.ply", far, BOX_FACES)
+    np.testing.assert_array_equal(read_scan(tmp_path / "a.ply").points, far)
+
+
 def test_surface_samples_lie_on_the_mesh_evenly() -> None:
-    points, normals = Scan(BOX, BOX_FACES).surface(4000, np.random.default_rng(0))
-    assert normals is not None
+    without_area = np.array([[0, 0, 1], [2, 2, 2]])
+    points, normals = Scan(BOX, np.concatenate([without_area, BOX_FACES, without_area])).surface(
+        4000, np.random.default_rng(0)
+    )
+    assert normals is not None and np.isfinite(normals).all()
     on_top = np.isclose(points[:, 2], 1.7)
     np.testing.assert_allclose(np.abs(normals[on_top][:, 2]), 1)
     assert np.all(normals[on_top][:, 2] > 0)

@@ -71,6 +71,15 @@ def test_correspondence_follows_a_rigid_motion() -> None:
     assert distance.max() < 0.08
 
 
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_closest_places_do_not_depend_on_the_unit(size: float) -> None:
+    vertices, faces = sphere()
+    points = np.random.default_rng(1).normal(size=(200, 3))
+    expected = closest_on_mesh(points, None, vertices, faces).points(vertices, faces)
+    found = closest_on_mesh(size * points, None, size * vertices, faces).points(size * vertices, faces)
+    np.testing.assert_allclose(found / size, expected, atol=1e-9)
+
+
 def test_correspondence_onto_a_cloud_gives_its_points() -> None:
     vertices, faces = sphere()
     points, _ = correspond(vertices, vertices, faces, Scan(vertices, faces), Scan(vertices[::-1].copy()))

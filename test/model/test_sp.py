@@ -120,6 +120,8 @@ def test_batches_are_the_same_as_one_by_one(neutral: StitchedPuppet) -> None:
     one = BodyState(batch.center[1, 2], batch.rotation[1, 2], batch.pose[1, 2], batch.shape[1, 2])
     np.testing.assert_allclose(vertices[1, 2], neutral.vertices(one), atol=1e-12)
     np.testing.assert_allclose(neutral.joints(vertices)[1, 2], neutral.joints(vertices[1, 2]), atol=1e-12)
+    far = np.array([5e5, 5.5e6, 300.0])
+    np.testing.assert_allclose(neutral.joints(vertices + far) - far, neutral.joints(vertices), atol=1e-7)
 
 
 def test_stitch_undoes_a_motion(neutral: StitchedPuppet) -> None:
