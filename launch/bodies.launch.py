@@ -43,11 +43,9 @@ def nodes(context: LaunchContext) -> list[Node]:
     cameras = [name for name in given["cameras"].split(",") if name]
     if not cameras:
         return [node("body_fitter", remappings=[("points", given["points"]), ("initial", given["initial"])])]
-    image = given["image"]
-    kinds = (("image", image), ("image/compressed", f"{image}/compressed"))
-    of_cameras = [(f"{camera}/{port}", f"{camera}/{topic}") for camera in cameras for port, topic in kinds]
+    of_cameras = [(f"{camera}/image", f"{camera}/{given['image']}") for camera in cameras]
     return [
-        *(node("puppet_tracker", camera, list(kinds)) for camera in cameras),
+        *(node("puppet_tracker", camera, [("image", given["image"])]) for camera in cameras),
         node("visual_hull", remappings=of_cameras, cameras=",".join(cameras)),
         node("body_fitter", remappings=[("points", "hull"), ("initial", "hull/joints")]),
     ]

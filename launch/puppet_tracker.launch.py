@@ -42,10 +42,9 @@ def generate_launch_description() -> LaunchDescription:
             description="parameter file of puppet_tracker",
         ),
     ]
-    image = LaunchConfiguration("image")
     common = {"package": "flowing_puppet_ros", "namespace": LaunchConfiguration("namespace"), "output": "screen"}
     clock = {"use_sim_time": LaunchConfiguration("use_sim_time")}
-    images = [("image", image), ("image/compressed", [image, "/compressed"])]
+    images = [("image", LaunchConfiguration("image"))]
     flow = Node(
         executable="optical_flow",
         name="optical_flow",

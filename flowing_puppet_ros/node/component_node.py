@@ -15,7 +15,6 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.time import Time
 from std_srvs.srv import Trigger
 
 from flowing_puppet_ros.node.diagnostics import Diagnostics
@@ -25,6 +24,7 @@ from flowing_puppet_ros.node.registry import COMPONENTS, NodeSettings
 from flowing_puppet_ros.node.worker import Worker
 from flowing_puppet_ros.stream.component import COMPRESSED_IMAGE, Component, Port
 from flowing_puppet_ros.stream.images import compress
+from flowing_puppet_ros.stream.messages import header_ns
 
 C = TypeVar("C", bound=Component)
 QUIET_SECONDS = 5.0
@@ -75,26 +75,27 @@ class ComponentNode[C: Component](Node):
         super().destroy_node()
 
     def _subscribe(self, port: Port) -> None:
-        topics = [(port.name, port.type)]
+        self._subscription(message_type(port.type), port.name, port)
         if port.compressed:
-            topics.append((f"{port.name}/compressed", COMPRESSED_IMAGE))
-        for topic, kind in topics:
-            self.create_subscription(
-                message_type(kind),
-                topic,
-                partial(self._received, port.name),
-                _SUBSCRIPTION_QOS[port.qos],
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
+            self._subscription(message_type(COMPRESSED_IMAGE), self._compressed(port), port)
+
+    def _subscription(self, kind: Any, topic: str, port: Port) -> None:
+        received, qos = partial(self._received, port.name), _SUBSCRIPTION_QOS[port.qos]
+        options = QoSOverridingOptions.with_default_policies()
+        self.create_subscription(kind, topic, received, qos, qos_overriding_options=options)
 
     def _open_output(self, port: Port) -> list[tuple[Publisher, Callable[[Any], Any]]]:
         """Return the publishers of a port, each with what makes its message out of the component's."""
         made: list[tuple[Publisher, Callable[[Any], Any]]]
         made = [(self._publisher(message_type(port.type), port.name, port.qos), _same)]
         if port.compressed:
-            compressed = self._publisher(message_type(COMPRESSED_IMAGE), f"{port.name}/compressed", port.qos)
+            compressed = self._publisher(message_type(COMPRESSED_IMAGE), self._compressed(port), port.qos)
             made.append((compressed, partial(compress, self.component.factory)))
         return made
+
+    def _compressed(self, port: Port) -> str:
+        """Return the topic of a port's compressed images: it follows the port when that is remapped."""
+        return f"{self.resolve_topic_name(port.name)}/compressed"
 
     def _publisher(self, kind: Any, topic: str, qos: str) -> Publisher:
         options = QoSOverridingOptions.with_default_policies()
@@ -123,12 +124,12 @@ class ComponentNode[C: Component](Node):
             if not extra or publisher.get_subscription_count():
                 publisher.publish(converted(message))
         self._diagnostics.passed(name)
-        stamp = getattr(getattr(message, "header", None), "stamp", None)
-        if stamp is not None:
-            age = self.get_clock().now() - Time.from_msg(stamp, clock_type=self.get_clock().clock_type)
-            self._diagnostics.took(age.nanoseconds * 1e-9)
+        if hasattr(message, "header"):
+            self._diagnostics.took((self.get_clock().now().nanoseconds - header_ns(message.header)) * 1e-9)
 
     def _failed(self, error: Exception) -> None:
+        if not self.context.ok():
+            return
         self._diagnostics.failed()
         where = traceback.extract_tb(error.__traceback__)[-1]
         text = f"a message failed: {type(error).__name__}: {error} ({where.filename}:{where.lineno})"

@@ -101,7 +101,7 @@ def test_bodies_from_cameras() -> None:
     assert started == [("puppet_tracker", "a"), ("puppet_tracker", "b"), ("visual_hull", ""), ("body_fitter", "")]
     assert {name for name, _ in started} <= set(COMPONENTS)
     assert nodes[2].named["parameters"][-1] == {"cameras": "a,b"}
-    assert dict(nodes[2].named["remappings"])["b/image/compressed"] == "b/image_raw/compressed"
+    assert dict(nodes[2].named["remappings"])["b/image"] == "b/image_raw"
     assert dict(nodes[3].named["remappings"]) == {"points": "hull", "initial": "hull/joints"}
 
 
