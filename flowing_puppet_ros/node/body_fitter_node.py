@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import threading
-from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from flowing_puppet_msgs.action import FitBody
 from rclpy.action import ActionServer, CancelResponse
 from rclpy.action.server import ServerGoalHandle
-from rclpy.callback_groups import ReentrantCallbackGroup
 
 from flowing_puppet_ros.errors import PuppetError
 from flowing_puppet_ros.node.component_node import ComponentNode
@@ -18,16 +16,7 @@ from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent
 
 
 class _Cancelled(Exception):
-    """The client does not want the result any more."""
-
-
-@dataclass
-class _Job:
-    """What the worker leaves for the action: the bodies or the error, then `done`."""
-
-    bodies: Any = None
-    error: Exception | None = None
-    done: threading.Event = field(default_factory=threading.Event)
+    """Nobody wants the result any more."""
 
 
 class BodyFitterNode(ComponentNode[BodyFitterComponent]):
@@ -40,9 +29,9 @@ class BodyFitterNode(ComponentNode[BodyFitterComponent]):
             self,
             FitBody,
             "fit_body",
-            self._execute,
-            # A goal waits for its fit without keeping the other callbacks from running.
-            callback_group=ReentrantCallbackGroup(),
+            _abort,
+            # The worker executes a goal when its fit is done: a goal that waits or is fitted holds up no callback.
+            handle_accepted_callback=lambda goal: self.worker.call(partial(self._serve, goal)),
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
@@ -51,42 +40,48 @@ class BodyFitterNode(ComponentNode[BodyFitterComponent]):
         self._action.destroy()
         super().destroy_node()
 
-    def _execute(self, goal: ServerGoalHandle) -> FitBody.Result:
-        job = _Job()
-        self.worker.call(lambda: self._fit(goal, job))
-        job.done.wait()
-        result = FitBody.Result()
-        if job.error is None:
-            result.bodies = job.bodies
-            goal.succeed()
-        elif isinstance(job.error, _Cancelled):
-            result.message = "cancelled"
-            goal.canceled()
+    def _serve(self, goal: ServerGoalHandle) -> None:
+        """Fit the goal's cloud and end the goal (on the worker thread)."""
+        try:
+            bodies = self._fit(goal)
+        except _Cancelled:
+            if self.context.ok():
+                goal.execute(_cancel)
+        except PuppetError as error:
+            goal.execute(partial(_abort, message=str(error)))
+        except Exception as error:
+            goal.execute(partial(_abort, message=f"{type(error).__name__}: {error}"))
+            raise
         else:
-            result.message = str(job.error)
-            goal.abort()
-        return result
+            goal.execute(partial(_succeed, bodies=bodies))
 
-    def _fit(self, goal: ServerGoalHandle, job: _Job) -> None:
-        """Fit the goal's cloud and publish feedback (on the worker thread)."""
+    def _fit(self, goal: ServerGoalHandle) -> Any:
+        """Return the BodyArray of the goal's cloud and publish feedback; _Cancelled when the fit is to end."""
 
         def progress(fraction: float) -> None:
-            if goal.is_cancel_requested:
+            if goal.is_cancel_requested or not self.context.ok():
                 raise _Cancelled
             goal.publish_feedback(FitBody.Feedback(stage="fit", progress=float(fraction)))
 
+        progress(0.0)
         request = goal.request
-        try:
-            progress(0.0)
-            initial = request.initial if request.initial.bodies else None
-            job.bodies, _ = self.component.fit(request.cloud, initial, int(request.seed), progress)
-        except (PuppetError, _Cancelled) as error:
-            job.error = error
-        except Exception as error:
-            job.error = error
-            raise
-        finally:
-            job.done.set()
+        initial = request.initial if request.initial.bodies else None
+        return self.component.fit(request.cloud, initial, int(request.seed), progress)[0]
+
+
+def _succeed(goal: ServerGoalHandle, bodies: Any) -> FitBody.Result:
+    goal.succeed()
+    return FitBody.Result(bodies=bodies)
+
+
+def _cancel(goal: ServerGoalHandle) -> FitBody.Result:
+    goal.canceled()
+    return FitBody.Result(message="cancelled")
+
+
+def _abort(goal: ServerGoalHandle, message: str = "") -> FitBody.Result:
+    goal.abort()
+    return FitBody.Result(message=message)
 
 
 def make_node(name: str) -> BodyFitterNode:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
@@ -21,7 +20,7 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
     """
     try:
         import rclpy
-        from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+        from rclpy.exceptions import NameValidationException, ParameterException
         from rclpy.utilities import remove_ros_args
 
         make_node = import_module(module).make_node
@@ -32,12 +31,15 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
     try:
         _parser(name, description).parse_args(remove_ros_args(given)[1:])
         rclpy.init(args=given)
-        return _spin(name, make_node)
-    except (PuppetError, RCLError, UnknownROSArgsError) as error:
+        node = make_node(name)
+    except (PuppetError, ParameterException, NameValidationException, RuntimeError) as error:
+        # RuntimeError is what rclpy raises for arguments, names and policies that it cannot read.
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
-    finally:
         rclpy.try_shutdown()
+        return 2
+    _spin(node)
+    rclpy.try_shutdown()
+    return 0
 
 
 def _parser(name: str, description: str | None) -> argparse.ArgumentParser:
@@ -53,25 +55,20 @@ def _parser(name: str, description: str | None) -> argparse.ArgumentParser:
     )
 
 
-def _spin(name: str, make_node: Callable[[str], Any]) -> int:
+def _spin(node: Any) -> None:
     import rclpy
-    from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
-    node = make_node(name)
-    # The second thread is for an action, which waits for its result while messages come in.
-    executor = MultiThreadedExecutor(num_threads=2)
+    executor = SingleThreadedExecutor()
     executor.add_node(node)
     node.get_logger().info("ready")
-    try:
-        while rclpy.ok():
-            try:
-                executor.spin_once()
-            except (KeyboardInterrupt, ExternalShutdownException):
-                break
-            except Exception as error:
-                # A message of another type under the same topic name must not end the node; a shut-down context does.
-                if rclpy.ok():
-                    node.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=5.0)
-        return 0
-    finally:
-        node.destroy_node()
+    while rclpy.ok():
+        try:
+            executor.spin_once()
+        except (KeyboardInterrupt, ExternalShutdownException):
+            break
+        except Exception as error:
+            # A message of another type under the same topic name must not end the node; a shut-down context does.
+            if rclpy.ok():
+                node.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=5.0)
+    node.destroy_node()

@@ -49,8 +49,8 @@ class Worker:
         with self._changed:
             self._tasks = deque(item for item in self._tasks if item[0] is None)
 
-    def stop(self, timeout: float = 5.0) -> None:
-        """Finish the running task, drop the others and end the thread; `timeout` in seconds bounds the wait."""
+    def stop(self, timeout: float = 1.0) -> None:
+        """Drop the tasks that wait and end the thread; a task that runs has `timeout` seconds to finish."""
         with self._changed:
             self._stopping = True
             self._changed.notify()

@@ -74,3 +74,4 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Path]]:
             status = process.wait()
         assert status == 0, f"{name} ended with {status}:\n{log.read_text()}"
         assert "Traceback" not in log.read_text()
+        assert "[ERROR]" not in log.read_text()

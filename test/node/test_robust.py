@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from flowing_puppet_msgs.action import FitBody
 from flowing_puppet_msgs.msg import BodyArray
@@ -64,10 +65,11 @@ def kept(topic: str) -> list[str]:
 
 
 def test_flow_survives_bad_images_and_starts_anew_on_request(start: Callable[..., Path], peer: Any) -> None:
-    log = start("optical_flow", *kept("/image"), *kept("/image/compressed"))
+    topic = "/camera/image_raw"
+    log = start("optical_flow", "-r", f"image:={topic}", *kept(topic), *kept(f"{topic}/compressed"))
     flows = received(peer, Image, "flow/forward")
     reports = received(peer, DiagnosticArray, "/diagnostics")
-    raw, compressed = connected(peer, Image, "image"), connected(peer, CompressedImage, "image/compressed")
+    raw, compressed = connected(peer, Image, topic), connected(peer, CompressedImage, f"{topic}/compressed")
     peer.spin_until(lambda: peer.count_publishers("flow/forward"), "the output")
     garbage = CompressedImage(header=image(1).header, format="jpeg", data=array.array("B", b"not a jpeg"))
     short = image(2)
@@ -77,10 +79,12 @@ def test_flow_survives_bad_images_and_starts_anew_on_request(start: Callable[...
     raw.publish(short)
     raw.publish(image(2, "8UC9"))
     raw.publish(Image())
-    peer.spin_for(1.0)
+    for number in (-101, -100):
+        raw.publish(image(number))
+    peer.spin_until(lambda: flows, "flow of images from before the epoch")
     for number in (3, 4, 5):
         raw.publish(image(number))
-    peer.spin_until(lambda: any(median(flow) == [2.0, 0.0] for flow in flows), "flow after bad images")
+    peer.spin_until(lambda: len(flows) > 1 and median(flows[-1]) == [2.0, 0.0], "flow after bad images")
     count = len(flows)
     client = peer.create_client(Trigger, "optical_flow/reset")
     answer = client.call_async(Trigger.Request())
@@ -144,11 +148,39 @@ def test_fitter_survives_bad_clouds_and_serves_goals(start: Callable[..., Path],
 def goal(peer: Any, client: ActionClient, cloud: PointCloud2) -> tuple[FitBody.Result, list[Any]]:
     """Send a goal; return its result and the feedback that came."""
     feedback: list[Any] = []
-    accepted = client.send_goal_async(FitBody.Goal(cloud=cloud, seed=1), feedback.append)
-    peer.spin_until(accepted.done, "the goal's acceptance")
-    done = accepted.result().get_result_async()
+    done = sent(peer, client, cloud, feedback.append).get_result_async()
     peer.spin_until(done.done, "the goal's result")
     return done.result().result, feedback
+
+
+def sent(peer: Any, client: ActionClient, cloud: PointCloud2, feedback: Callable[[Any], None] | None = None) -> Any:
+    """Send a goal; return its handle."""
+    accepted = client.send_goal_async(FitBody.Goal(cloud=cloud, seed=1), feedback)
+    peer.spin_until(accepted.done, "the goal's acceptance")
+    return accepted.result()
+
+
+def test_goals_that_wait_can_be_cancelled_and_do_not_outlive_the_node(start: Callable[..., Path], peer: Any) -> None:
+    start("body_fitter", "-p", "iterations:=10000")
+    client = ActionClient(peer, FitBody, "fit_body")
+    peer.spin_until(client.server_is_ready, "the action")
+    feedback: list[Any] = []
+    first = sent(peer, client, body_cloud(1), feedback.append)
+    second = sent(peer, client, body_cloud(2))
+    third = sent(peer, client, body_cloud(3))
+    peer.spin_until(lambda: len(feedback) > 1, "the first fit")
+    for handle in (second, first):
+        answer = handle.cancel_goal_async()
+        peer.spin_until(answer.done, "the answer to the cancellation")
+        assert len(answer.result().goals_canceling) == 1
+    for handle in (first, second):
+        done = handle.get_result_async()
+        peer.spin_until(done.done, "the end of the goal")
+        assert done.result().status == GoalStatus.STATUS_CANCELED
+        assert done.result().result.message == "cancelled"
+    third.get_result_async()
+    peer.spin_for(0.5)
+    # The third is being fitted when the interrupt comes.
 
 
 @pytest.mark.parametrize(
@@ -156,7 +188,10 @@ def goal(peer: Any, client: ActionClient, cloud: PointCloud2) -> tuple[FitBody.R
     [
         ("optical_flow", ["--ros-args", "-p", "max_side:=3"], "max_side"),
         ("optical_flow", ["--ros-args", "-p", "preset:=best"], "best"),
+        ("optical_flow", ["--ros-args", "-p", "use_sim_time:=5"], "use_sim_time"),
+        ("optical_flow", ["--ros-args", "-p", "qos_overrides./image.subscription.reliability:=good"], "good"),
         ("visual_hull", [], "cameras"),
+        ("visual_hull", ["--ros-args", "-p", "cameras:=a b,c"], "a b/image"),
         ("body_fitter", ["--ros-args", "--params-file", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
