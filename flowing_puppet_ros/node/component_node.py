@@ -132,7 +132,8 @@ class ComponentNode[C: Component](Node):
             return
         self._diagnostics.failed()
         where = traceback.extract_tb(error.__traceback__)[-1]
-        text = f"a message failed: {type(error).__name__}: {error} ({where.filename}:{where.lineno})"
+        reason = " ".join(str(error).split())
+        text = f"a message failed: {type(error).__name__}: {reason} ({where.filename}:{where.lineno})"
         self.get_logger().error(text, throttle_duration_sec=QUIET_SECONDS)
 
     def _report(self) -> None:

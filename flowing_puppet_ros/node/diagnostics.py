@@ -22,6 +22,7 @@ class Diagnostics:
         self._passed: Counter[str] = Counter()
         self._latencies: list[float] = []
         self._dropped = 0
+        self._unusable = 0
         self._failures = 0
 
     def passed(self, topic: str) -> None:
@@ -49,7 +50,9 @@ class Diagnostics:
             latencies, self._latencies = self._latencies, []
             failures, self._failures = self._failures, 0
         newly_dropped, self._dropped = sum(dropped.values()) - self._dropped, sum(dropped.values())
-        level, message = _verdict(failures, newly_dropped, sum(passed.values()))
+        unusable = int(counters.get("unusable", 0))
+        newly_unusable, self._unusable = unusable - self._unusable, unusable
+        level, message = _verdict(failures, newly_unusable, newly_dropped, sum(passed.values()))
         values = {f"{topic} (Hz)": f"{count / seconds:.1f}" for topic, count in sorted(passed.items())}
         if latencies:
             values["latency mean (s)"] = f"{sum(latencies) / len(latencies):.3f}"
@@ -63,9 +66,11 @@ class Diagnostics:
         return array
 
 
-def _verdict(failures: int, dropped: int, passed: int) -> tuple[bytes, str]:
+def _verdict(failures: int, unusable: int, dropped: int, passed: int) -> tuple[bytes, str]:
     if failures:
         return DiagnosticStatus.ERROR, f"{failures} messages failed; the log says why"
+    if unusable:
+        return DiagnosticStatus.WARN, f"{unusable} messages could not be used; the log says why"
     if dropped:
         return DiagnosticStatus.WARN, f"too slow: {dropped} messages dropped"
     return DiagnosticStatus.OK, "running" if passed else "waiting for messages"

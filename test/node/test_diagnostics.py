@@ -37,5 +37,8 @@ def test_level_follows_what_is_new() -> None:
     diagnostics = Diagnostics("/a", "a")
     assert diagnostics.report(Time(), 1.0, {}, {"image": 3}).status[0].level == DiagnosticStatus.WARN
     assert diagnostics.report(Time(), 1.0, {}, {"image": 3}).status[0].level == DiagnosticStatus.OK
+    unusable = diagnostics.report(Time(), 1.0, {"unusable": 2}, {"image": 3}).status[0]
+    assert (unusable.level, unusable.message[:1]) == (DiagnosticStatus.WARN, "2")
+    assert diagnostics.report(Time(), 1.0, {"unusable": 2}, {"image": 3}).status[0].level == DiagnosticStatus.OK
     diagnostics.failed()
     assert diagnostics.report(Time(), 1.0, {}, {"image": 3}).status[0].level == DiagnosticStatus.ERROR
