@@ -245,7 +245,7 @@ class BodyFitter:
 
 
 def checked_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return float64 arrays without the points that are not finite.
+    """Return float64 arrays without the points that are not finite; normals most of which are missing become None.
 
     Raises:
         InputError: when shapes are wrong or too few points are left.
@@ -259,8 +259,12 @@ def checked_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.nd
         if normals.shape != points.shape:
             raise InputError(f"{len(points)} points need as many normals, got an array of shape {normals.shape}")
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        finite &= np.isfinite(length[:, 0]) & (length[:, 0] > 0)
-        normals = (normals / np.where(length > 0, length, 1))[finite]
+        usable = np.isfinite(length[:, 0]) & (length[:, 0] > 0)
+        if 2 * np.count_nonzero(usable) < len(points):
+            normals = None
+        else:
+            finite &= usable
+            normals = (normals / np.where(length > 0, length, 1))[finite]
     points = points[finite]
     if len(points) < MIN_POINTS:
         raise InputError(f"the cloud has {len(points)} finite points, a fit needs at least {MIN_POINTS} on one person")

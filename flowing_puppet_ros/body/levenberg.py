@@ -5,6 +5,10 @@ The unknowns are rotation, translation and pose deformation. Residuals are taken
 the sum of squares as it is: with y = R^T (v - o) for cloud point v and p for the model point in that frame the
 residual is p - y, its derivative with respect to a rotation increment on the right of R is -[p]x, with respect to the
 translation (in the part's frame) the identity, and with respect to the deformation the constant basis.
+
+Other than the thesis, which damps with lambda I and takes every residual alike: the damping is scaled by the diagonal
+of J J^T (Marquardt 1963), so that radians, metres and coefficients are damped alike; points whose normals contradict
+the cloud's count less, believed joints pull too, and a weak prior keeps the deformation bounded.
 """
 
 from __future__ import annotations
@@ -16,11 +20,11 @@ from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.particles import Particles
 from flowing_puppet_ros.body.points import PartPoints
 from flowing_puppet_ros.evidence.cloud import CloudGrid, look_up
+from flowing_puppet_ros.model.sp import DEVIATIONS
 
 DAMPING = 0.1
 DAMPING_FACTOR = 10.0
 MAX_TURN = 0.6
-MAX_POSE = 3.0
 POSE_PRIOR = 5e-5
 CONTRADICTING_WEIGHT = 0.3
 # Points, normals, nearest indices, origin and cell of a CloudGrid.
@@ -87,7 +91,7 @@ def _improve_all(
                 step *= MAX_TURN / turn
             new_center = center[p] + rotation[p] @ step[3:6]
             new_rotation = rotation[p] @ _rotation(step[:3])
-            new_pose = np.minimum(np.maximum(pose[p] + step[6:], -MAX_POSE), MAX_POSE)
+            new_pose = np.minimum(np.maximum(pose[p] + step[6:], -DEVIATIONS), DEVIATIONS)
             new_hessian, new_gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
             new_cost = _assemble(
                 new_center, new_rotation, new_pose, mean[p], basis, normals, weight, target, cloud,

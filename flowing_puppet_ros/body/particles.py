@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+from flowing_puppet_ros.model.sp import POSE_WIDTH, BodyState, StitchedPuppet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,7 +46,7 @@ class Particles:
 
 def state_of(model: StitchedPuppet, groups: list[Particles], pick: np.ndarray) -> BodyState:
     """The body made of particle `pick[i]` of every part i."""
-    pose = np.zeros((len(groups), max(basis.shape[2] for basis in model.pose_basis)))
+    pose = np.zeros((len(groups), POSE_WIDTH))
     for part, group in enumerate(groups):
         pose[part, : group.pose.shape[1]] = group.pose[pick[part]]
     return BodyState(
@@ -63,7 +63,7 @@ def particles_of(model: StitchedPuppet, states: list[BodyState]) -> list[Particl
         Particles(
             np.stack([state.center[part] for state in states]),
             np.stack([state.rotation[part] for state in states]),
-            np.stack([state.pose[part, : model.pose_basis[part].shape[2]] for state in states]),
+            np.stack([state.pose[part, : model.pose_count(part)] for state in states]),
             np.stack([state.shape[part] for state in states]),
         )
         for part in range(len(model.tree))

@@ -12,9 +12,7 @@ from flowing_puppet_ros.body.particles import Particles
 from flowing_puppet_ros.body.points import PartPoints
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.gaussian import Gaussian
-from flowing_puppet_ros.model.sp import StitchedPuppet
-
-MAX_COEFFICIENT = 3.0
+from flowing_puppet_ros.model.sp import DEVIATIONS, StitchedPuppet
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +57,8 @@ class Proposer:
         self._deformation: dict[tuple[int, int], tuple[Conditional, Conditional]] = {}
         for edge, (parent, child) in enumerate(model.tree.edges):
             relative = np.arange(3)
-            of_parent = 3 + np.arange(model.pose_basis[parent].shape[2])
-            of_child = of_parent[-1] + 1 + np.arange(model.pose_basis[child].shape[2])
+            of_parent = 3 + np.arange(model.pose_count(parent))
+            of_child = of_parent[-1] + 1 + np.arange(model.pose_count(child))
             for part, kept, other, given in (
                 (child, of_child, parent, of_parent),
                 (parent, of_parent, child, of_child),
@@ -102,8 +100,8 @@ class Proposer:
         return Particles(
             particles.center + rng.normal(0.0, noise.center, (count, 3)) * whole,
             so3.exp(turn) @ particles.rotation,
-            np.clip(pose, -MAX_COEFFICIENT, MAX_COEFFICIENT),
-            np.clip(shape, -MAX_COEFFICIENT, MAX_COEFFICIENT),
+            np.clip(pose, -DEVIATIONS, DEVIATIONS),
+            np.clip(shape, -DEVIATIONS, DEVIATIONS),
         )
 
     def _from_neighbour(self, part: int, other: int, source: Judged, rng: np.random.Generator) -> Particles:
@@ -118,7 +116,7 @@ class Proposer:
         relative = rng.uniform(self._model.limit_low[edge], self._model.limit_high[edge], (len(given), 3))
         with_turn = turned.sample(rng, np.concatenate([relative, given.pose], axis=1))
         pose = np.where(rng.random((len(given), 1)) < 0.5, pose, with_turn)
-        pose = np.clip(pose, -MAX_COEFFICIENT, MAX_COEFFICIENT)
+        pose = np.clip(pose, -DEVIATIONS, DEVIATIONS)
         local = self._points[part].interfaces[edge].local(pose, given.shape)
         weight = self._model.interfaces[edge].weight
         rotation, center = so3.procrustes(local, source.interfaces[edge], weight)

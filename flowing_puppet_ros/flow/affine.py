@@ -50,11 +50,6 @@ class RegionMotions:
         return self.pixels >= LEAST_FOR_TRANSLATION
 
 
-def identity_motion() -> Floats:
-    """The (2, 3) motion that leaves every point where it is."""
-    return np.eye(2, 3)
-
-
 def transform(affine: Floats, points: Floats) -> Floats:
     """Apply motions (..., 2, 3) to points (..., N, 2)."""
     moved: Floats = points @ np.swapaxes(affine[..., :2], -1, -2) + affine[..., None, :, 2]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, checked_cloud
 from flowing_puppet_ros.body.io import write_ply
 from flowing_puppet_ros.body.normals import estimated_normals
 from flowing_puppet_ros.cli import main
@@ -198,6 +198,7 @@ def test_unusable_clouds_are_refused_in_one_sentence(fitter: BodyFitter) -> None
     ):
         with pytest.raises(InputError, match=words):
             fitter.fit(bad)
+    assert checked_cloud(cloud, np.zeros((100, 3)))[1] is None
     with pytest.raises(InputError, match="normals"):
         fitter.fit(cloud, cloud[:50])
     with pytest.raises(InputError, match="initial joints"):
