@@ -14,6 +14,7 @@ from flowing_puppet_ros.errors import InputError
 Floats = NDArray[np.float64]
 
 _LENS_MODELS = ("plumb_bob", "")
+_RADIUS2 = np.linspace(0.0, 5.0, 5001) ** 2
 _NEWTON_STEPS = 20
 _NEWTON_ACCURACY = 1e-10
 
@@ -77,6 +78,18 @@ class Camera:
         """The mean focal length in pixels: pixels per metre at one metre depth."""
         return float(np.sqrt(self.matrix[0, 0] * self.matrix[1, 1]))
 
+    @property
+    def lens_reach(self) -> float:
+        """Squared distance from the axis, on the image plane at depth 1, up to which the radial lens model is 1 to 1.
+
+        Beyond it the model would fold places far outside the view back into the image. Infinite when there is no fold
+        within 79 degrees of the axis.
+        """
+        k1, k2, _, _, k3 = self.distortion
+        slope = 1 + _RADIUS2 * (3 * k1 + _RADIUS2 * (5 * k2 + _RADIUS2 * 7 * k3))
+        turned = np.flatnonzero(slope <= 0)
+        return float(_RADIUS2[turned[0] - 1]) if len(turned) else np.inf
+
     def same_as(self, other: Camera) -> bool:
         """Whether both cameras project every point to the same pixel."""
         names = ("matrix", "distortion", "size", "rotation", "translation")
@@ -87,11 +100,15 @@ class Camera:
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
     def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
-        """Pixels (..., 2) and depths (...) in metres of world points (..., 3); NaN pixels for points behind."""
+        """Pixels (..., 2) and depths (...) in metres of world points (..., 3); NaN pixels for what no lens shows.
+
+        That is what lies behind, or beyond `lens_reach`.
+        """
         local = self.to_camera(points)
         depth = local[..., 2]
-        safe = np.where(depth > 0, depth, np.nan)
-        return self.to_pixels(distort(local[..., :2] / safe[..., None], self.distortion)), depth
+        plane = local[..., :2] / np.where(depth > 0, depth, np.nan)[..., None]
+        plane = np.where((plane**2).sum(axis=-1, keepdims=True) <= self.lens_reach, plane, np.nan)
+        return self.to_pixels(distort(plane, self.distortion)), depth
 
     def to_pixels(self, image_plane: Floats) -> Floats:
         """Pixels (..., 2) of (distorted) points (..., 2) of the image plane at depth 1."""

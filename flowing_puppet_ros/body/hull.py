@@ -131,14 +131,14 @@ def _distance_field(views: list[_View], corners: Floats, settings: HullSettings)
         camera = view.camera
         _carve(
             field, seen, corners[0], settings.voxel, np.float32(band), np.ascontiguousarray(view.distance),
-            camera.matrix, camera.distortion, camera.rotation, camera.translation, camera.focal,
+            camera.matrix, camera.distortion, camera.lens_reach, camera.rotation, camera.translation, camera.focal,
         )  # fmt: skip
     field[seen < MIN_VIEWS] = band
     return field
 
 
 @njit(cache=True, error_model="numpy")
-def _carve(field, seen, origin, voxel, band, distance, matrix, lens, rotation, translation, focal):  # type: ignore[no-untyped-def]  # pragma: no cover  # fmt: skip
+def _carve(field, seen, origin, voxel, band, distance, matrix, lens, reach, rotation, translation, focal):  # type: ignore[no-untyped-def]  # pragma: no cover  # fmt: skip
     """Raise `field` (X,Y,Z) to one camera's signed distances in metres; count the cameras that see each voxel."""
     height, width = distance.shape
     step = voxel * rotation[:, 2]
@@ -154,6 +154,8 @@ def _carve(field, seen, origin, voxel, band, distance, matrix, lens, rotation, t
                     continue
                 x, y = (start[0] + k * step[0]) / depth, (start[1] + k * step[1]) / depth
                 r2 = x * x + y * y
+                if r2 > reach:
+                    continue
                 radial = 1 + r2 * (lens[0] + r2 * (lens[1] + r2 * lens[4]))
                 u = x * radial + 2 * lens[2] * x * y + lens[3] * (r2 + 2 * x * x)
                 v = y * radial + lens[2] * (r2 + 2 * y * y) + 2 * lens[3] * x * y

@@ -34,7 +34,10 @@ class Stage:
 
 
 def four_stages(tree: PartTree) -> tuple[Stage, ...]:
-    """The thesis's schedule for an unknown pose; the stages end at 35, 60, 85 and 100 % of the iterations."""
+    """The thesis's schedule for an unknown pose; the stages end at 35, 60, 85 and 100 % of the iterations.
+
+    The "lower limbs" of its first stage are taken to be the lower legs: with the lower arms among them fits are alike.
+    """
     ends = np.array([name.endswith(("_hand", "_foot")) for name in tree.names])
     distal = ends | np.array([name.endswith("_lower_leg") for name in tree.names])
     hips = np.array([name.endswith("_upper_leg") for name in tree.names])

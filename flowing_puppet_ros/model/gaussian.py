@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Multivariate Gaussians: conditioning, marginals, sampling, density and product (thesis Eqs. 12-14 and 25-30)."""
+"""Multivariate Gaussians: conditioning, marginals and sampling (thesis Eqs. 12-14)."""
 
 from __future__ import annotations
 
@@ -59,22 +59,3 @@ class Gaussian:
         variances, axes = np.linalg.eigh(self.covariance)
         scaled = axes * np.sqrt(np.maximum(variances, 0.0))
         return np.asarray(self.mean + rng.standard_normal((n, len(self))) @ scaled.T)
-
-    def log_density(self, x: Array) -> Array:
-        """Log density at x (...,D); LinAlgError when the covariance is not positive definite."""
-        factor = np.linalg.cholesky(self.covariance)
-        deviation = np.asarray(x, dtype=np.float64) - self.mean
-        whitened = np.linalg.solve(factor, deviation[..., None])[..., 0]
-        log_volume = np.log(np.diag(factor)).sum() + 0.5 * len(self) * np.log(2 * np.pi)
-        return np.asarray(-0.5 * (whitened**2).sum(axis=-1) - log_volume)
-
-
-def product(gaussians: Sequence[Gaussian]) -> Gaussian:
-    """The normalised product of Gaussians over the same variables (Eqs. 25-30).
-
-    Information vectors are precision times mean; Eq. 30 as printed has the covariance there.
-    """
-    precisions = [np.linalg.inv(gaussian.covariance) for gaussian in gaussians]
-    information = np.sum([p @ g.mean for p, g in zip(precisions, gaussians, strict=True)], axis=0)
-    covariance = np.linalg.inv(np.sum(precisions, axis=0))
-    return Gaussian(covariance @ information, (covariance + covariance.T) / 2)

@@ -69,6 +69,11 @@ def test_undistort_says_nan_beyond_the_lens_models_fold() -> None:
     plane = camera(d=[-0.3]).undistort([[319.5 + 800 * 0.6, 239.5], [319.5 + 800 * 0.8, 239.5]])
     assert np.isfinite(plane[0]).all() and plane[0, 0] < 1.054
     assert np.isnan(plane[1]).all()
+    view = camera(d=[-0.3])
+    assert np.sqrt(view.lens_reach) == pytest.approx(1.054, abs=2e-3)
+    folded, seen = view.project([[1.8, 0.0, 1.0], [0.6, 0.0, 1.0]])[0]
+    assert np.isnan(folded).all() and np.isfinite(seen).all()
+    assert camera(d=[0.1, 0.05]).lens_reach == np.inf
 
 
 @pytest.mark.parametrize("factor", [0.25, 0.5, 2.0, 0.3])

@@ -2,6 +2,7 @@
 """Hulls of analytic bodies: the carved surface against the exact cones of the silhouettes, and bad masks."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,6 +117,25 @@ def test_what_a_camera_does_not_see_is_the_others_affair(ring: Ring) -> None:
     views = [narrow, *cameras[1:]]
     points, _ = visual_hull(views, [mask(c, CAPSULES) for c in views], BOX)
     assert points[:, 2].max() > 0.86 and points[:, 2].min() < -0.90
+
+
+def test_what_a_lens_would_fold_into_the_image_is_the_others_affair(ring: Ring) -> None:
+    cameras = ring(5)
+    # Turned by 61 degrees: the body is far outside its view, where the lens model folds it onto the image's middle.
+    c, s = np.cos(np.radians(61.0)), np.sin(np.radians(61.0))
+    aside = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    blind = replace(
+        cameras[4],
+        distortion=np.array([-0.3, 0, 0, 0, 0]),
+        rotation=aside @ cameras[4].rotation,
+        translation=aside @ cameras[4].translation,
+    )
+    masks = [mask(camera, CAPSULES) for camera in cameras[:4]]
+    empty = np.zeros((320, 240), np.uint8)
+    empty[0, 0] = 255
+    expected, _ = visual_hull(cameras[:4], masks, BOX)
+    points, _ = visual_hull([*cameras[:4], blind], [*masks, empty], BOX)
+    np.testing.assert_allclose(points, expected, atol=1e-6)
 
 
 def test_nothing_is_kept_where_one_camera_alone_sees(ring: Ring) -> None:
