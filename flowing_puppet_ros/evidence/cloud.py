@@ -56,11 +56,6 @@ class CloudGrid:
         nearest = cKDTree(points).query(centres)[1].astype(np.int32).reshape(shape)
         return cls(points, np.ascontiguousarray(normals, dtype=np.float64), low, cell, nearest)
 
-    def closest(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return index (M,) and distance (M,) in metres of the cloud point close to each of (M, 3) `queries`."""
-        queries = np.ascontiguousarray(queries, dtype=np.float64)
-        return _closest(self.points, self.nearest, self.origin, self.cell, queries)
-
     def data_cost(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Eq. 53 and the share of normals that contradict the cloud's, for many sets of surface points at once.
 
@@ -85,21 +80,6 @@ def look_up(nearest: np.ndarray, origin: np.ndarray, cell: float, x: float, y: f
     j = min(max(int(np.floor((y - origin[1]) / cell + 0.5)), 0), nearest.shape[1] - 1)
     k = min(max(int(np.floor((z - origin[2]) / cell + 0.5)), 0), nearest.shape[2] - 1)
     return nearest[i, j, k]
-
-
-@njit(cache=True)
-def _closest(
-    points: np.ndarray, nearest: np.ndarray, origin: np.ndarray, cell: float, queries: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    index = np.empty(len(queries), dtype=np.int64)
-    distance = np.empty(len(queries))
-    for row in range(len(queries)):
-        x, y, z = queries[row]
-        found = look_up(nearest, origin, cell, x, y, z)
-        dx, dy, dz = x - points[found, 0], y - points[found, 1], z - points[found, 2]
-        index[row] = found
-        distance[row] = np.sqrt(dx * dx + dy * dy + dz * dz)
-    return index, distance
 
 
 @njit(cache=True)

@@ -56,16 +56,6 @@ def transform(affine: Floats, points: Floats) -> Floats:
     return moved
 
 
-def fit_affine(points: Floats, vectors: Floats, weights: Floats | None = None) -> tuple[Floats, float, float]:
-    """Robust affine motion (2, 3) of flow `vectors` (N, 2) at `points` (N, 2), its residual in px and its support."""
-    if weights is None:
-        weights = np.ones(len(points))
-    samples = np.column_stack([points, vectors, weights, weights])
-    affine = np.empty((2, 3))
-    residual, support = _fit(np.ascontiguousarray(samples, dtype=np.float64), affine)
-    return affine, residual, support
-
-
 def fit_regions(labels: NDArray[np.unsignedinteger], count: int, forward: Flow, backward: Flow | None) -> RegionMotions:
     """Fit one motion to each of the labels 0 .. count - 1 of `labels` (H, W), over the pixels with known flow.
 

@@ -87,12 +87,6 @@ class AnnyBody:
         origin[1] = 0.0
         return RestBody(vertices - origin, joints - origin)
 
-    def rest_vertices(self, phenotype: Array | np.random.Generator) -> Array:
-        """Vertices (V,3) in the rest pose of a given phenotype (6,), or of a random adult drawn with a generator."""
-        if isinstance(phenotype, np.random.Generator):
-            phenotype = self.sample_phenotype(phenotype)
-        return self.rest(phenotype).vertices
-
     def mean_phenotype(self) -> Array:
         """The phenotype (6,) of an adult of average build and stature."""
         gender = {"neutral": 0.5, "female": 1.0, "male": 0.0}[self.gender]
@@ -184,12 +178,6 @@ class AnnyBody:
         labels = connected_components(graph, directed=False)[1]
         size = np.bincount(labels)[labels]
         return np.flatnonzero((size == size.min()) & (vertices[:, 1] > 0))
-
-    def random_body(self, rng: np.random.Generator, rotations: Array) -> tuple[Array, dict[str, Array]]:
-        """A random adult in the pose of `rotations` (B,3,3): vertices (V,3) and named joints {name: (3,)}."""
-        rest = self.rest(self.sample_phenotype(rng))
-        vertices, joints = self.pose(rest, rotations)
-        return vertices, self.landmarks(vertices, joints)
 
 
 JOINT_BONES = {

@@ -5,11 +5,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from flowing_puppet_ros.flow.affine import LEAST_FOR_TRANSLATION, fit_affine, fit_regions, transform
+from flowing_puppet_ros.flow.affine import LEAST_FOR_TRANSLATION, _fit, fit_regions, transform
 
 type Floats = NDArray[np.float64]
 
 MOTION = np.array([[0.97, -0.12, 9.0], [0.15, 1.03, -4.0]])
+
+
+def fit_affine(points: Floats, vectors: Floats) -> tuple[Floats, float, float]:
+    """Motion (2, 3), residual in px and support of `vectors` (N, 2) at `points` (N, 2) that all weigh 1."""
+    affine = np.empty((2, 3))
+    residual, support = _fit(np.column_stack([points, vectors, np.ones((len(points), 2))]), affine)
+    return affine, residual, support
 
 
 def field_of(affine: Floats, height: int, width: int) -> Floats:
