@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from flowing_puppet_ros.bag.reader import open_bag
+from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.video import Frame
@@ -26,22 +27,34 @@ class BagFrames:
     detections: dict[int, list[Keypoints]]
     fps: float
     count: int
+    salvage: bool
+    warn: Callable[[str], None]
 
     def __iter__(self) -> Iterator[tuple[Frame, list[Keypoints] | None]]:
-        """Read the images in the order of the bag; a stamp without detections had no detector run on it."""
-        with open_bag(self.path) as bag:
+        """Read the images in the order of the bag; a stamp without detections had no detector run on it.
+
+        An image that cannot be read is warned of and left out; it counts in the index.
+        """
+        with open_bag(self.path, self.salvage) as bag:
             for index, record in enumerate(bag.messages([self.topic])):
-                stamp = stamp_ns(record.message)
-                frame = Frame(index, stamp, decode_image(record.message), "")
+                try:
+                    stamp = stamp_ns(record.message)
+                    frame = Frame(index, stamp, decode_image(record.message), "")
+                except InputError as error:
+                    self.warn(f"frame {index}: {error}")
+                    continue
                 yield frame, self.detections.get(stamp)
 
 
-def open_bag_frames(path: Path, topic: str = "") -> BagFrames:
+def open_bag_frames(
+    path: Path, topic: str = "", salvage: bool = False, warn: Callable[[str], None] = lambda sentence: None
+) -> BagFrames:
     """Open the images on `topic`, or on the first image topic whose namespace has detections.
 
-    InputError lists the image topics when there is no such topic, and when the topic has no message.
+    `salvage` reads what is whole of a truncated file; `warn` hears of every message that cannot be used. InputError
+    lists the image topics when there is no such topic, and when the topic has no message.
     """
-    with open_bag(path) as bag:
+    with open_bag(path, salvage) as bag:
         images = sorted(name for name, kind in bag.topics.items() if kind in (IMAGE, COMPRESSED_IMAGE))
         people_topics = [name for name, kind in bag.topics.items() if kind == PUPPETS and name.endswith("/detections")]
         detected = {name.removesuffix("/detections"): name for name in people_topics}
@@ -51,13 +64,26 @@ def open_bag_frames(path: Path, topic: str = "") -> BagFrames:
             listed = ", ".join(images) or "none"
             raise InputError(f"{path} has no images on {topic or 'any topic'}; its image topics are: {listed}")
         source = detected.get(_namespace(chosen[0]), "")
-        people = {stamp_ns(r.message): keypoints_of(r.message) for r in bag.messages([source])} if source else {}
-        stamps = [stamp_ns(record.message) for record in bag.messages([chosen[0]])]
+        people = {}
+        for message in _readable(bag, source, warn):
+            people[stamp_ns(message)] = keypoints_of(message)
+        stamps = [stamp_ns(message) for message in _readable(bag, chosen[0], lambda sentence: None)]
     if not stamps:
         raise InputError(f"{path} has no message on {chosen[0]}")
     span = (max(stamps) - min(stamps)) * 1e-9
     fps = (len(stamps) - 1) / span if span > 0 else 0.0
-    return BagFrames(path, chosen[0], people, fps, len(stamps))
+    return BagFrames(path, chosen[0], people, fps, bag.details[chosen[0]].count, salvage, warn)
+
+
+def _readable(bag: Bag, topic: str, warn: Callable[[str], None]) -> Iterator[Any]:
+    """Yield the messages of a topic ("" has none) that are what they claim to be, and warn of the others."""
+    for record in bag.messages([topic]) if topic else ():
+        try:
+            message = record.message
+        except InputError as error:
+            warn(str(error))
+        else:
+            yield message
 
 
 def _namespace(image: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from flowing_puppet_ros.body.camera import Camera as CameraModel
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent
@@ -48,19 +49,26 @@ class Instance:
 
 @dataclass(slots=True, eq=False)
 class Graph:
-    """The components over a recording, in the order in which messages reach them."""
+    """The components over a recording, in the order in which messages reach them; `notes` say what it lacks."""
 
     instances: list[Instance]
+    notes: list[str] = field(default_factory=list)
 
-    def routes(self) -> dict[str, list[tuple[Instance, str]]]:
-        """Return topic -> the inputs that it feeds; an image's compressed form feeds the same input."""
+    def routes(self, recorded: Mapping[str, str]) -> dict[str, list[tuple[Instance, str]]]:
+        """Return topic -> the inputs that it feeds, `recorded` being the recording's topics and their types.
+
+        An image's compressed form feeds the same input, unless the image itself was recorded too. A recorded topic of
+        another type than the input's feeds nothing.
+        """
         found: dict[str, list[tuple[Instance, str]]] = {}
         for instance in self.instances:
             for port in instance.component.inputs:
                 topic = instance.topic(port.name)
-                topics = (topic, f"{topic}/compressed") if port.compressed else (topic,)
-                for each in topics:
-                    found.setdefault(each, []).append((instance, port.name))
+                kinds = (port.type, COMPRESSED_IMAGE) if port.compressed else (port.type,)
+                if recorded.get(topic, port.type) in kinds:
+                    found.setdefault(topic, []).append((instance, port.name))
+                if port.compressed and topic not in recorded:
+                    found.setdefault(f"{topic}/compressed", []).append((instance, port.name))
         return found
 
     def outputs(self) -> dict[str, Port]:
@@ -84,31 +92,55 @@ class Camera:
 def build_graph(
     topics: Mapping[str, str],
     frames: FrameTree,
-    info_frames: Mapping[str, str],
+    infos: Mapping[str, Any],
     settings: Mapping[str, Mapping[str, Any]],
     factory: MessageFactory,
 ) -> Graph:
     """Make the components that the topics (name -> type) of a recording can feed.
 
-    One tracker a camera; a visual hull of three or more cameras that `frames` connects (`info_frames`: topic of
-    camera_info -> frame_id); a body fitter for the hull and one for every cloud topic. `settings` are those of each
-    kind of component by its name. InputError lists what there is when nothing can be used.
+    One tracker a camera; a visual hull of three or more cameras that `frames` connects (`infos`: topic -> its first
+    CameraInfo); a body fitter for the hull and one for every cloud topic. `settings` are those of each kind of
+    component by its name. What the recording holds of their outputs is not used: it is made anew. InputError lists
+    what there is when nothing can be used.
     """
     cameras = _cameras(topics)
     clouds = [topic for topic, kind in topics.items() if kind == POINT_CLOUD and not topic.endswith("/body_vertices")]
     if not cameras and not clouds:
-        listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
-        raise InputError(
-            f"no topic can be used: wanted are images named {', '.join(IMAGE_NAMES)}, or point clouds; the topics are "
-            f"{listed}; --topic-map OLD:=NEW renames them"
-        )
-    instances = [_tracker(camera, topics, settings, factory) for camera in cameras]
-    calibrated = _calibrated(cameras, frames, info_frames)
-    if len(calibrated) >= LEAST_CAMERAS:
-        instances += _hull_and_fitter(calibrated, settings, factory)
-    for cloud in clouds:
-        instances.append(_cloud_fitter(cloud, topics, settings, factory))
-    return Graph(instances)
+        raise InputError(_nothing_usable(topics))
+    graph = Graph([_tracker(camera, topics, settings, factory) for camera in cameras])
+    graph.notes += _detection_notes(graph.instances, topics)
+    if len(cameras) >= LEAST_CAMERAS:
+        calibrated, note = _calibrated(cameras, frames, infos)
+        graph.notes += [note] if note else []
+        if len(calibrated) >= LEAST_CAMERAS:
+            graph.instances += _hull_and_fitter(calibrated, settings, factory)
+    made = graph.outputs()
+    graph.instances += [_cloud_fitter(cloud, topics, settings, factory) for cloud in clouds if cloud not in made]
+    return graph
+
+
+def _nothing_usable(topics: Mapping[str, str]) -> str:
+    listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
+    images = sorted(name for name, kind in topics.items() if kind in (IMAGE, COMPRESSED_IMAGE))
+    old = images[0] if images else "OLD"
+    new = f"{old.removesuffix('/compressed').rpartition('/')[0]}/image" if images else "NEW"
+    return (
+        f"no topic can be used: wanted are images named {', '.join(IMAGE_NAMES)}, or point clouds; the topics are "
+        f"{listed}; --topic-map {old}:={new} renames one"
+    )
+
+
+def _detection_notes(trackers: list[Instance], topics: Mapping[str, str]) -> list[str]:
+    """Say which cameras track nobody because no keypoints of people come with their images."""
+    wanted = [tracker.topic("detections") for tracker in trackers]
+    others = sorted(name for name, kind in topics.items() if kind == PUPPETS and name not in wanted)
+    return [
+        f"nobody is tracked in {tracker.topic('image')}: it needs keypoints of people ({PUPPETS}) on {topic}"
+        + (f", not {topics[topic]}" if topic in topics else "")
+        + (f"; --topic-map {others[0]}:={topic} renames what is there" if others else "")
+        for tracker, topic in zip(trackers, wanted, strict=True)
+        if topics.get(topic) != PUPPETS
+    ]
 
 
 def _cameras(topics: Mapping[str, str]) -> list[Camera]:
@@ -138,15 +170,39 @@ def _tracker(
     return instance
 
 
-def _calibrated(cameras: list[Camera], frames: FrameTree, info_frames: Mapping[str, str]) -> list[Camera]:
-    """Return the largest group of cameras with a camera_info whose frames hang on one root."""
+def _calibrated(cameras: list[Camera], frames: FrameTree, infos: Mapping[str, Any]) -> tuple[list[Camera], str]:
+    """Return the largest group of calibrated cameras whose frames hang on one root, and why others are not in it."""
     groups: dict[str, list[Camera]] = {}
+    reasons = []
     for camera in cameras:
-        frame = info_frames.get(f"{camera.namespace}/camera_info", "").lstrip("/")
-        root = frames.root(frame) if frame else ""
-        if root not in ("", frame):
-            groups.setdefault(root, []).append(camera)
-    return max(groups.values(), key=len, default=[])
+        try:
+            groups.setdefault(_root(camera, frames, infos), []).append(camera)
+        except InputError as error:
+            reasons.append(f"{camera.name}: {error}")
+    chosen = max(groups.values(), key=len, default=[])
+    for root, group in groups.items():
+        if group is not chosen:
+            reasons += [f"{camera.name}: its frames end in {root!r}" for camera in group]
+    if not reasons:
+        return chosen, ""
+    what = "without these cameras" if len(chosen) >= LEAST_CAMERAS else f"not built, it needs {LEAST_CAMERAS} cameras"
+    return chosen, f"the visual hull is {what} ({'; '.join(reasons)})"
+
+
+def _root(camera: Camera, frames: FrameTree, infos: Mapping[str, Any]) -> str:
+    """Return the frame above a camera's frame; InputError when the camera is not calibrated or hangs on nothing."""
+    info = infos.get(f"{camera.namespace}/camera_info")
+    if info is None:
+        raise InputError(f"there is no {camera.namespace}/camera_info")
+    frame = info.header.frame_id.lstrip("/")
+    root = frames.root(frame)
+    if root == frame:
+        raise InputError(f"/tf_static has no transform to its frame {frame!r}")
+    placed = frames.pose(root, frame)
+    assert placed is not None
+    translation, rotation = placed
+    CameraModel.from_info(info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model)
+    return root
 
 
 def _hull_and_fitter(

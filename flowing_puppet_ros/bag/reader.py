@@ -60,6 +60,8 @@ class Bag:
         self._reader: Reader | None = None
         if self._salvage:
             self.details = self._scan()
+            if not self.details:
+                raise InputError(f"{path} is cut off so early that it has no whole message")
             return
         try:
             self._reader = Reader(path)

@@ -7,6 +7,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -52,8 +53,8 @@ def replay(source: Path, target: Path, options: ReplayOptions | None = None) -> 
     usable topic. What a component cannot use is counted and said once in the summary's `warnings`.
     """
     options = options or ReplayOptions()
-    if target.exists() and source.exists() and target.resolve() == source.resolve():
-        raise InputError(f"{target} is the input itself: name another output")
+    if source.exists() and source.resolve() in (target.resolve(), target.parent.resolve()):
+        raise InputError(f"{target} is the input itself or in its folder: name another output")
     begin = time.perf_counter()
     with open_bag(source, options.salvage) as bag:
         run = _Replay(bag, options)
@@ -76,12 +77,15 @@ class _Replay:
         unknown = sorted(set(options.topic_map) - set(bag.topics))
         if unknown:
             raise InputError(f"--topic-map names {unknown[0]}, but the topics are {', '.join(sorted(bag.topics))}")
+        if len(topics) < len(bag.topics):
+            new = next(name for name in topics if list(self._new_name.values()).count(name) > 1)
+            raise InputError(f"--topic-map gives two topics the name {new}: choose another name")
         self._static = self._static_records(topics)
-        frames = FrameTree()
-        for record in self._static:
-            frames.add(record.message)
-        self._graph = build_graph(topics, frames, self._info_frames(topics), self._settings(), self._factory)
-        self._routes = self._graph.routes()
+        infos = self._first_infos(topics)
+        self._graph = build_graph(topics, self._frames(), infos, self._settings(), self._factory)
+        self.warnings += self._graph.notes
+        held = {self._new_name[name]: detail.type for name, detail in bag.details.items() if detail.count}
+        self._routes = self._graph.routes(held)
         self._outputs = self._graph.outputs()
         for instance in self._graph.instances:
             for port in instance.component.outputs:
@@ -105,18 +109,25 @@ class _Replay:
         names = self._old_names(topics, lambda name: name == STATIC and topics[name] == TRANSFORMS)
         return list(self._bag.messages(names)) if names else []
 
-    def _info_frames(self, topics: Mapping[str, str]) -> dict[str, str]:
-        """Return the frame of the first message of every camera_info topic."""
-        infos = set(info_topics(topics))
-        found: dict[str, str] = {}
-        names = self._old_names(topics, infos.__contains__)
+    def _frames(self) -> FrameTree:
+        """The frames of the static transforms; those that cannot be used are warned of when they are replayed."""
+        frames = FrameTree()
+        for record in self._static:
+            with suppress(InputError):
+                frames.add(record.message)
+        return frames
+
+    def _first_infos(self, topics: Mapping[str, str]) -> dict[str, Any]:
+        """Return the first message of every camera_info topic that can be read."""
+        names = self._old_names(topics, set(info_topics(topics)).__contains__)
+        found: dict[str, Any] = {}
         for record in self._bag.messages(names) if names else ():
-            topic = self._new_name[record.topic]
-            if topic not in found:
-                found[topic] = record.message.header.frame_id
-            if len(found) == len(infos):
+            if record.topic not in found:
+                with suppress(InputError):
+                    found[record.topic] = record.message
+            if len(found) == len(names):
                 break
-        return found
+        return {self._new_name[old]: info for old, info in found.items()}
 
     def write_to(self, writer: BagWriter) -> None:
         """Drive every message through the graph and write what it makes."""
@@ -136,7 +147,7 @@ class _Replay:
                 self._emit(writer, log_time, instance, self._timed(instance, instance.component.flush))
 
     def _needed(self, topic: str) -> bool:
-        return topic != STATIC and (topic in self._routes or self._carried(topic))
+        return topic != STATIC and topic not in self._outputs and (topic in self._routes or self._carried(topic))
 
     def _carried(self, topic: str) -> bool:
         old = next((name for name, new in self._new_name.items() if new == topic), None)
@@ -166,7 +177,8 @@ class _Replay:
         try:
             message = record.message
         except InputError as error:
-            self.warnings.append(str(error))
+            if str(error) not in self.warnings:
+                self.warnings.append(str(error))
             return
         for instance, port in routes:
             self._emit(writer, log_time, instance, self._handle(instance, port, message))

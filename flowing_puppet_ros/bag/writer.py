@@ -56,6 +56,8 @@ class BagWriter:
                 target = self._folder / f"{path.name}_0.mcap"
             else:
                 path.parent.mkdir(parents=True, exist_ok=True)
+            if target.is_dir():
+                raise InputError(f"cannot write the bag {target}: it is a folder")
             self._partial = target.with_name(target.name + ".partial")
             self._stream: BinaryIO = self._partial.open("wb")
         except OSError as error:

@@ -47,3 +47,7 @@ def main(argv: list[str] | None = None) -> int:
         return 130
     except BrokenPipeError:
         return 1
+    except OSError as error:
+        # A disk that is full or gone, which may happen wherever something is read or written.
+        print(f"flowing-puppet {chosen.verb}: {error.filename or 'the work'} failed: {error.strerror}", file=sys.stderr)
+        return 1

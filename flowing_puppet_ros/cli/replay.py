@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Replay, report, and say where the results are."""
-    if arguments.rate < 0:
+    if not arguments.rate >= 0:
         raise InputError(f"--rate is {arguments.rate:g}: give 0 for full speed or a positive factor")
     if arguments.seed < 0:
         raise InputError(f"--seed is {arguments.seed}: give 0 or a positive number")
@@ -54,12 +54,15 @@ def run(arguments: argparse.Namespace) -> int:
     summary = replay(arguments.input, arguments.out, options)
     for warning in summary["warnings"]:
         print(f"flowing-puppet replay: {warning}", file=sys.stderr)
-    if arguments.report:
-        from flowing_puppet_ros.view.report import write_report
+    try:
+        if arguments.report:
+            from flowing_puppet_ros.view.report import write_report
 
-        write_report(arguments.input, arguments.out, arguments.report, summary)
-        summary["report"] = str(arguments.report)
-    print(json.dumps(summary) if arguments.json else _text(summary))
+            write_report(arguments.input, arguments.out, arguments.report, summary)
+            summary["report"] = str(arguments.report)
+    finally:
+        # The output bag is there, whatever becomes of the report.
+        print(json.dumps(summary) if arguments.json else _text(summary))
     return 0
 
 
@@ -85,7 +88,7 @@ def read_params(path: Path) -> dict[str, dict[str, Any]]:
         values = entry.get("ros__parameters") if isinstance(entry, dict) else None
         if not isinstance(values, dict):
             raise InputError(f"the parameter file {path} has no ros__parameters under {str(name)!r}")
-        settings = {key: value for key, value in values.items() if key not in _OF_NODES_ONLY}
+        settings = {str(key): value for key, value in values.items() if key not in _OF_NODES_ONLY}
         found[str(name).rpartition("/")[2]] = settings
     return found
 

@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, help="tracks.json to write")
     parser.add_argument("--init", help="keypoints.json, people of one or more frames; needed unless a bag has them")
     parser.add_argument("--topic", default="", help="image topic of a bag [the first camera with detections]")
+    parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated .mcap")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
     parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object")
@@ -49,52 +50,69 @@ def run(arguments: argparse.Namespace) -> int:
     model = DeformableStructures.load(arguments.model, arguments.parts)
     settings = TrackerSettings.from_arguments(arguments), FlowSettings.from_arguments(arguments)
     tracker = FlowingPuppetTracker(model, *settings)
-    detected, fps, count = _open(Path(arguments.input), arguments.init, arguments.topic)
+    detected, fps, count = _open(arguments)
     frames: list[dict[str, Any]] = []
     began, last = time.monotonic(), ""
     for frame, detections in tqdm(detected, total=count or None, unit="frame", disable=None):
-        result = tracker.step(frame.image, frame.stamp_ns, detections)
+        try:
+            result = tracker.step(frame.image, frame.stamp_ns, detections)
+        except InputError as error:
+            _warn(f"frame {frame.index}: {error}")
+            continue
         for warning in result.warnings:
             if warning != last:
-                print(f"flowing-puppet track: frame {frame.index}: {warning}", file=sys.stderr)
+                _warn(f"frame {frame.index}: {warning}")
             last = warning
         puppets = [puppet_entry(puppet, model.tree) for puppet in result.puppets]
         entry = {"index": frame.index, "stamp_ns": frame.stamp_ns, "puppets": puppets}
         frames.append(entry | ({"path": frame.path} if frame.path else {}))
+    if not frames:
+        raise InputError(f"{arguments.input} has no image that can be used")
     write_tracks(arguments.out, model.joint_names, fps, frames)
     _summarise(arguments, frames, time.monotonic() - began)
     return 0
 
 
-def _open(path: Path, init: str | None, topic: str) -> tuple[Iterable[Detected], float, int]:
+def _warn(sentence: str) -> None:
+    print(f"flowing-puppet track: {sentence}", file=sys.stderr)
+
+
+def _open(arguments: argparse.Namespace) -> tuple[Iterable[Detected], float, int]:
     """The input's frames with the keypoints given for them, its frame rate and its number of frames (0 unknown)."""
+    path, init, out = Path(arguments.input), arguments.init, Path(arguments.out)
+    if out.resolve() in {Path(name).resolve() for name in (path, init) if name}:
+        raise InputError(f"{out} is an input itself: name another output")
+    keypoints = None if init is None else read_keypoints(init)
     if is_bag(path):
-        return _open_bag(path, init, topic)
+        # Only bags need the bag stack, which takes a while to import.
+        from flowing_puppet_ros.bag.frames import open_bag_frames
+
+        bag = open_bag_frames(path, arguments.topic, arguments.salvage, _warn)
+        if keypoints is None and not bag.detections:
+            raise InputError(f"{path} has no detections beside {bag.topic}; give keypoints of one image with --init")
+        if keypoints is None:
+            return bag, bag.fps, bag.count
+        _check_reach(keypoints, bag.count, arguments)
+        return ((frame, keypoints.get(frame.index)) for frame, _ in bag), bag.fps, bag.count
     source = open_frames(path)
-    if init is None:
+    if keypoints is None:
         raise InputError(f"{path} says nothing about where people are; give keypoints of one frame with --init")
-    keypoints = read_keypoints(init)
-    if source.count and min(keypoints, default=0) >= source.count:
-        raise InputError(f"{init} has keypoints from frame {min(keypoints)} on, but {path} has {source.count} frames")
+    _check_reach(keypoints, source.count, arguments)
     return ((frame, keypoints.get(frame.index)) for frame in source), source.fps, source.count
+
+
+def _check_reach(keypoints: dict[int, list[Keypoints]], count: int, arguments: argparse.Namespace) -> None:
+    """Refuse keypoints that begin after the last of `count` frames (0 unknown)."""
+    first = min(index for index, people in keypoints.items() if people)
+    if count and first >= count:
+        raise InputError(
+            f"{arguments.init} has keypoints from frame {first} on, but {arguments.input} has {count} frames"
+        )
 
 
 def is_bag(path: Path) -> bool:
     """Whether `path` is a bag file or a folder that rosbag2 wrote."""
     return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
-
-
-def _open_bag(path: Path, init: str | None, topic: str) -> tuple[Iterable[Detected], float, int]:
-    # Only bags need the bag stack, which takes a while to import.
-    from flowing_puppet_ros.bag.frames import open_bag_frames
-
-    source = open_bag_frames(path, topic)
-    if init is None:
-        if not source.detections:
-            raise InputError(f"{path} has no detections beside {source.topic}; give keypoints of one image with --init")
-        return source, source.fps, source.count
-    keypoints = read_keypoints(init)
-    return ((frame, keypoints.get(frame.index)) for frame, _ in source), source.fps, source.count
 
 
 def _summarise(arguments: argparse.Namespace, frames: list[dict[str, Any]], seconds: float) -> None:

@@ -8,6 +8,7 @@ PuppetArrays called `detections` come from a detector, all others from the track
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -87,7 +88,9 @@ def read_recording(given: Bag, made: Bag) -> Recording:
     for bag, roles in ((made, carried - {""}), (given, missing)):
         wanted = [name for name, kind in bag.topics.items() if _role(name, kind) in roles]
         for record in bag.messages(wanted):
-            _take(recording, frames, record.topic, record.type, record.message)
+            # What the replay could not use is in its warnings; the rest is worth a report.
+            with suppress(InputError):
+                _take(recording, frames, record.topic, record.type, record.message)
     for name, kind in made.topics.items():
         leaf = name.rpartition("/")[2]
         if kind == CLOUD and leaf in ("hull", "points", "body_vertices"):
@@ -131,8 +134,8 @@ def _find_images(recording: Recording, given: Bag) -> None:
     topics = [name for name, topic in given.details.items() if topic.type in IMAGE and topic.count]
     by_frame: dict[str, str] = {}
     for topic in topics:
-        message = next(given.messages([topic])).message
-        by_frame.setdefault(message.header.frame_id, topic)
+        with suppress(InputError):
+            by_frame.setdefault(next(given.messages([topic])).message.header.frame_id, topic)
     for camera in recording.cameras.values():
         same = [topic for topic in topics if namespace(topic) == camera.namespace]
         camera.image_topic = min(same) if same else by_frame.get(camera.frame_id, "")
@@ -144,17 +147,16 @@ def _place_cameras(recording: Recording, frames: FrameTree) -> None:
         if record.info is None:
             continue
         frame = record.info.header.frame_id
-        pose = frames.pose(recording.body_frame or frames.root(frame), frame)
-        if pose is None:
-            continue
-        translation, rotation = pose
         info = record.info
-        try:
+        # Without a calibration or a place everything but the re-projection can still be shown.
+        with suppress(InputError):
+            pose = frames.pose(recording.body_frame or frames.root(frame), frame)
+            if pose is None:
+                continue
+            translation, rotation = pose
             record.camera = Camera.from_info(
                 info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model
             )
-        except InputError:
-            record.camera = None  # uncalibrated: everything but the re-projection can still be shown
 
 
 def puppet_joints(person: Any) -> Joints:

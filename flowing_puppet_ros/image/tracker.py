@@ -189,7 +189,10 @@ class FlowingPuppetTracker:
 
     def _start(self, detection: Detection, warnings: list[str]) -> None:
         joints, confidence = detection
-        if np.count_nonzero(np.isfinite(joints).all(axis=1)) < self.settings.least_joints:
+        known = np.count_nonzero(np.isfinite(joints).all(axis=1))
+        if known < self.settings.least_joints:
+            least = self.settings.least_joints
+            warnings.append(f"a detected person is left out: {known} joints can be used, least_joints is {least}")
             return
         if len(self.people) >= self.settings.most_people:
             warnings.append(f"more than {self.settings.most_people} people: the others are left out")

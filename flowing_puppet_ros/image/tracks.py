@@ -22,6 +22,7 @@ from flowing_puppet_ros.image.tracker import TrackedPuppet
 from flowing_puppet_ros.model.tree import PartTree
 
 DECIMALS = 2  # of a pixel
+MOST_DIGITS = 18  # of a frame's index
 
 
 def read_keypoints(path: str | Path) -> dict[int, list[Keypoints]]:
@@ -30,7 +31,7 @@ def read_keypoints(path: str | Path) -> dict[int, list[Keypoints]]:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is no JSON file: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("frames"), dict):
         raise InputError(f'{path} needs "joint_names" and "frames": {{"0": [[[x, y, confidence], ...], ...]}}')
@@ -41,9 +42,11 @@ def read_keypoints(path: str | Path) -> dict[int, list[Keypoints]]:
         raise InputError(f"{path} has no joint name that is known here; {names[:3]} are not")
     frames: dict[int, list[Keypoints]] = {}
     for key, people in data["frames"].items():
-        if not key.isdecimal() or not isinstance(people, list):
-            raise InputError(f"{path}: frame {key!r} must be an index with a list of people")
+        if not key.isdecimal() or len(key) > MOST_DIGITS or not isinstance(people, list):
+            raise InputError(f"{path}: frame {key[:MOST_DIGITS]!r} must be an index with a list of people")
         frames[int(key)] = [_person(tuple(names), rows, f"{path}, frame {key}") for rows in people]
+    if not any(frames.values()):
+        raise InputError(f"{path} has no person in any frame")
     return frames
 
 

@@ -15,15 +15,17 @@ from flowing_puppet_ros.stream.messages import MessageFactory
 # sensor_msgs/PointField datatype -> numpy
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _FLOAT32 = 7
+_FARTHEST = 1000.0
+"""Metres from the median point; no sensor of people reaches beyond, drivers mark unknown points with such numbers."""
 _NORMALS = ("normal_x", "normal_y", "normal_z")
 
 
 def decode_cloud(message: Any) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
     """Return the finite points (N,3) in metres and, when the cloud has normal_x/y/z, their normals (N,3).
 
-    An organised cloud is flattened and points with a NaN or infinite coordinate are left out, whatever `is_dense`
-    says. A normal that is not finite becomes zero. InputError when there are no x, y, z fields or the data do not
-    fit the sizes the message names.
+    An organised cloud is flattened and points with a NaN, infinite or absurd coordinate are left out, whatever
+    `is_dense` says. A normal that is not finite becomes zero. InputError when there are no x, y, z fields or the data
+    do not fit the sizes the message names.
     """
     types = {field.name: field for field in message.fields}
     missing = [name for name in "xyz" if name not in types]
@@ -32,6 +34,8 @@ def decode_cloud(message: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]
     records = _records(message, types)
     points = np.stack([records[name].astype(float) for name in "xyz"], axis=1)
     good = np.isfinite(points).all(axis=1)
+    if good.any():
+        good[good] = np.abs(points[good] - np.median(points[good], axis=0)).max(axis=1) < _FARTHEST
     if not all(name in types for name in _NORMALS):
         return points[good], None
     normals = np.stack([records[name].astype(float) for name in _NORMALS], axis=1)[good]

@@ -8,7 +8,7 @@ messages of either kind.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -116,18 +116,6 @@ def make_transform(
     )
 
 
-def transforms(message: Any) -> Iterable[tuple[str, str, NDArray[np.float64], NDArray[np.float64]]]:
-    """Yield (parent, child, position (3,), rotation (3,3)) of the poses of the children in a TFMessage."""
-    for item in message.transforms:
-        t, q = item.transform.translation, item.transform.rotation
-        yield (
-            item.header.frame_id.lstrip("/"),
-            item.child_frame_id.lstrip("/"),
-            np.array([t.x, t.y, t.z], float),
-            rotation_matrix((q.x, q.y, q.z, q.w)),
-        )
-
-
 class FrameTree:
     """The static frames heard on `/tf_static`."""
 
@@ -135,9 +123,20 @@ class FrameTree:
         self._parent: dict[str, tuple[str, NDArray[np.float64], NDArray[np.float64]]] = {}
 
     def add(self, message: Any) -> None:
-        """Take the transforms of a TFMessage; a later one replaces an earlier one of the same child."""
-        for parent, child, position, rotation in transforms(message):
-            self._parent[child] = (parent, position, rotation)
+        """Take the transforms of a TFMessage; a later one replaces an earlier one of the same child.
+
+        InputError names the first that cannot be used; the others are taken.
+        """
+        unusable = []
+        for item in message.transforms:
+            parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
+            t, q = item.transform.translation, item.transform.rotation
+            try:
+                self._parent[child] = (parent, np.array([t.x, t.y, t.z], float), rotation_matrix((q.x, q.y, q.z, q.w)))
+            except InputError as error:
+                unusable.append(f"the transform from {parent!r} to {child!r} cannot be used: {error}")
+        if unusable:
+            raise InputError(unusable[0])
 
     def root(self, frame: str) -> str:
         """Return the topmost known ancestor of `frame` (itself when it has none)."""

@@ -140,7 +140,10 @@ class VisualHullComponent(Component):
                 raise InputError(f"/tf_static does not connect the frame {frame!r} of {name} with {self._frame!r}")
             translation, rotation = world
             size = info.width, info.height
-            camera = Camera.from_info(info.k, info.d, *size, rotation, translation, info.distortion_model)
+            try:
+                camera = Camera.from_info(info.k, info.d, *size, rotation, translation, info.distortion_model)
+            except InputError as error:
+                raise InputError(f"{name}: {error}") from error
             self._builder.set_camera(name, camera)
         return self._builder.cameras
 

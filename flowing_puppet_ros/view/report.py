@@ -42,6 +42,7 @@ def write_report(
     """
     data = gather(input_bag, output_bag, summary)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(report_page(data), "utf8")
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror}; choose another place") from error

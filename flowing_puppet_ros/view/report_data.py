@@ -207,7 +207,7 @@ def _add_track(data: ReportData, camera: CameraRecord, given: Bag) -> None:
             data.strip.append((stamp, track_shot(image, shown[stamp], people_box(shown.values(), image.shape))))
     for stamp in moving:
         pair = [picture_of(images, camera.image_topic, s) for s in (stamp, following[stamp])]
-        if pair[0] is not None and pair[1] is not None:
+        if pair[0] is not None and pair[1] is not None and pair[0].shape == pair[1].shape:
             box = people_box(shown.values(), pair[0].shape)
             data.flow.append(flow_shot(stamp, pair[0], pair[1], shown[stamp], box))
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 
 from flowing_puppet_ros.bag.reader import Bag
 from flowing_puppet_ros.body.camera import Camera
-from flowing_puppet_ros.errors import PuppetError
+from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.evaluate.from_bag import CameraRecord, body_joints, puppet_joints
 from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.flow.puppet_flow import explained_fraction, motion_field, part_motions
@@ -58,13 +59,14 @@ class BodyShot:
 
 
 def fetch(bag: Bag, wanted: Mapping[str, Iterable[int]]) -> dict[tuple[str, int], Any]:
-    """Messages {(topic, stamp)} of the wanted stamps (ns) of each topic; those that are not there are left out."""
+    """Messages {(topic, stamp)} of the wanted stamps (ns) of each topic; missing and damaged ones are left out."""
     stamps = {topic: set(values) for topic, values in wanted.items() if topic}
     found: dict[tuple[str, int], Any] = {}
     for record in bag.messages([topic for topic in stamps if topic in bag.topics]):
-        message = record.message
-        if stamp_ns(message) in stamps[record.topic]:
-            found[record.topic, stamp_ns(message)] = message
+        with suppress(InputError):
+            message = record.message
+            if stamp_ns(message) in stamps[record.topic]:
+                found[record.topic, stamp_ns(message)] = message
     return found
 
 

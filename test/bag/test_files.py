@@ -138,8 +138,8 @@ def test_next_to_nothing_left_is_no_traceback(bag: Any, tmp_path: Path, keep: An
     cut.write_bytes(bag.read_bytes()[:keep])
     with pytest.raises(InputError):
         open_bag(cut)
-    if keep > 8:
-        assert summary(cut, salvage=True) == []
+    with pytest.raises(InputError):
+        open_bag(cut, salvage=True)
 
 
 def database(path: Path) -> None:

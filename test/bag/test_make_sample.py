@@ -17,7 +17,7 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import PuppetError
 from flowing_puppet_ros.stream.images import decode_image
-from flowing_puppet_ros.stream.messages import transforms
+from flowing_puppet_ros.stream.messages import FrameTree
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 
@@ -94,10 +94,13 @@ def test_messages_are_in_the_pixels_and_frames_of_the_videos(recipe: ModuleType,
             maker.write_image(name, 50, np.full((1920, c["video_size"][0], 3), 90, np.uint8))
     with open_bag(tmp_path / "bag.mcap") as bag:
         found: dict[str, Any] = {record.topic: record.message for record in bag.messages()}
-    poses = {child: (position, rotation) for _, child, position, rotation in transforms(found["/tf_static"])}
+    frames = FrameTree()
+    frames.add(found["/tf_static"])
     for name in calibration:
         info = found[f"/{name}/camera_info"]
-        position, rotation = poses[info.header.frame_id]
+        placed = frames.pose(info.header.frame_id, frames.root(info.header.frame_id))
+        assert placed is not None
+        position, rotation = placed
         local = rotation.T @ (point - position)
         pixel, _ = cv2.projectPoints(local, np.zeros(3), np.zeros(3), info.k.reshape(3, 3), info.d)
         np.testing.assert_allclose(pixel.ravel(), seen[name], atol=1e-3)

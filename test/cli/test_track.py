@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from flowing_puppet_ros.bag.reader import open_bag
+from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.model.ds import DeformableStructures
 
@@ -149,3 +151,61 @@ def test_bags_without_the_topic_or_broken_are_one_sentence(tmp_path: Path, capsy
         assert main(["track", *arguments, "--out", str(tmp_path / "o.json")]) == 2
         (line,) = capsys.readouterr().err.strip().splitlines()
         assert says in line
+
+
+@pytest.mark.parametrize(
+    ("frames_of", "sentence"),
+    [
+        ({}, "has no person in any frame"),
+        ({"0": []}, "has no person in any frame"),
+        ({"9" * 5000: [start()]}, "frame '999999999999999999' must be an index"),
+        ({"6": [start()]}, "has keypoints from frame 6 on"),
+    ],
+)
+def test_keypoints_that_reach_no_frame_are_refused(
+    frames_of: Any, sentence: str, frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    init = write_keypoints(tmp_path / "k.json", frames_of)
+    assert main(["track", str(frames), "--init", str(init), "--out", str(tmp_path / "t.json")]) == 2
+    assert sentence in capsys.readouterr().err
+
+
+def test_inputs_are_never_overwritten(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    init = write_keypoints(tmp_path / "k.json", {"0": [start()]})
+    before = init.read_bytes()
+    assert main(["track", str(frames), "--init", str(init), "--out", str(init)]) == 2
+    assert "is an input itself" in capsys.readouterr().err
+    assert init.read_bytes() == before
+
+
+def test_images_that_cannot_be_used_are_named_and_left_out(
+    frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(frames / "3.png"), np.zeros((1, 1, 3), np.uint8))
+    init, out = write_keypoints(tmp_path / "k.json", {"0": [start()]}), tmp_path / "t.json"
+    assert main(["track", str(frames), "--init", str(init), "--out", str(out)]) == 0
+    assert "frame 3: an image must be at least 16 px on each side" in capsys.readouterr().err
+    assert [frame["index"] for frame in json.loads(out.read_text())["frames"]] == [0, 1, 2, 4, 5]
+
+
+def test_a_bag_with_damaged_messages_or_without_its_end_is_tracked(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ("/cam1/image/compressed", "/cam1/detections")
+    seen = 0
+    with open_bag(GOLDEN) as bag, BagWriter(tmp_path / "whole.mcap") as writer:
+        for name in names:
+            writer.add_topic(name, bag.topics[name])
+        for record in bag.messages(names):
+            seen += record.topic == names[0]
+            spoiled = record.topic == names[0] and seen == 3
+            writer.write_raw(record.topic, record.log_time, b"\0\1\0\0" if spoiled else record.raw)
+    cut, out = tmp_path / "cut.mcap", tmp_path / "t.json"
+    cut.write_bytes((tmp_path / "whole.mcap").read_bytes()[:-40])
+    assert main(["track", str(cut), "--out", str(out)]) == 2
+    assert "add --salvage" in capsys.readouterr().err
+    assert main(["track", str(cut), "--out", str(out), "--salvage"]) == 0
+    assert "frame 2: a message on /cam1/image/compressed is not" in capsys.readouterr().err
+    tracks = json.loads(out.read_text())
+    assert [frame["index"] for frame in tracks["frames"]] == [0, 1, 3, 4, 5, 6, 7]
+    assert all(frame["puppets"] for frame in tracks["frames"])

@@ -91,3 +91,12 @@ def test_what_is_no_cloud_is_refused() -> None:
     message.fields = message.fields[:2]
     with pytest.raises(InputError, match="fields x, y has no z"):
         decode_cloud(message)
+
+
+def test_points_that_no_sensor_reaches_are_left_out_wherever_the_frame_is() -> None:
+    person = np.random.default_rng(0).normal((2000, 5000, 3), 0.5, (200, 3))
+    far = np.array([[1e30, 0, 0], [2000, -1e9, 3], [1e10, 1e10, 1e10]])
+    message = make_cloud(FACTORY, FACTORY.make("std_msgs/msg/Header"), np.vstack([far, person]), np.ones((203, 3)))
+    points, normals = decode_cloud(message)
+    np.testing.assert_allclose(points, person, atol=1e-3)
+    assert normals is not None and normals.shape == (200, 3)

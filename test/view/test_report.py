@@ -179,7 +179,7 @@ def test_command_line_says_what_is_wrong(replay: Replay, tmp_path: Path, capsys:
     for arguments in (
         [str(tmp_path / "missing.mcap"), "--input", str(given)],
         [str(noise), "--input", str(given)],
-        [str(made), "--input", str(given), "--out", str(tmp_path / "no" / "folder.html")],
+        [str(made), "--input", str(given), "--out", str(noise / "folder.html")],
     ):
         assert main(["report", *arguments]) == 2
         error = capsys.readouterr().err
