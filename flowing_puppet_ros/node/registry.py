@@ -29,7 +29,7 @@ COMPONENTS: dict[str, type[Component]] = {
 class NodeSettings(Settings):
     """Settings that every node has beside those of its component."""
 
-    queue: int = setting(10, "messages of one input that may wait; the oldest is dropped for a newer", low=1, high=1000)
+    queue: int = setting(4, "messages of one input that may wait; the oldest is dropped for a newer", low=1, high=1000)
 
 
 def parameter_yaml(name: str) -> str:

@@ -50,9 +50,8 @@ def arguments(settings: dict[str, Any]) -> list[str]:
 def kept(*topics: str) -> list[str]:
     """Return ROS arguments under which no message of these sensor topics is lost."""
     policies = {"reliability": "reliable", "depth": 50}
-    return arguments(
-        {f"qos_overrides.{t}.subscription.{name}": value for t in topics for name, value in policies.items()}
-    )
+    overrides = {f"qos_overrides.{t}.subscription.{name}": value for t in topics for name, value in policies.items()}
+    return arguments({"queue": 50, **overrides})
 
 
 def start_all(start: Callable[..., Path]) -> None:

@@ -61,7 +61,7 @@ def connected(peer: Any, kind: Any, topic: str) -> Any:
 def kept(topic: str) -> list[str]:
     """Return ROS arguments under which no message of a sensor topic is lost."""
     prefix = f"qos_overrides.{topic}.subscription"
-    return ["-p", f"{prefix}.reliability:=reliable", "-p", f"{prefix}.depth:=50"]
+    return ["-p", f"{prefix}.reliability:=reliable", "-p", f"{prefix}.depth:=50", "-p", "queue:=50"]
 
 
 def test_flow_survives_bad_images_and_starts_anew_on_request(start: Callable[..., Path], peer: Any) -> None:
@@ -207,4 +207,4 @@ def test_help_lists_the_parameters() -> None:
     command = [str(Path(sys.executable).with_name("puppet_tracker")), "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert "overlay_side [960]" in shown
-    assert "queue [10]" in shown
+    assert "queue [4]" in shown
