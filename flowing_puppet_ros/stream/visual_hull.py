@@ -66,7 +66,7 @@ class VisualHullComponent(Component):
         self._sets = Pairing(self._names, round(settings.slop * 1e9))
         self._last_stamp: int | None = None
         self._seen = 0
-        self._frame = settings.frame
+        self._frame = ""
 
     def reset(self) -> None:
         """Forget backgrounds and what waits; calibrations and frames stay."""
@@ -134,7 +134,9 @@ class VisualHullComponent(Component):
             if info is None:
                 raise InputError(f"no camera_info came yet on {name}/camera_info")
             frame = info.header.frame_id
-            self._frame = self._frame or self._frames.root(frame.lstrip("/"))
+            if name == self._names[0]:
+                # Looked up for every set: /tf_static may come after the first images.
+                self._frame = self._settings.frame or self._frames.root(frame.lstrip("/"))
             world = self._frames.pose(self._frame, frame)
             if world is None:
                 raise InputError(f"/tf_static does not connect the frame {frame!r} of {name} with {self._frame!r}")

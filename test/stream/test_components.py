@@ -237,3 +237,11 @@ def test_a_hull_says_what_it_misses(recorded: dict[str, list[Any]], skip: tuple[
     (warning,) = component.drain_warnings()
     assert warning.startswith(sentence)
     assert component.counters["unusable"] == 2
+
+
+def test_frames_that_come_after_the_first_images_place_the_hull(recorded: dict[str, list[Any]]) -> None:
+    component = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2", every=1), FACTORY)
+    stream = hull_stream(recorded)
+    assert drive(component, [item for item in stream if item[0] != "/tf_static"]) == []
+    component.reset()
+    assert {message.header.frame_id for _, message in drive(component, stream)} == {"world"}
