@@ -54,7 +54,12 @@ def decode_image(message: Any) -> NDArray[np.uint8]:
         pixels = (pixels >> 8).astype(np.uint8)
     if conversion is None:
         return np.ascontiguousarray(pixels)
-    return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
+    try:
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
+    except cv2.error as error:  # packed formats need an even width, Bayer patterns two rows
+        raise InputError(
+            f"an image of {message.width}x{message.height} is no whole {message.encoding} image"
+        ) from error
 
 
 def _decode_compressed(message: Any) -> NDArray[np.uint8]:

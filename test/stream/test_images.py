@@ -101,6 +101,12 @@ def test_broken_compressed_images_are_refused(data: Any) -> None:
         images.decode_image(broken)
 
 
+def test_half_a_colour_pair_is_refused() -> None:
+    odd = message(np.zeros((12, 15, 2), np.uint8), "yuv422_yuy2")
+    with pytest.raises(InputError, match="15x12 is no whole yuv422_yuy2 image"):
+        images.decode_image(odd)
+
+
 def test_unknown_encodings_and_wrong_sizes_are_refused_by_name() -> None:
     with pytest.raises(InputError, match="the image encoding 'pixels9' is not one of rgb8"):
         images.decode_image(message(ramp(), "pixels9"))
