@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+
+import numpy as np
 
 from flowing_puppet_ros.cli import sample_ds, sample_sp
+from flowing_puppet_ros.errors import InputError
 
 MODELS = {"ds": sample_ds, "sp": sample_sp}
 
@@ -14,9 +18,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add one sub-command a model."""
     models = parser.add_subparsers(dest="model", required=True, metavar="ds|sp")
     for name, module in MODELS.items():
-        module.add_arguments(models.add_parser(name, description=module.__doc__))
+        flags = models.add_parser(name, description=module.__doc__)
+        flags.add_argument("--gender", default="neutral", help="neutral, female or male [%(default)s]")
+        flags.add_argument("--count", type=int, default=8, help="samples [%(default)s]")
+        flags.add_argument("--seed", type=int, default=0, help="seed of the samples [%(default)s]")
+        flags.add_argument("--out", type=Path, required=True, help=f"folder for {module.FILES}")
+        module.add_arguments(flags)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw from the chosen model and return the exit status."""
-    return MODELS[arguments.model].run(arguments)
+    """Draw from the chosen model, print the paths of what was written and return the exit status."""
+    if arguments.count < 1:
+        raise InputError(f"--count is {arguments.count}; draw at least 1")
+    if arguments.seed < 0:
+        raise InputError(f"--seed is {arguments.seed}; it must be 0 or more")
+    try:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {arguments.out} cannot be made: {error.strerror}; choose another folder") from error
+    for path in MODELS[arguments.model].draw(arguments, np.random.default_rng(arguments.seed)):
+        print(path)
+    return 0
