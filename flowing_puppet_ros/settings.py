@@ -14,6 +14,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Self, get_type_hints
 
 from flowing_puppet_ros.errors import InputError
@@ -122,3 +123,11 @@ class Settings:
         """Make an instance from the flags that `add_arguments` added; flags that were skipped keep their defaults."""
         names = {info.name for info in cls.describe()}
         return cls(**{name: value for name, value in vars(arguments).items() if name in names})
+
+
+def make_out_folder(path: Path) -> None:
+    """Make the folder that an `--out` flag names, with its parents; InputError when it cannot be made."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out {path} cannot be made: {error.strerror}; choose another folder") from error

@@ -87,6 +87,8 @@ class _Replay:
         held = {self._new_name[name]: detail.type for name, detail in bag.details.items() if detail.count}
         self._routes = self._graph.routes(held)
         self._outputs = self._graph.outputs()
+        carried = {self._new_name[name] for name, kind in bag.topics.items() if kind in _CARRIED}
+        self._carried = carried - set(self._outputs)
         for instance in self._graph.instances:
             for port in instance.component.outputs:
                 if port.lazy:
@@ -147,16 +149,12 @@ class _Replay:
                 self._emit(writer, log_time, instance, self._timed(instance, instance.component.flush))
 
     def _needed(self, topic: str) -> bool:
-        return topic != STATIC and topic not in self._outputs and (topic in self._routes or self._carried(topic))
-
-    def _carried(self, topic: str) -> bool:
-        old = next((name for name, new in self._new_name.items() if new == topic), None)
-        return old is not None and self._bag.topics[old] in _CARRIED and topic not in self._outputs
+        return topic != STATIC and topic not in self._outputs and (topic in self._routes or topic in self._carried)
 
     def _announce(self, writer: BagWriter) -> None:
         """Name the output's topics in an order that does not depend on what comes first."""
         for name, detail in self._bag.details.items():
-            if self._carried(self._new_name[name]):
+            if self._new_name[name] in self._carried:
                 qos = "latched" if self._new_name[name] == STATIC else detail.qos
                 writer.add_topic(self._new_name[name], detail.type, qos)
         for topic, port in self._outputs.items():
@@ -169,7 +167,7 @@ class _Replay:
 
     def _take(self, writer: BagWriter, record: Record, log_time: int) -> None:
         topic = self._new_name[record.topic]
-        if self._carried(topic):
+        if topic in self._carried:
             writer.write_raw(topic, log_time, record.raw)
         routes = self._routes.get(topic, [])
         if not routes:

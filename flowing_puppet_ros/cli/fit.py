@@ -18,6 +18,7 @@ from flowing_puppet_ros.body.frames import UNITS, UP_NAMES, Frame, guess_scale, 
 from flowing_puppet_ros.body.io import Scan, read_scan, storable, write_ply
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.settings import make_out_folder
 from flowing_puppet_ros.view.palette import part_colours
 
 WRITTEN_SHAPES = 4
@@ -53,10 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     double = next((stem for stem, count in stems.items() if count > 1), None)
     if double is not None:
         raise InputError(f"two inputs are called {double!r} and would overwrite each other's result; fit them apart")
-    try:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {arguments.out} cannot be made: {error.strerror}") from error
+    make_out_folder(arguments.out)
     fitter = BodyFitter(StitchedPuppet.load(arguments.model), FitterSettings.from_arguments(arguments))
     status = 0
     for path in arguments.inputs:

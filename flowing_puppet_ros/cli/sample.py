@@ -10,6 +10,7 @@ import numpy as np
 
 from flowing_puppet_ros.cli import sample_ds, sample_sp
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.settings import make_out_folder
 
 MODELS = {"ds": sample_ds, "sp": sample_sp}
 
@@ -32,10 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--count is {arguments.count}; draw at least 1")
     if arguments.seed < 0:
         raise InputError(f"--seed is {arguments.seed}; it must be 0 or more")
-    try:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {arguments.out} cannot be made: {error.strerror}; choose another folder") from error
+    make_out_folder(arguments.out)
     for path in MODELS[arguments.model].draw(arguments, np.random.default_rng(arguments.seed)):
         print(path)
     return 0

@@ -16,6 +16,7 @@ from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_joints import JOINT_NAMES, PART_JOINTS
 from flowing_puppet_ros.model.ds_shape import PairLayout, PartShape, rotate
 from flowing_puppet_ros.model.gaussian import Gaussian
+from flowing_puppet_ros.settings import make_out_folder
 
 Array = np.ndarray[Any, Any]
 
@@ -104,10 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--poses is {arguments.poses}; a model needs at least {2 * COMPONENTS}")
     if arguments.seed < 0:
         raise InputError(f"--seed is {arguments.seed}; it must be 0 or more")
-    try:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {arguments.out} cannot be made: {error.strerror}; choose another folder") from error
+    make_out_folder(arguments.out)
     rng = np.random.default_rng(arguments.seed)
     training = make_training_set(arguments.gender, arguments.parts, arguments.poses, rng, arguments.mocap)
     model = fit(arguments.gender, training)

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.learn.anny import GENDERS
 from flowing_puppet_ros.learn.sp import Learned, LearnSettings, learn
 from flowing_puppet_ros.learn.sp_pose import TREE
+from flowing_puppet_ros.settings import make_out_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,10 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Learn one model, write it with its card and print its path; progress on stderr."""
     settings = LearnSettings.from_arguments(arguments)
-    try:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--out {arguments.out} cannot be made: {error.strerror}; choose another folder") from error
+    make_out_folder(arguments.out)
     # Sums of several BLAS threads depend on how many there are; with one the weights are the same everywhere.
     with threadpool_limits(1):
         learned = learn(arguments.gender, settings, arguments.mocap, lambda step: print(step, file=sys.stderr))
