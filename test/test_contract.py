@@ -31,9 +31,10 @@ MAY_IMPORT = {
     "bag": BELOW_STREAM | {"stream", "view"},
     "node": BELOW_STREAM | {"stream", "view"},
     "view": BELOW_STREAM | {"evaluate", "stream", "bag"},
-    "evaluate": BELOW_STREAM | {"stream", "bag"},
     "learn": BELOW_STREAM,
-    "cli": BELOW_STREAM | {"stream", "bag", "view", "evaluate", "learn"},
+    "evaluate": BELOW_STREAM | {"stream", "bag", "learn"},
+    "annotate": BELOW_STREAM,
+    "cli": BELOW_STREAM | {"stream", "bag", "view", "evaluate", "learn", "annotate"},
 }
 
 

@@ -13,11 +13,15 @@ from flowing_puppet_ros.errors import PuppetError
 VERBS = {
     "fit": "fit the 3D Stitched Puppet to meshes and clouds",
     "correspond": "map scan to scan through two fits",
+    "pose": "find people's pose in single images",
     "track": "track people in a video, a frame folder or a bag with flowing puppets",
     "replay": "run the nodes' algorithms over a bag, losslessly and reproducibly",
     "report": "make the HTML report of a replayed bag",
-    "learn": "learn the 2D and 3D body models",
+    "annotate": "pose puppets on images in the browser",
+    "learn": "learn the body models, the likelihood and the detector",
     "sample": "draw samples of the learned body models",
+    "evaluate": "measure poses and bodies against the truth",
+    "bench": "measure speed as ratios taken in one run",
 }
 
 
