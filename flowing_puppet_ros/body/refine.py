@@ -8,6 +8,7 @@ narrows from step to step, so that far limbs are first drawn in and the surface 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,9 @@ MAX_COEFFICIENT = 3.5
 MAX_TURN = 0.5
 # Joints are believed this many times more widely than closest points are.
 JOINT_WIDTH = 2.5
+
+# What else draws the body's vertices (V, 3), given the width in metres of the robust kernel at this step.
+SurfaceTerm = Callable[[np.ndarray, float], Quadratic]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +69,15 @@ class Refiner:
         for row, (index, weight) in enumerate(zip(model.joint_index, model.joint_weight, strict=True)):
             np.add.at(self._regressor[row], index, weight)
 
-    def run(self, state: BodyState, cloud: Cloud | None, targets: JointTargets, weights: RefineWeights) -> BodyState:
-        """Refine a body; without a cloud only believed joints, stitching and priors count.
+    def run(
+        self,
+        state: BodyState,
+        cloud: Cloud | None,
+        targets: JointTargets,
+        weights: RefineWeights,
+        terms: Sequence[SurfaceTerm] = (),
+    ) -> BodyState:
+        """Refine a body; without a cloud and `terms` only believed joints, stitching and priors count.
 
         All parts of the result have the same shape coefficients; it starts from their mean.
         """
@@ -76,14 +87,22 @@ class Refiner:
             state.pose.copy(),
             np.tile(state.shape.mean(axis=0), (len(state.shape), 1)),
         )
+        drawn = list(terms)
+        if cloud is not None:
+            drawn.append(lambda vertices, sigma: attract(vertices, self._model.faces, cloud, sigma))
         ratio = weights.sigma_end / weights.sigma_start
         for step in range(weights.iterations):
             sigma = weights.sigma_start * ratio ** (step / max(weights.iterations - 1, 1))
-            state = self._step(state, cloud, targets, weights, sigma)
+            state = self._step(state, drawn, targets, weights, sigma)
         return state
 
     def _step(
-        self, state: BodyState, cloud: Cloud | None, targets: JointTargets, weights: RefineWeights, sigma: float
+        self,
+        state: BodyState,
+        terms: Sequence[SurfaceTerm],
+        targets: JointTargets,
+        weights: RefineWeights,
+        sigma: float,
     ) -> BodyState:
         local = [
             points.local(state.pose[part, None, : points.pose_basis.shape[2]], state.shape[part, None])[0]
@@ -97,8 +116,8 @@ class Refiner:
         size = self._shape_columns[-1] + 1
         hessian, gradient = np.zeros((size, size)), np.zeros(size)
         vertices = self._merge(world)
-        if cloud is not None:
-            self._add_quadratic(attract(vertices, self._model.faces, cloud, sigma), jacobians, hessian, gradient)
+        for term in terms:
+            self._add_quadratic(term(vertices, sigma), jacobians, hessian, gradient)
         self._add_joints(targets, JOINT_WIDTH * sigma, vertices, jacobians, hessian, gradient)
         self._add_stitching(weights.stitch, world, jacobians, hessian, gradient)
         self._add_priors(state, weights, hessian, gradient)

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint Gauss-Newton over all parts: what else may draw the surface."""
+
+import numpy as np
+
+from flowing_puppet_ros.body.correspondence import Quadratic
+from flowing_puppet_ros.body.energy import JointTargets
+from flowing_puppet_ros.body.refine import Refiner, RefineWeights
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+
+def test_a_further_term_draws_the_body_where_it_says() -> None:
+    model = StitchedPuppet.load("neutral")
+    start = model.rest_state()
+    move = np.array([0.3, -0.2, 0.1])
+    goal, count = model.vertices(start) + move, len(model.part_of_vertex)
+    widths = []
+
+    def springs(vertices: np.ndarray, sigma: float) -> Quadratic:
+        widths.append(sigma)
+        return Quadratic(np.tile(np.eye(3) / count, (count, 1, 1)), (vertices - goal) / count)
+
+    weights = RefineWeights(sigma_start=0.2, sigma_end=0.05, iterations=5)
+    body = Refiner(model).run(start, None, JointTargets.none(model), weights, [springs])
+    np.testing.assert_allclose(model.vertices(body), goal, atol=2e-3)
+    np.testing.assert_allclose(widths, 0.2 * 0.25 ** (np.arange(5) / 4))
