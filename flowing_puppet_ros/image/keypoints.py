@@ -43,7 +43,7 @@ PAIRED = {
 }
 # Puppets that people posed on 31 annotated JHMDB clips, against a detector's joints on the same images:
 TRUNK_LOWERED = 0.06  # shoulders and hips lie lower, share of the trunk's length
-SHOULDER_INWARDS = 0.04  # shoulders lie further in, share of their distance
+SHOULDER_OUTWARDS = 0.04  # each shoulder lies further out, share of their distance
 EARS_HEIGHT = 0.54  # of the head's centre on the way from the neck to the top of the head, in the learned model
 FARTHEST = 1e5  # px; no camera sees a keypoint beyond
 
@@ -167,8 +167,8 @@ def _place_trunk(found: dict[str, Point], mean: dict[str, Floats]) -> None:
         left, right, left_hip, right_hip = (found[name] for name in sides)
         shoulders, pelvis = _mix(left, right, 0.5), _mix(left_hip, right_hip, 0.5)
         down = TRUNK_LOWERED * (pelvis[0] - shoulders[0]), TRUNK_LOWERED * (pelvis[1] - shoulders[1])
-        found["left_shoulder"] = _mix(left, right, SHOULDER_INWARDS)
-        found["right_shoulder"] = _mix(right, left, SHOULDER_INWARDS)
+        found["left_shoulder"] = _mix(left, right, -SHOULDER_OUTWARDS)
+        found["right_shoulder"] = _mix(right, left, -SHOULDER_OUTWARDS)
         shoulder_y, hip_y = ((mean["left" + end][1] + mean["right" + end][1]) / 2 for end in ("_shoulder", "_hip"))
         for name in ("neck", "belly"):
             share = (mean[name][1] - hip_y) / (shoulder_y - hip_y)
