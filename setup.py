@@ -32,7 +32,14 @@ setup(
     maintainer_email="maintainers@users.noreply.github.com",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={
-        NAME: ["py.typed", "weights/*.npz", "weights/*.md", "interfaces/*/*/*.msg", "interfaces/*/*/*.action"]
+        NAME: [
+            "py.typed",
+            "annotate/page/*",
+            "weights/*.npz",
+            "weights/*.md",
+            "interfaces/*/*/*.msg",
+            "interfaces/*/*/*.action",
+        ]
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "view": BELOW_STREAM | {"evaluate", "stream", "bag"},
     "learn": BELOW_STREAM,
     "evaluate": BELOW_STREAM | {"stream", "bag", "learn"},
-    "annotate": BELOW_STREAM,
+    "annotate": BELOW_STREAM | {"view"},
     "cli": BELOW_STREAM | {"stream", "bag", "view", "evaluate", "learn", "annotate"},
 }
 

@@ -70,7 +70,7 @@ def open_frames(path: str | Path) -> FrameSource:
     """Open a video file or a folder of images (in natural order: frame2 before frame10); InputError with the reason."""
     path = Path(path)
     if path.is_dir():
-        files = tuple(sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES), key=_natural))
+        files = tuple(sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES), key=natural_order))
         if not files:
             raise InputError(f"the folder {path} has no images ({' '.join(sorted(IMAGE_SUFFIXES))})")
         return FrameSource(path, FOLDER_FPS, len(files), files)
@@ -87,7 +87,7 @@ def open_frames(path: str | Path) -> FrameSource:
     return FrameSource(path, float(rate), max(0, int(count)), ())
 
 
-def _natural(path: Path) -> tuple[list[tuple[int, int, str]], str]:
+def natural_order(path: Path) -> tuple[list[tuple[int, int, str]], str]:
     """Sorting key that compares the runs of digits in a name as numbers."""
     pieces = re.findall(r"(\d+)|(\D+)", path.name)
     return [(0, int(digits), "") if digits else (1, 0, text) for digits, text in pieces], path.name

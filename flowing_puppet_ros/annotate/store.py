@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The annotations of a folder, kept in one JSON file that is replaced as a whole at every change.
+
+{"joint_names": [...], "images": {"name.jpg": [{"joints": [[x, y, visible], ...], "gender": ..., "view": ...}]}}
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import math
+import os
+import re
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from flowing_puppet_ros.annotate.folder import split_key
+from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.image.sticks import sticks_of, write_sticks
+
+FILE = "annotations.json"
+GENDERS = ("neutral", "female", "male")
+VIEWS = ("front", "back")
+MOST_PEOPLE = 50
+FARTHEST = 1e5  # px
+
+type Person = dict[str, Any]
+
+
+class ConflictError(PuppetError):
+    """Somebody else has changed the annotation since it was read."""
+
+
+class AnnotationStore:
+    """People by image key, with a revision an image that tells who writes over whom. Thread-safe.
+
+    What the file says of images that are not there any more is kept. One program at a time has the folder.
+    """
+
+    def __init__(self, folder: Path, joint_names: Sequence[str]) -> None:
+        """Open or begin the folder's annotations; InputError when they are broken, of other joints, or in use."""
+        self.path = folder / FILE
+        self.joint_names = tuple(joint_names)
+        self._lock = threading.Lock()
+        self._claim = _claimed(folder)
+        self._images = self._read()
+        self._revision = dict.fromkeys(self._images, 1)
+
+    def close(self) -> None:
+        """Let others have the folder."""
+        self._claim.close()
+
+    def get(self, key: str) -> tuple[int, list[Person]]:
+        """Revision (0 before the first) and people of an image."""
+        with self._lock:
+            return self._revision.get(key, 0), self._images.get(key, [])
+
+    def counts(self) -> dict[str, int]:
+        """Number of people of every image that has any."""
+        with self._lock:
+            return {key: len(people) for key, people in self._images.items() if people}
+
+    def put(self, key: str, revision: int, people: object) -> int:
+        """Replace the people of an image and return the new revision; they are on the disk when this returns.
+
+        ConflictError when `revision` is not the present one, InputError when `people` cannot be, PuppetError when the
+        file cannot be written; then the annotation stays as it was.
+        """
+        checked = checked_people(people, len(self.joint_names))
+        with self._lock:
+            if revision != self._revision.get(key, 0):
+                raise ConflictError(f"{key} was changed elsewhere in the meantime")
+            before = self._images.get(key)
+            self._images[key] = checked
+            try:
+                self._write()
+            except OSError as error:
+                if before is None:
+                    del self._images[key]
+                else:
+                    self._images[key] = before
+                raise PuppetError(f"{self.path} cannot be written: {error.strerror}") from error
+            self._revision[key] = revision + 1
+            return revision + 1
+
+    def write_stick_figures(self, path: Path, items: Sequence[str]) -> None:
+        """Write the stick figures of all people; a frame's number is the one in its name, or its place if some agree."""
+        numbers = [_number(key) for key in items]
+        if None in numbers or len(set(numbers)) < len(numbers):
+            numbers = list(range(len(items)))
+        frames = {}
+        for key, number in zip(items, numbers, strict=True):
+            people = [np.array(person["joints"], dtype=np.float64)[:, :2] for person in self.get(key)[1]]
+            if people and number is not None:
+                frames[number] = [sticks_of(self.joint_names, joints) for joints in people]
+        write_sticks(path, frames)
+
+    def _read(self) -> dict[str, list[Person]]:
+        if not self.path.exists():
+            return {}
+        try:
+            data = json.loads(self.path.read_text())
+            names, images = tuple(data["joint_names"]), dict(data["images"])
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{self.path} is no file of annotations ({error}); move it away or repair it") from error
+        if names != self.joint_names:
+            raise InputError(
+                f"{self.path} has {len(names)} joints a person and this puppet has {len(self.joint_names)}; "
+                "choose the other number of --parts"
+            )
+        return {key: checked_people(people, len(names)) for key, people in images.items()}
+
+    def _write(self) -> None:
+        draft = self.path.with_name(FILE + ".part")
+        with draft.open("w") as file:
+            json.dump({"joint_names": self.joint_names, "images": self._images}, file, separators=(",", ":"))
+            file.flush()
+            os.fsync(file.fileno())
+        draft.replace(self.path)
+
+
+def checked_people(people: object, joint_count: int) -> list[Person]:
+    """The people that a page or a file gave, with nothing in them but what belongs there; InputError otherwise."""
+    if not isinstance(people, list) or len(people) > MOST_PEOPLE:
+        raise InputError(f"the people of an image are a list of at most {MOST_PEOPLE}")
+    return [_checked_person(person, joint_count) for person in people]
+
+
+def _checked_person(person: object, joint_count: int) -> Person:
+    if not isinstance(person, dict):
+        raise InputError("a person is an object with joints, gender and view")
+    gender, view, joints = person.get("gender"), person.get("view"), person.get("joints")
+    if gender not in GENDERS or view not in VIEWS:
+        raise InputError(
+            f"a person is {', '.join(GENDERS)} and seen from {' or '.join(VIEWS)}, not {gender!r}, {view!r}"
+        )
+    if not isinstance(joints, list) or len(joints) != joint_count:
+        raise InputError(f"a person has {joint_count} joints")
+    return {"joints": [_checked_joint(joint) for joint in joints], "gender": gender, "view": view}
+
+
+def _checked_joint(joint: object) -> list[float]:
+    if not isinstance(joint, list) or len(joint) != 3:
+        raise InputError("a joint is [x, y, visible]")
+    for number in joint:
+        if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
+            raise InputError(f"a joint has the coordinate {number!r}")
+    x, y, visible = joint
+    if abs(x) > FARTHEST or abs(y) > FARTHEST or visible not in (0, 1):
+        raise InputError(f"a joint at ({x:g}, {y:g}) with visibility {visible:g} is none")
+    return [round(float(x), 2), round(float(y), 2), int(visible)]
+
+
+def _number(key: str) -> int | None:
+    """The last number of an item's name; the frame of a video."""
+    name, frame = split_key(key)
+    digits = re.findall(r"\d+", Path(name).stem)
+    if frame is not None:
+        return frame
+    return int(digits[-1]) if digits and len(digits[-1]) < 10 else None
+
+
+def _claimed(folder: Path) -> IO[str]:
+    """Hold the folder's lock file; the system lets it go when the program ends, however it ends."""
+    try:
+        file = (folder / ".annotations.lock").open("w")
+    except OSError as error:
+        raise InputError(f"{folder} cannot be written, and the annotations are kept there: {error.strerror}") from error
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        file.close()
+        raise InputError(f"{folder} is being annotated by another run of this tool; stop that one first") from error
+    return file
