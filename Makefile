@@ -26,6 +26,7 @@ lint: venv
 	@.venv/bin/mypy
 
 test: lint
+	@$(PYTHON) scripts/ensure_browser.py
 	@$(CLEAN_ENV) $(PYTHON) -m pytest
 
 config: venv
