@@ -32,6 +32,18 @@ def test_closest_is_within_a_cell_of_brute_force(sphere: CloudGrid) -> None:
     assert np.mean(distance - exact.min(axis=1)) < 0.1 * sphere.cell
 
 
+def test_cells_hold_nearly_the_nearest_point(sphere: CloudGrid) -> None:
+    rng = np.random.default_rng(4)
+    cells = rng.integers(0, sphere.nearest.shape, (2000, 3))
+    centres = sphere.origin + sphere.cell * cells
+    taken = np.linalg.norm(centres - sphere.points[sphere.nearest[tuple(cells.T)]], axis=1)
+    exact = np.linalg.norm(centres[:, None] - sphere.points, axis=2).min(axis=1)
+    near = exact < 0.1
+    assert np.all(taken >= exact - 1e-12) and np.all(taken[near] < exact[near] + 0.3 * sphere.cell)
+    assert (taken - exact).max() < 1.5 * sphere.cell
+    assert np.mean(taken - exact) < 0.03 * sphere.cell
+
+
 def test_far_queries_are_answered_at_the_border(sphere: CloudGrid) -> None:
     index, distance = closest(sphere, np.array([[100.0, 2.0, -0.5], [-100.0, 2.0, -0.5]]))
     assert sphere.points[index[0], 0] > 1.25
