@@ -11,6 +11,7 @@ import numpy as np
 
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_joints import JOINT_NAMES
+from flowing_puppet_ros.model.ds_multiview import VIEW_HEADINGS, VIEW_NAMES, MultiViewStructures
 from flowing_puppet_ros.model.ds_render import depth_order
 from flowing_puppet_ros.model.ds_shape import PuppetShape
 from flowing_puppet_ros.view.overlay import DrawnPuppet, draw_puppets
@@ -20,23 +21,36 @@ SCALE = 240.0  # pixels per metre
 MARGIN = 24  # pixels
 COLUMNS = 4
 FILES = "ds_GENDER-PARTS.png"
+ALL = "all"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of `sample ds` alone."""
     parser.add_argument("--parts", type=int, choices=tuple(JOINT_NAMES), default=10, help="parts [%(default)s]")
+    views = "side the torso faces, on a map with the camera in the south; all: the likely puppet of every side"
+    parser.add_argument("--view", choices=(*VIEW_NAMES, ALL), help=f"{views} [near S]")
 
 
 def draw(arguments: argparse.Namespace, rng: np.random.Generator) -> Iterator[Path]:
     """Draw the puppets on one sheet and yield its path."""
-    model = DeformableStructures.load(arguments.gender, arguments.parts)
-    pictures = [picture(model, model.sample(rng)) for _ in range(arguments.count)]
-    path = arguments.out / f"ds_{model.name}.png"
-    save(contact_sheet(pictures, COLUMNS), path)
+    gender, parts, view = arguments.gender, arguments.parts, arguments.view
+    if view is None:
+        model = DeformableStructures.load(gender, parts)
+        pictures = [picture(model, model.sample(rng)) for _ in range(arguments.count)]
+    else:
+        sides = MultiViewStructures.load(gender, parts)
+        if view == ALL:
+            seen = [(side, side.likely(), angle) for side, angle in zip(sides.views, VIEW_HEADINGS, strict=True)]
+        else:
+            angle = VIEW_HEADINGS[VIEW_NAMES.index(view)]
+            seen = [(sides.at(view), sides.sample(rng, view), angle) for _ in range(arguments.count)]
+        pictures = [picture(*one) for one in seen]
+    path = arguments.out / f"ds_{gender}-{parts}{'' if view is None else '-' + view}.png"
+    save(contact_sheet(pictures, len(VIEW_NAMES) if view == ALL else COLUMNS), path)
     yield path
 
 
-def picture(model: DeformableStructures, shape: PuppetShape) -> np.ndarray:
+def picture(model: DeformableStructures, shape: PuppetShape, heading: float = 0.0) -> np.ndarray:
     """Draw a puppet of model space, filled in depth order, with contours and joints, on an image that it just fits."""
     points = np.vstack(shape.contours)
     corner = points.min(axis=0) - MARGIN / SCALE
@@ -48,6 +62,6 @@ def picture(model: DeformableStructures, shape: PuppetShape) -> np.ndarray:
         confidence=np.ones(len(model.joint_names)),
         part_names=model.tree.names,
         contours=tuple((contour - corner) * SCALE for contour in shape.contours),
-        order=depth_order(model, shape.view),
+        order=depth_order(model, shape.view, heading),
     )
     return draw_puppets(np.full((height, width, 3), 255, np.uint8), [drawn], opacity=0.8, labels=False)

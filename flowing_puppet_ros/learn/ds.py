@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learn the 2D Deformable Structures puppet from projected Anny bodies."""
+"""Learn the 2D Deformable Structures puppet from projected Anny bodies, seen from the front or from nine sides."""
 
 from __future__ import annotations
 
@@ -8,140 +8,113 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.learn.anny import GENDERS
-from flowing_puppet_ros.learn.ds_samples import PartSamples, TrainingSet, make_training_set
-from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.model.ds_joints import JOINT_NAMES, PART_JOINTS
-from flowing_puppet_ros.model.ds_shape import PairLayout, PartShape, rotate
-from flowing_puppet_ros.model.gaussian import Gaussian
+from flowing_puppet_ros.learn.ds_fit import COMPONENTS, fit
+from flowing_puppet_ros.learn.ds_multiview import fit_views
+from flowing_puppet_ros.learn.ds_samples import People, make_training_set, make_view_sets
+from flowing_puppet_ros.model.ds_joints import JOINT_NAMES
+from flowing_puppet_ros.model.ds_multiview import VIEW_NAMES
 from flowing_puppet_ros.settings import make_out_folder
 
-Array = np.ndarray[Any, Any]
-
-COMPONENTS = 10
 POSES = 1500
-NEGLIGIBLE = 1e-6  # metres: components with less deviation are rounding noise and get coefficients of about 0
-# Standard deviations added to the pairwise variables: lengths depend exactly on shapes, which cannot be inverted.
-SHAPE_FLOOR, ANGLE_FLOOR, METRE_FLOOR = 0.03, 0.03, 0.003
-
-LENGTH_PAIRS = (
-    *(("neck", "belly"), ("neck", "face"), ("face", "belly"), ("right_shoulder", "left_shoulder")),
-    ("right_hip", "left_hip"),
-    *((f"{side}_{a}", f"{side}_{b}") for side in ("right", "left") for a, b in (("shoulder", "hip"), ("hip", "knee"))),
-    *((f"{side}_{a}", f"{side}_{b}") for side in ("right", "left") for a, b in (("knee", "ankle"), ("elbow", "wrist"))),
-    *((f"{side}_shoulder", f"{side}_elbow") for side in ("right", "left")),
-    *(("neck", f"{side}_{joint}") for side in ("right", "left") for joint in ("shoulder", "hip")),
-)
-"""Joints whose distance tells the scale of a person."""
-
-
-def fit(gender: str, training: TrainingSet, components: int = COMPONENTS) -> DeformableStructures:
-    """Fit the part shapes (Eq. 6), the pairwise Gaussians (Eq. 10) and the statistics of the joints."""
-    fitted = [_fit_part(part, name, components) for part, name in zip(training.parts, training.tree.names, strict=True)]
-    shapes = tuple(shape for shape, _ in fitted)
-    coefficients = [z for _, z in fitted]
-    pairwise = tuple(_fit_pair(training, shapes, coefficients, *edge) for edge in training.tree.edges)
-    middle = training.joints[:, :2].mean(axis=1, keepdims=True)
-    prior = Gaussian.from_samples((training.joints - middle).reshape(len(training.joints), -1), ridge=1e-6)
-    pairs = np.array([[training.joint_names.index(name) for name in pair] for pair in LENGTH_PAIRS])
-    log_length = np.log(np.linalg.norm(training.joints[:, pairs[:, 0]] - training.joints[:, pairs[:, 1]], axis=2))
-    spread = np.maximum(log_length.std(axis=0), 0.02)
-    statistics = np.stack([log_length.mean(axis=0), spread], axis=1)
-    return DeformableStructures(gender, training.tree, shapes, pairwise, prior, pairs, statistics)
-
-
-def _fit_part(part: PartSamples, name: str, components: int) -> tuple[PartShape, Array]:
-    """Principal components of one part's points; returns the shape and the samples' coefficients (n,Z)."""
-    flat = part.points.reshape(len(part.points), -1)
-    mean = flat.mean(axis=0)
-    _, values, axes = np.linalg.svd(flat - mean, full_matrices=False)
-    deviation = np.maximum(values[:components] / np.sqrt(len(flat) - 1), NEGLIGIBLE)
-    coefficients = (flat - mean) @ axes[:components].T / deviation
-    basis = (axes[:components].T * deviation).reshape(*part.points.shape[1:], components)
-    return PartShape(mean.reshape(-1, 2), basis, len(PART_JOINTS[name])), coefficients
-
-
-def _fit_pair(
-    training: TrainingSet, shapes: tuple[PartShape, ...], coefficients: list[Array], parent: int, child: int
-) -> Gaussian:
-    """Gaussian over [z_j, sin, cos, q_ji, t_j, z_i, t_i]; q_ji is what the truncated shapes leave open at the joint."""
-    above, below = training.parts[parent], training.parts[child]
-    angle = below.angle - above.angle
-    sine, cosine = np.sin(angle), np.cos(angle)
-    shared = PART_JOINTS[training.tree.names[parent]].index(PART_JOINTS[training.tree.names[child]][0])
-    center = rotate(below.center - above.center, -np.sin(above.angle), np.cos(above.angle))
-    joint = _joint(shapes[child], coefficients[child], 0)
-    gap = center + rotate(joint, sine, cosine) - _joint(shapes[parent], coefficients[parent], shared)
-    columns = [coefficients[child], sine, cosine, gap, below.length, coefficients[parent], above.length]
-    layout = PairLayout(coefficients[child].shape[1])
-    floor = np.full(2 * layout.size + 6, SHAPE_FLOOR)
-    floor[layout.angle] = ANGLE_FLOOR
-    floor[layout.gap + layout.child_length + layout.parent_length] = METRE_FLOOR
-    pair = Gaussian.from_samples(np.column_stack(columns))
-    return Gaussian(pair.mean, pair.covariance + np.diag(floor**2))
-
-
-def _joint(shape: PartShape, coefficients: Array, index: int) -> Array:
-    """Joint point `index` (n,2) of a part for coefficients (n,Z)."""
-    row = len(shape.mean) - shape.joint_count + index
-    return np.asarray(shape.mean[row] + coefficients @ shape.basis[row].T)
+POSES_A_VIEW = 600
+MOST_COMPONENTS = 30
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Flags of `learn ds`."""
     parser.add_argument("--gender", choices=GENDERS, default="neutral", help="whose body [%(default)s]")
     parser.add_argument("--parts", type=int, choices=tuple(JOINT_NAMES), default=10, help="parts [%(default)s]")
+    views = "1: near the front; 9: a model that knows nine sides, from W to E [%(default)s]"
+    parser.add_argument("--views", type=int, choices=(1, len(VIEW_NAMES)), default=1, help=views)
+    components = "shape coefficients a part; the thesis uses 4, 5 and 10 [%(default)s]"
+    parser.add_argument("--components", type=int, default=COMPONENTS, help=components)
     parser.add_argument("--out", type=Path, required=True, help="folder for ds_GENDER-PARTS.npz and its model card")
     parser.add_argument("--mocap", type=Path, help="motion capture, expmap_20hz.npz; without it joint limits alone")
-    parser.add_argument("--poses", type=int, default=POSES, help="random poses, each also mirrored [%(default)s]")
+    poses = f"random poses, each also mirrored [{POSES}, or {POSES_A_VIEW} a view]"
+    parser.add_argument("--poses", type=int, default=None, help=poses)
     parser.add_argument("--seed", type=int, default=0, help="seed of poses and cameras [%(default)s]")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Learn one model and write it with its card."""
-    if arguments.poses < 2 * COMPONENTS:
-        raise InputError(f"--poses is {arguments.poses}; a model needs at least {2 * COMPONENTS}")
+    several = arguments.views > 1
+    poses = arguments.poses if arguments.poses is not None else POSES_A_VIEW if several else POSES
+    if not 1 <= arguments.components <= MOST_COMPONENTS:
+        raise InputError(f"--components is {arguments.components}; choose 1 to {MOST_COMPONENTS}")
+    if poses < 2 * arguments.components:
+        raise InputError(f"--poses is {poses}; a model needs at least {2 * arguments.components}")
     if arguments.seed < 0:
         raise InputError(f"--seed is {arguments.seed}; it must be 0 or more")
     make_out_folder(arguments.out)
     rng = np.random.default_rng(arguments.seed)
-    training = make_training_set(arguments.gender, arguments.parts, arguments.poses, rng, arguments.mocap)
-    model = fit(arguments.gender, training)
-    path = arguments.out / f"ds_{model.name}.npz"
-    np.savez_compressed(path, **model.to_arrays())  # type: ignore[arg-type]
-    path.with_suffix(".md").write_text(_card(model, arguments), encoding="utf-8")
+    people = People(arguments.gender, arguments.parts, arguments.mocap)
+    # The same weights on every machine: sums of several BLAS threads differ in their last bits.
+    with threadpool_limits(1):
+        arrays: dict[str, np.ndarray[Any, Any]]
+        if several:
+            arrays = fit_views(make_view_sets(people, poses, rng), arguments.components)
+        else:
+            arrays = fit(arguments.gender, make_training_set(people, poses, rng), arguments.components).to_arrays()
+    path = arguments.out / f"ds_{arguments.gender}-{arguments.parts}{'-views' if several else ''}.npz"
+    np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
+    path.with_suffix(".md").write_text(_card(arguments, poses), encoding="utf-8")
     print(path)
     return 0
 
 
-def _card(model: DeformableStructures, arguments: argparse.Namespace) -> str:
+def _card(arguments: argparse.Namespace, count: int) -> str:
     poses = "frames of the CMU motion capture with noise, and joint limits" if arguments.mocap else "joint limits"
     mocap = " --mocap expmap_20hz.npz" if arguments.mocap else ""
+    several = arguments.views > 1
+    views = f" --views {arguments.views}" if several else ""
+    components = f" --components {arguments.components}" if arguments.components != COMPONENTS else ""
     command = (
-        f"flowing-puppet learn ds --gender {model.gender} --parts {len(model.tree)} --poses {arguments.poses}"
-        f" --seed {arguments.seed}{mocap} --out flowing_puppet_ros/weights"
+        f"flowing-puppet learn ds --gender {arguments.gender} --parts {arguments.parts}{views}{components}"
+        f" --poses {count} --seed {arguments.seed}{mocap} --out flowing_puppet_ros/weights"
     )
     return _CARD.format(
-        name=model.name, gender=model.gender, parts=len(model.tree), samples=2 * arguments.poses, poses=poses,
-        command=command, components=COMPONENTS,
-    )  # fmt: skip
+        name=f"{arguments.gender}-{arguments.parts}{'-views' if several else ''}",
+        gender=arguments.gender,
+        parts=arguments.parts,
+        samples=f"{count} samples of each view" if several else f"{2 * count} samples",
+        poses=poses,
+        command=command,
+        components=arguments.components,
+        **(_NINE_SIDES if several else _FRONT),
+    )
 
 
+_FRONT = {
+    "seen": "seen roughly from the front\n(S. Zuffi, thesis, chapter \"Deformable Structure Model\")",
+    "mixture": "",
+    "camera": "yaw 15, pitch 5 and roll 3 degrees (standard deviations) off the front view",
+    "limits": "profile views and strongly foreshortened limbs are extrapolated",
+}  # fmt: skip
+_NINE_SIDES = {
+    "seen": "seen from nine sides,\nfacing W (left of the image) over S (the camera) to E "
+    '(S. Zuffi, thesis, section "Multi-view DS Model")',
+    "mixture": " The torso's shape and\nits ties to head, upper arms and upper legs are those of one of the nine "
+    "views; the limbs are the same in all.",
+    "camera": "yaw 8, pitch 5 and roll 3 degrees (standard deviations) off the view",
+    "limits": "strongly foreshortened limbs are extrapolated",
+}  # fmt: skip
 _CARD = """# Deformable Structures puppet {name}
 
-A 2D model of the shape and pose of a {gender} adult of average build in {parts} parts, seen roughly from the front
-(S. Zuffi, thesis, chapter "Deformable Structure Model"). It holds, for every part, the mean contour and {components}
+A 2D model of the shape and pose of a {gender} adult of average build in {parts} parts, {seen}.
+It holds, for every part, the mean contour and {components}
 principal components, and for every joint of two parts a Gaussian over both shapes, their relative angle and lengths;
-also the Gaussian of all joints, and the lengths that tell a person's scale.
+also the Gaussian of all joints, and the lengths that tell a person's scale.{mixture}
 
-- Learned from {samples} samples (half of them mirror images) with the command
+- Learned from {samples} (half of them mirror images) with the command
   `{command}`
 - Body: Anny 0.6.2 (code Apache-2.0, assets CC0, made from MakeHuman), fixed average build, minimal clothing.
 - Poses: {poses}. The motion capture is from mocap.cs.cmu.edu, created with
   funding from NSF EIA-0196217; only statistics of it are in this file.
-- Camera: perspective, 3 to 6 m away, yaw 15, pitch 5 and roll 3 degrees (standard deviations) off the front view.
-- Limits: no clothing, no hair; one build; profile views and strongly foreshortened limbs are extrapolated.
+- Camera: perspective, 3 to 6 m away, {camera}.
+- Limits: no clothing, no hair; one build; {limits}.
 - Licence: Apache-2.0, as the package.
 """

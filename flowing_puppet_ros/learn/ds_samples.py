@@ -18,6 +18,7 @@ from flowing_puppet_ros.learn.contour import closed_contour, resample_sides, to_
 from flowing_puppet_ros.learn.poses import PoseSampler
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.ds_joints import JOINT_NAMES, PART_JOINTS, part_tree
+from flowing_puppet_ros.model.ds_multiview import VIEW_HEADINGS, VIEW_NAMES
 from flowing_puppet_ros.model.tree import PartTree, mirrored_name
 
 Array = np.ndarray[Any, Any]
@@ -46,9 +47,10 @@ ROOT_BONES = {
     "lower_leg": "Leg",
     "foot": "Foot",
 }
-# Standard deviations of the near-frontal camera, and the range of its distance.
 YAW, PITCH, ROLL = np.radians(15.0), np.radians(5.0), np.radians(3.0)
 DISTANCE = (3.0, 6.0)
+VIEW_YAW = np.radians(8.0)
+"""Standard deviation of the yaw within one of the nine views, which are 22.5 degrees apart."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,43 +89,78 @@ class Projection:
         )
 
 
-def make_training_set(
-    gender: str, parts: int, poses: int, rng: np.random.Generator, mocap: Path | None = None
-) -> TrainingSet:
-    """Project `poses` random poses of the average body of `gender`, each with its mirror image (2 * poses samples).
+class People:
+    """Random people of one gender in the average build: Anny bodies in random poses, ready to be projected."""
 
-    `parts` is 10 or 14. `mocap` names the motion capture; without it poses come from joint limits alone.
+    def __init__(self, gender: str, parts: int, mocap: Path | None = None) -> None:
+        """`parts` is 10 or 14. `mocap` names the motion capture; without it poses come from joint limits alone."""
+        self.tree = part_tree(parts)
+        self._name = f"{gender} {parts}"
+        self._body = AnnyBody(gender)
+        self._sampler = PoseSampler(self._body, mocap)
+        self._rest = self._body.rest(self._body.mean_phenotype())
+        self._faces = part_faces(self._body, self.tree)
+
+    def images(self, poses: int, rng: np.random.Generator, view: CameraView) -> list[Projection]:
+        """Project `poses` random poses, each by a random camera of `view`."""
+        found: list[Projection] = []
+        with tqdm(total=poses, desc=f"{self._name} {np.degrees(view.heading):+.0f}", unit="pose") as progress:
+            while len(found) < poses:
+                vertices, bones = self._body.pose(self._rest, self._sampler.sample(rng, BATCH))
+                joints = self._body.landmarks(vertices, bones)
+                for index in range(BATCH):
+                    posed = {name: xyz[index] for name, xyz in joints.items()}
+                    image = project(vertices[index], posed, self._faces, RandomCamera.draw(rng, view))
+                    if image is not None and len(found) < poses:
+                        found.append(image)
+                        progress.update()
+        return found
+
+
+def make_training_set(people: People, poses: int, rng: np.random.Generator) -> TrainingSet:
+    """Project `poses` random poses seen from the front, each with its mirror image (2 * poses samples)."""
+    seen = people.images(poses, rng, CameraView())
+    return collect(people.tree, [image for one in seen for image in (one, one.mirrored())])
+
+
+def make_view_sets(people: People, poses: int, rng: np.random.Generator) -> tuple[TrainingSet, ...]:
+    """Training samples of the nine views of `VIEW_NAMES`, `poses` a view (an even number, or one less in the south).
+
+    A person who faces south-west is one who faces south-east in the mirror, so half of the views come from mirrors.
     """
-    tree = part_tree(parts)
-    body = AnnyBody(gender)
-    sampler = PoseSampler(body, mocap)
-    rest = body.rest(body.mean_phenotype())
-    faces = part_faces(body, tree)
-    projections: list[Projection] = []
-    with tqdm(total=poses, desc=f"{gender} {parts}", unit="pose") as progress:
-        while len(projections) < poses:
-            vertices, bones = body.pose(rest, sampler.sample(rng, BATCH))
-            joints = body.landmarks(vertices, bones)
-            for index in range(BATCH):
-                camera = RandomCamera.draw(rng)
-                image = project(vertices[index], {name: xyz[index] for name, xyz in joints.items()}, faces, camera)
-                if image is not None and len(projections) < poses:
-                    projections.append(image)
-                    progress.update()
-    return collect(tree, [image for one in projections for image in (one, one.mirrored())])
+    count = len(VIEW_NAMES)
+    images: list[list[Projection]] = [[] for _ in range(count)]
+    for view in range(count // 2 + 1):
+        wanted = poses if view < count // 2 else poses // 2
+        seen = people.images(wanted, rng, CameraView(VIEW_HEADINGS[view], VIEW_YAW))
+        images[view] += seen
+        images[count - 1 - view] += [image.mirrored() for image in seen]
+    return tuple(collect(people.tree, seen) for seen in images)
+
+
+@dataclass(frozen=True, slots=True)
+class CameraView:
+    """How people stand before the camera: turned by `heading` on average, with deviation `yaw`; radians.
+
+    Heading 0 faces the camera, a positive one the right of the image.
+    """
+
+    heading: float = 0.0
+    yaw: float = YAW
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RandomCamera:
-    """A near-frontal perspective camera: the body is turned by `turn` (3,3) and seen from `distance` metres."""
+    """A perspective camera: the body is turned by `turn` (3,3) and seen from `distance` metres."""
 
     turn: Array
     distance: float
 
     @classmethod
-    def draw(cls, rng: np.random.Generator) -> RandomCamera:
-        """Draw slight yaw, pitch and roll and a distance of a few metres."""
-        roll, pitch, yaw = rng.normal(0.0, [ROLL, PITCH, YAW])
+    def draw(cls, rng: np.random.Generator, view: CameraView) -> RandomCamera:
+        """Draw slight yaw, pitch and roll off the view and a distance of a few metres."""
+        roll, pitch, yaw = rng.normal(0.0, [ROLL, PITCH, view.yaw])
+        yaw += view.heading
         turn = rotation.exp(np.array([roll, 0.0, 0.0])) @ rotation.exp(np.array([0.0, pitch, 0.0]))
         return cls(turn @ rotation.exp(np.array([0.0, 0.0, yaw])), float(rng.uniform(*DISTANCE)))
 

@@ -7,7 +7,7 @@ point is `scale * model + offset` (Eqs. 8 and 9), scale in pixels per metre. Fro
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -102,15 +102,23 @@ class DeformableStructures:
     def sample(self, rng: np.random.Generator) -> PuppetShape:
         """Draw a puppet in model space, from torso to leaves (Eqs. 11-14); the torso is upright at the origin."""
         size = self.shapes[0].basis.shape[2]
+        return self._descend(rng.standard_normal(size), lambda given: given.sample(rng, 1)[0])
+
+    def likely(self) -> PuppetShape:
+        """The puppet that grows from the mean torso by conditional means, in model space."""
+        return self._descend(np.zeros(self.shapes[0].basis.shape[2]), lambda given: given.mean)
+
+    def _descend(self, torso: Array, choose: Callable[[Gaussian], Array]) -> PuppetShape:
+        """From the torso's coefficients to the leaves: `choose` picks from a child's conditional Gaussian (Eq. 12)."""
+        size = len(torso)
         layout = PairLayout(size)
-        coefficients = [np.clip(rng.standard_normal(size), -COEFFICIENT_LIMIT, COEFFICIENT_LIMIT)]
+        kept = layout.child + layout.angle + layout.gap
+        coefficients = [np.clip(torso, -COEFFICIENT_LIMIT, COEFFICIENT_LIMIT)]
         poses: list[Array] = []
         for parent, child in self.tree.edges:
-            kept = layout.child + layout.angle + layout.gap
-            given = self.pairwise[child - 1].condition(kept, layout.parent, coefficients[parent])
-            drawn = given.sample(rng, 1)[0]
-            coefficients.append(np.clip(drawn[:size], -COEFFICIENT_LIMIT, COEFFICIENT_LIMIT))
-            poses.append(drawn[size:])
+            chosen = choose(self.pairwise[child - 1].condition(kept, layout.parent, coefficients[parent]))
+            coefficients.append(np.clip(chosen[:size], -COEFFICIENT_LIMIT, COEFFICIENT_LIMIT))
+            poses.append(chosen[size:])
         return self._assemble(coefficients, poses)
 
     def mean_joints(self) -> Array:

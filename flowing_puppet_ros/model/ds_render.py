@@ -15,19 +15,25 @@ from flowing_puppet_ros.model.ds_shape import View
 Array = np.ndarray[Any, Any]
 
 _FAR_TO_NEAR = ("upper_leg", "lower_leg", "foot", "torso", "head", "upper_arm", "lower_arm", "hand")
+SIDEWAYS = np.radians(40.0)
+"""Heading from which the limbs of the far side are drawn behind the torso."""
+
 _SUBPIXEL_BITS = 4
 _FARTHEST_PIXEL = 1e5
 
 
-def depth_order(model: DeformableStructures, view: View = "front") -> tuple[int, ...]:
+def depth_order(model: DeformableStructures, view: View = "front", heading: float = 0.0) -> tuple[int, ...]:
     """Part indices from far to near: legs, torso, head, right and left upper arms, lower arms, hands.
 
-    From behind the order is the reverse.
+    From behind the order is the reverse. Who is turned far from the camera, by `heading` radians towards the right of
+    the image, has the limbs of the far side behind the torso.
     """
+    far_side = "" if abs(heading) < SIDEWAYS else "left_" if heading > 0 else "right_"
 
-    def layer(part: int) -> tuple[int, bool]:
+    def layer(part: int) -> tuple[bool, int, bool]:
         name = model.tree.names[part]
-        return _FAR_TO_NEAR.index(name.removeprefix("right_").removeprefix("left_")), name.startswith("left_")
+        far = bool(far_side) and name.startswith(far_side)
+        return not far, _FAR_TO_NEAR.index(name.removeprefix("right_").removeprefix("left_")), name.startswith("left_")
 
     order = tuple(sorted(range(len(model.tree)), key=layer))
     return order if view == "front" else order[::-1]

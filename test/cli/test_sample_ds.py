@@ -53,3 +53,11 @@ def test_folder_that_is_a_file_is_refused(tmp_path: Path, capsys: pytest.Capture
     (tmp_path / "file").write_text("no folder")
     assert main(["sample", "ds", "--out", str(tmp_path / "file")]) == 2
     assert "choose another folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("view", "columns"), [("all", 9), ("WSW", 3)])
+def test_sides_are_drawn(tmp_path: Path, view: str, columns: int) -> None:
+    image = sheet(tmp_path, "--view", view)
+    filled = (np.ptp(image.astype(int), axis=2) > 40).any(axis=0).astype(int)
+    assert (np.diff(filled) == 1).sum() >= columns - 1
+    assert (tmp_path / f"ds_neutral-10-{view}.png").exists()

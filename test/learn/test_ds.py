@@ -11,11 +11,13 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.learn import ds, ds_samples
+from flowing_puppet_ros.learn import ds, ds_fit, ds_samples
+from flowing_puppet_ros.learn.ds_multiview import fit_views
 from flowing_puppet_ros.learn.ds_samples import Projection, RandomCamera, TrainingSet, collect
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_energy import PairwiseEnergy
 from flowing_puppet_ros.model.ds_joints import JOINT_NAMES, PART_JOINTS, part_tree
+from flowing_puppet_ros.model.ds_multiview import MultiViewStructures
 
 TREE = part_tree(10)
 LENGTHS = {"upper_arm": 0.28, "lower_arm": 0.25, "upper_leg": 0.4, "lower_leg": 0.4}
@@ -73,7 +75,7 @@ def training() -> TrainingSet:
 
 @pytest.fixture(scope="module")
 def model(training: TrainingSet) -> DeformableStructures:
-    return ds.fit("neutral", training)
+    return ds_fit.fit("neutral", training)
 
 
 def test_parts_are_aligned_to_their_bones(training: TrainingSet) -> None:
@@ -110,6 +112,37 @@ def test_arms_swell_with_the_bend_of_unseen_poses(model: DeformableStructures) -
             spread.append(width(bends[f"{side}_arm"]))
     assert np.std(errors) < 0.35 * np.std(spread), "the pairwise Gaussians carry the bend into the width"
     assert abs(np.mean(errors)) < 0.002
+
+
+def test_views_have_torsos_of_their_own_and_limbs_in_common() -> None:
+    rng = np.random.default_rng(1)
+    people = [cardboard(rng)[0] for _ in range(30)]
+
+    def narrowed(image: Projection, factor: float) -> Projection:
+        """The person of cardboard with shoulders and hips drawn in, arms and legs moved along with them."""
+        joints = {}
+        for name, xy in image.joints.items():
+            side, _, joint = name.partition("_")
+            root = {"elbow": "shoulder", "wrist": "shoulder", "knee": "hip", "ankle": "hip"}.get(joint, joint)
+            hung = image.joints[f"{side}_{root}"] if root else np.zeros(2)
+            joints[name] = xy - [(1 - factor) * hung[0], 0.0]
+        contours = {}
+        for part in TREE.names:
+            near, far = (joints[name] for name in PART_JOINTS[part][:2])
+            contours[part] = ellipse(near, far, 0.17 * factor if part == "torso" else 0.05)
+        return Projection(contours, joints)
+
+    factors = np.cos(np.linspace(-1.2, 1.2, 9))
+    sets = [collect(TREE, [narrowed(one, factor) for one in people]) for factor in factors]
+    sides = MultiViewStructures.from_arrays("neutral", 10, fit_views(sets, 4))
+    left, right = (sides.views[0].joint_names.index(f"{side}_shoulder") for side in ("left", "right"))
+    widths = [view.likely().joints[left, 0] - view.likely().joints[right, 0] for view in sides.views]
+    np.testing.assert_allclose(widths, 0.36 * factors, atol=0.02)
+    for view, training in zip(sides.views, sets, strict=True):
+        middle = training.joints[:, :2].mean(axis=1, keepdims=True)
+        expected = (training.joints - middle).mean(axis=0).ravel()
+        np.testing.assert_allclose(view.joint_prior.mean, expected, atol=1e-6)
+        assert view.pairwise[3] is sides.views[0].pairwise[3], "lower arms hang from upper arms alike in all views"
 
 
 def test_energy_is_the_density_of_the_pairwise_gaussians(training: TrainingSet, model: DeformableStructures) -> None:
@@ -160,7 +193,13 @@ def test_mirror_image_exchanges_sides() -> None:
 
 
 @pytest.mark.parametrize(
-    ("flag", "value", "message"), [("poses", 3, "at least 20"), ("seed", -1, "--seed is -1"), ("out", None, "--out")]
+    ("flag", "value", "message"),
+    [
+        ("poses", 3, "at least 20"),
+        ("components", 0, "--components is 0"),
+        ("seed", -1, "--seed is -1"),
+        ("out", None, "--out"),
+    ],
 )
 def test_unusable_arguments_are_told_before_any_work(tmp_path: Path, flag: str, value: object, message: str) -> None:
     parser = argparse.ArgumentParser()
@@ -178,7 +217,8 @@ def test_unusable_arguments_are_told_before_any_work(tmp_path: Path, flag: str, 
     find_spec("anny") is None or find_spec("body_models") is None, reason="the Anny body is for learning"
 )
 def test_projected_bodies_hold_their_joints() -> None:
-    first, again = (ds_samples.make_training_set("female", 14, 4, np.random.default_rng(3)) for _ in range(2))
+    people = ds_samples.People("female", 14)
+    first, again = (ds_samples.make_training_set(people, 4, np.random.default_rng(3)) for _ in range(2))
     np.testing.assert_array_equal(first.joints, again.joints)
     assert first.joint_names == JOINT_NAMES[14] and len(first.joints) == 8
     for name, part in zip(first.tree.names, first.parts, strict=True):
