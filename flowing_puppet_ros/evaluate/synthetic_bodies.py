@@ -61,9 +61,14 @@ class BodySource:
         self.triangles = self._anny.triangles
         self.joint_names = tuple(self._anny.landmarks(rest.vertices, rest.joints))
 
+    @property
+    def has_mocap(self) -> bool:
+        """Whether people can be drawn in poses of motion capture."""
+        return self._mocap is not None
+
     def body(self, rng: np.random.Generator, hard: bool) -> TrueBody:
         """Draw a person of unknown yaw: in a pose of the motion capture, or `hard`, anywhere within joint limits."""
-        if not hard and self._mocap is None:
+        if not hard and not self.has_mocap:
             raise InputError("poses of people need motion capture; give --mocap expmap_20hz.npz")
         rest = self._anny.rest(self._anny.sample_phenotype(rng))
         pose = self._sampler.sample(rng, 1, limits_share=float(hard))[0]

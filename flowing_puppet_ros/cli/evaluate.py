@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure poses and bodies against the truth."""
+
+from __future__ import annotations
+
+import argparse
+
+from flowing_puppet_ros.cli import evaluate_bodies
+
+KINDS = {"bodies": evaluate_bodies}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add one sub-command a kind of measurement."""
+    kinds = parser.add_subparsers(dest="kind_of_truth", required=True, metavar="|".join(KINDS))
+    for name, module in KINDS.items():
+        module.add_arguments(kinds.add_parser(name, description=module.__doc__))
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the chosen measurement and return the exit status."""
+    return KINDS[arguments.kind_of_truth].run(arguments)
