@@ -29,6 +29,10 @@ POSE_PRIOR = 5e-5
 CONTRADICTING_WEIGHT = 0.3
 # Points, normals, nearest indices, origin and cell of a CloudGrid.
 CloudArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
+# Basis (K, D, 3), normals and weights of the surface points and then the joints, the joints' targets, and the weighted
+# sums over all points of the basis (D, 3) and of its products (D, D).
+PartArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Triple = tuple[float, float, float]
 
 
 def improve(
@@ -47,141 +51,208 @@ def improve(
     Returns:
         Particles of the same shape coefficients whose sum of squares is not larger.
     """
-    surface, joints = points.surface, points.joints
-    count = min(count, len(surface))
-    center, rotation = particles.center.copy(), np.ascontiguousarray(particles.rotation)
-    pose = particles.pose.copy()
-    mean = np.concatenate([surface.shaped(particles.shape)[:, :count], joints.shaped(particles.shape)], axis=1)
-    basis = np.concatenate([surface.pose_basis[:count], joints.pose_basis])
-    weight = np.concatenate([np.full(count, 1.0 / count), targets.weight[points.joint_index]])
-    target = np.ascontiguousarray(targets.points[points.joint_index])
-    normals = np.ascontiguousarray(points.normals[:count])
+    center, rotation, pose = particles.center.copy(), particles.rotation.copy(), particles.pose.copy()
+    mean, part = prepared_part(points, particles, targets, min(count, len(points.surface)))
     cloud = (grid.points, grid.normals, grid.nearest, grid.origin, grid.cell)
-    _improve_all(center, rotation, pose, mean, np.ascontiguousarray(basis), normals, weight, target, cloud, steps)
+    _improve_all(center, rotation, pose, mean, part, cloud, steps)
     return Particles(center, rotation, pose, particles.shape)
 
 
-@njit(cache=True)
+def prepared_part(
+    points: PartPoints, particles: Particles, targets: JointTargets, count: int
+) -> tuple[np.ndarray, PartArrays]:
+    """Undeformed points (P, count + M, 3) of every particle, surface before joints, and what all particles share."""
+    surface, joints = points.surface, points.joints
+    mean = np.concatenate([surface.shaped(particles.shape)[:, :count], joints.shaped(particles.shape)], axis=1)
+    basis = np.concatenate([surface.pose_basis[:count], joints.pose_basis]).transpose(0, 2, 1).copy()
+    weight = np.concatenate([np.full(count, 1.0 / count), targets.weight[points.joint_index]])
+    first = np.tensordot(weight, basis, 1)
+    second = np.tensordot(basis * weight[:, None, None], basis, axes=([0, 2], [0, 2]))
+    target = np.ascontiguousarray(targets.points[points.joint_index])
+    return mean, (basis, np.ascontiguousarray(points.normals[:count]), weight, target, first, second)
+
+
+@njit(cache=True, nogil=True)
 def _improve_all(
     center: np.ndarray,
     rotation: np.ndarray,
     pose: np.ndarray,
     mean: np.ndarray,
-    basis: np.ndarray,
-    normals: np.ndarray,
-    weight: np.ndarray,
-    target: np.ndarray,
+    part: PartArrays,
     cloud: CloudArrays,
     steps: int,
 ) -> None:
     unknowns = 6 + pose.shape[1]
+    hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    new_hessian, new_gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    step, factor = np.zeros(unknowns), np.zeros((unknowns, unknowns))
     for p in range(len(center)):
         damping = DAMPING
-        hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
-        cost = _assemble(
-            center[p], rotation[p], pose[p], mean[p], basis, normals, weight, target, cloud, hessian, gradient
-        )
+        cost = assemble(center[p], rotation[p], pose[p], mean[p], part, cloud, hessian, gradient)
         for _ in range(steps):
-            system = hessian.copy()
-            for k in range(unknowns):
-                system[k, k] += damping * hessian[k, k] + 1e-9
-            step = np.linalg.solve(system, -gradient)
+            _solve(hessian, gradient, damping, factor, step)
             turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
             if turn > MAX_TURN:
                 step *= MAX_TURN / turn
             new_center = center[p] + rotation[p] @ step[3:6]
             new_rotation = rotation[p] @ _rotation(step[:3])
             new_pose = np.minimum(np.maximum(pose[p] + step[6:], -DEVIATIONS), DEVIATIONS)
-            new_hessian, new_gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
-            new_cost = _assemble(
-                new_center, new_rotation, new_pose, mean[p], basis, normals, weight, target, cloud,
-                new_hessian, new_gradient,
-            )  # fmt: skip
+            new_cost = assemble(new_center, new_rotation, new_pose, mean[p], part, cloud, new_hessian, new_gradient)
             if new_cost < cost:
                 center[p], rotation[p], pose[p], cost = new_center, new_rotation, new_pose, new_cost
-                hessian, gradient = new_hessian, new_gradient
+                hessian, new_hessian = new_hessian, hessian
+                gradient, new_gradient = new_gradient, gradient
                 damping /= DAMPING_FACTOR
             else:
                 damping *= DAMPING_FACTOR
 
 
-@njit(cache=True)
-def _assemble(
+@njit(cache=True, nogil=True)
+def assemble(
     center: np.ndarray,
     rotation: np.ndarray,
     pose: np.ndarray,
     mean: np.ndarray,
-    basis: np.ndarray,
-    normals: np.ndarray,
-    weight: np.ndarray,
-    target: np.ndarray,
+    part: PartArrays,
     cloud: CloudArrays,
     hessian: np.ndarray,
     gradient: np.ndarray,
 ) -> float:
-    """Fill the normal equations and return half the weighted sum of squares."""
+    """Fill the normal equations (the lower triangle) and return half the weighted sum of squares.
+
+    The unknowns are increments of turn and place in the part's own frame, then the deformation. What all particles
+    share is in the sums that come with the part; points that contradict the cloud take their share of it back.
+    """
+    basis, normals, weight, target, first, second = part
     points, point_normals, nearest, origin, cell = cloud
-    count, surface, deformations = len(mean), len(normals), len(pose)
-    jacobian = np.zeros((3, 6 + deformations))
-    jacobian[0, 3] = jacobian[1, 4] = jacobian[2, 5] = 1.0
-    world, goal, residual = np.empty(3), np.empty(3), np.empty(3)
+    deformations = len(pose)
+    gradient[:] = 0.0
+    hessian[:6, :6] = 0.0
+    hessian[6:, :3] = 0.0
+    hessian[6:, 3:6] = first
+    hessian[6:, 6:] = second
     cost = 0.0
-    for k in range(count):
-        local = mean[k].copy()
+    for k in range(len(mean)):
+        x, y, z = mean[k, 0], mean[k, 1], mean[k, 2]
         for d in range(deformations):
-            for axis in range(3):
-                local[axis] += basis[k, axis, d] * pose[d]
-                jacobian[axis, 6 + d] = basis[k, axis, d]
-        for axis in range(3):
-            world[axis] = center[axis]
-            for other in range(3):
-                world[axis] += rotation[axis, other] * local[other]
+            x += basis[k, d, 0] * pose[d]
+            y += basis[k, d, 1] * pose[d]
+            z += basis[k, d, 2] * pose[d]
+        a = center[0] + rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+        b = center[1] + rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+        c = center[2] + rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
         importance = weight[k]
-        if k < surface:
-            found = look_up(nearest, origin, cell, world[0], world[1], world[2])
-            goal[:] = points[found]
-            cosine = 0.0
-            for axis in range(3):
-                for other in range(3):
-                    cosine += point_normals[found, axis] * rotation[axis, other] * normals[k, other]
-            if cosine < 0.0:
+        if k < len(normals):
+            found = look_up(nearest, origin, cell, a, b, c)
+            a, b, c = a - points[found, 0], b - points[found, 1], c - points[found, 2]
+            if _contradicts(rotation, normals[k], point_normals[found]):
                 importance *= CONTRADICTING_WEIGHT
+                _take_back(weight[k] - importance, basis[k], hessian)
         else:
-            goal[:] = target[k - surface]
-        for axis in range(3):
-            residual[axis] = 0.0
-            for other in range(3):
-                residual[axis] += rotation[other, axis] * (world[other] - goal[other])
-        jacobian[0, 1], jacobian[0, 2] = local[2], -local[1]
-        jacobian[1, 0], jacobian[1, 2] = -local[2], local[0]
-        jacobian[2, 0], jacobian[2, 1] = local[1], -local[0]
-        cost += _accumulate(jacobian, residual, importance, hessian, gradient)
+            goal = target[k - len(normals)]
+            a, b, c = a - goal[0], b - goal[1], c - goal[2]
+        u = rotation[0, 0] * a + rotation[1, 0] * b + rotation[2, 0] * c
+        v = rotation[0, 1] * a + rotation[1, 1] * b + rotation[2, 1] * c
+        w = rotation[0, 2] * a + rotation[1, 2] * b + rotation[2, 2] * c
+        cost += 0.5 * importance * (u * u + v * v + w * w)
+        _add_rigid(importance, (x, y, z), (u, v, w), hessian, gradient)
+        _add_deformed(importance, (x, y, z), (u, v, w), basis[k], hessian, gradient)
     for d in range(deformations):
         cost += 0.5 * POSE_PRIOR * pose[d] ** 2
         hessian[6 + d, 6 + d] += POSE_PRIOR
         gradient[6 + d] += POSE_PRIOR * pose[d]
-    for row in range(6 + deformations):
-        for column in range(row):
-            hessian[row, column] = hessian[column, row]
     return cost
 
 
-@njit(cache=True)
-def _accumulate(
-    jacobian: np.ndarray, residual: np.ndarray, weight: float, hessian: np.ndarray, gradient: np.ndarray
-) -> float:
-    unknowns = jacobian.shape[1]
+@njit(cache=True, nogil=True, inline="always")
+def _contradicts(rotation: np.ndarray, normal: np.ndarray, found: np.ndarray) -> bool:
+    """Whether the part's normal, once turned, looks away from the cloud's."""
+    cosine = 0.0
+    for axis in range(3):
+        turned = rotation[axis, 0] * normal[0] + rotation[axis, 1] * normal[1] + rotation[axis, 2] * normal[2]
+        cosine += found[axis] * turned
+    return cosine < 0.0
+
+
+@njit(cache=True, nogil=True)
+def _take_back(weight: float, basis: np.ndarray, hessian: np.ndarray) -> None:
+    """Lessen what the sums over all points hold of one point's deformation."""
+    for d in range(len(basis)):
+        for axis in range(3):
+            hessian[6 + d, 3 + axis] -= weight * basis[d, axis]
+        for e in range(d + 1):
+            product = basis[d, 0] * basis[e, 0] + basis[d, 1] * basis[e, 1] + basis[d, 2] * basis[e, 2]
+            hessian[6 + d, 6 + e] -= weight * product
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_rigid(weight: float, point: Triple, residual: Triple, hessian: np.ndarray, gradient: np.ndarray) -> None:
+    """Add a point's J^T W J and J^T W r of turn and place, J = (-[p]x, I)."""
+    x, y, z = point
+    u, v, w = residual
+    gradient[0] += weight * (y * w - z * v)
+    gradient[1] += weight * (z * u - x * w)
+    gradient[2] += weight * (x * v - y * u)
+    gradient[3] += weight * u
+    gradient[4] += weight * v
+    gradient[5] += weight * w
+    hessian[0, 0] += weight * (y * y + z * z)
+    hessian[1, 1] += weight * (x * x + z * z)
+    hessian[2, 2] += weight * (x * x + y * y)
+    hessian[1, 0] -= weight * x * y
+    hessian[2, 0] -= weight * x * z
+    hessian[2, 1] -= weight * y * z
+    hessian[3, 1] += weight * z
+    hessian[3, 2] -= weight * y
+    hessian[4, 0] -= weight * z
+    hessian[4, 2] += weight * x
+    hessian[5, 0] += weight * y
+    hessian[5, 1] -= weight * x
+    hessian[3, 3] += weight
+    hessian[4, 4] += weight
+    hessian[5, 5] += weight
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_deformed(
+    weight: float, point: Triple, residual: Triple, basis: np.ndarray, hessian: np.ndarray, gradient: np.ndarray
+) -> None:
+    """Add a point's part of the normal equations that is not the same for all particles: deformation with turn."""
+    x, y, z = point
+    u, v, w = residual
+    for d in range(len(basis)):
+        i, j, k = weight * basis[d, 0], weight * basis[d, 1], weight * basis[d, 2]
+        gradient[6 + d] += i * u + j * v + k * w
+        hessian[6 + d, 0] += y * k - z * j
+        hessian[6 + d, 1] += z * i - x * k
+        hessian[6 + d, 2] += x * j - y * i
+
+
+@njit(cache=True, nogil=True)
+def _solve(hessian: np.ndarray, gradient: np.ndarray, damping: float, factor: np.ndarray, step: np.ndarray) -> None:
+    """Write into `step` what solves (H + damping diag H) step = -g, by Cholesky; of H the lower triangle is read."""
+    unknowns = len(gradient)
     for row in range(unknowns):
-        slope = weight * jacobian[0, row], weight * jacobian[1, row], weight * jacobian[2, row]
-        gradient[row] += slope[0] * residual[0] + slope[1] * residual[1] + slope[2] * residual[2]
-        for column in range(row, unknowns):
-            hessian[row, column] += (
-                slope[0] * jacobian[0, column] + slope[1] * jacobian[1, column] + slope[2] * jacobian[2, column]
-            )
-    return 0.5 * weight * (residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
+        total = -gradient[row]
+        for column in range(row + 1):
+            value = hessian[row, column]
+            if row == column:
+                value += damping * value + 1e-9
+            for k in range(column):
+                value -= factor[row, k] * factor[column, k]
+            if row == column:
+                factor[row, row] = np.sqrt(max(value, 1e-12))
+            else:
+                factor[row, column] = value / factor[column, column]
+                total -= factor[row, column] * step[column]
+        step[row] = total / factor[row, row]
+    for row in range(unknowns - 1, -1, -1):
+        for k in range(row + 1, unknowns):
+            step[row] -= factor[k, row] * step[k]
+        step[row] /= factor[row, row]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _rotation(vector: np.ndarray) -> np.ndarray:
     """Rodrigues' formula for one vector."""
     angle = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
