@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Floors and walls of a scene: planes that are larger than a person, found by RANSAC (Fischler and Bolles 1981).
+
+Open3D's `segment_plane` is not used: it knows no limits of tilt or size, so that the back of a person who stands close
+to a low camera can win over the floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+TRIALS = (200, 3000)
+TRIALS_TIMES_POINTS = 2_000_000
+"""Small clouds may have a small floor and take more trials in the same time."""
+NEIGHBOURHOOD = 1.0
+"""Metres: the three points of a trial lie at most this far apart, so that small planes are hit too."""
+MAX_TILT = np.radians(15.0)
+BELOW_FLOOR = 0.03
+"""Share of points that may lie below a floor: reflections and noise."""
+FLOOR_SIZE = (1.0, 0.5)
+WALL_SIZE = (1.8, 1.2)
+"""Least longer and shorter side in metres; a wall's are more than a person has, a floor may be cropped narrowly."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plane:
+    """normal . x = offset.
+
+    Attributes:
+        normal: (3,) unit vector; of a floor upwards.
+        offset: metres.
+    """
+
+    normal: np.ndarray
+    offset: float
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Signed distance (N,) of points (N, 3), metres, positive where the normal points."""
+        return np.asarray(points @ self.normal - self.offset)
+
+
+def find_floor(points: np.ndarray, clearance: float, rng: np.random.Generator) -> Plane | None:
+    """Return the nearly level plane that most points lie on while next to none lie below it, or None.
+
+    Args:
+        points: (N, 3) metres, z up, thinned evenly.
+        clearance: half thickness of the plane, metres.
+        rng: source of the trials.
+    """
+    normals, offsets = _trials(points, rng)
+    normals, offsets = normals * np.sign(normals[:, 2:]), offsets * np.sign(normals[:, 2])
+    level = normals[:, 2] > np.cos(MAX_TILT)
+    height = points @ normals[level].T - offsets[level]
+    count = (np.abs(height) < clearance).sum(axis=0)
+    count[(height < -2 * clearance).mean(axis=0) > BELOW_FLOOR] = 0
+    return _best(points, normals[level], offsets[level], count, clearance, FLOOR_SIZE)
+
+
+def find_wall(points: np.ndarray, thickness: float, rng: np.random.Generator) -> Plane | None:
+    """Return the plane of any direction that most points (N, 3) lie on, or None when none is larger than a person."""
+    normals, offsets = _trials(points, rng)
+    count = (np.abs(points @ normals.T - offsets) < thickness).sum(axis=0)
+    return _best(points, normals, offsets, count, thickness, WALL_SIZE)
+
+
+def _trials(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Normals (T, 3) and offsets (T,) of planes through three points each."""
+    first = points[rng.integers(0, len(points), int(np.clip(TRIALS_TIMES_POINTS // len(points), *TRIALS)))]
+    others = []
+    for seed in first:
+        near = np.flatnonzero(np.abs(points - seed).max(axis=1) < NEIGHBOURHOOD)
+        others.append(points[near[rng.integers(0, len(near), 2)]])
+    second, third = np.stack(others, axis=1)
+    cross = np.cross(second - first, third - first)
+    length = np.linalg.norm(cross, axis=1)
+    kept = length > 1e-6
+    normals = cross[kept] / length[kept, None]
+    return normals, (normals * first[kept]).sum(axis=1)
+
+
+def _best(
+    points: np.ndarray,
+    normals: np.ndarray,
+    offsets: np.ndarray,
+    count: np.ndarray,
+    thickness: float,
+    size: tuple[float, float],
+) -> Plane | None:
+    """The trial with most points, fitted to them by least squares, if they cover enough."""
+    if not len(count) or count.max() < 3:
+        return None
+    best = int(count.argmax())
+    plane = Plane(normals[best], float(offsets[best]))
+    for _ in range(2):
+        on = points[np.abs(plane.height(points)) < thickness]
+        middle = on.mean(axis=0)
+        axes = np.linalg.svd((on - middle).T @ (on - middle))[0]
+        normal = axes[:, 2] * np.sign(axes[:, 2] @ plane.normal)
+        plane = Plane(normal, float(normal @ middle))
+    # Percentiles, or single points far off would stretch a person's back to a wall.
+    along = np.percentile((on - middle) @ axes[:, :2], (5, 95), axis=0)
+    longer, shorter = along[1] - along[0]
+    return plane if longer >= size[0] and shorter >= size[1] else None
