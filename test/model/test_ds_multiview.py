@@ -99,7 +99,7 @@ def test_view_needs_neither_place_nor_all_joints(neutral: MultiViewStructures) -
     joints = neutral.sample(np.random.default_rng(5), "E").joints * 100
     sure = np.ones(len(joints))
     whole = neutral.posterior(joints, sure)
-    np.testing.assert_allclose(neutral.posterior(joints + [500, -30], sure), whole, atol=1e-6)
+    np.testing.assert_allclose(neutral.posterior(joints + np.array([500, -30]), sure), whole, atol=1e-6)
     seen = sure.copy()
     seen[
         [neutral.views[0].joint_names.index(f"{side}_{j}") for side in ("left", "right") for j in ("knee", "ankle")]

@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of pose estimation in single images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flowing_puppet_ros.settings import Settings, setting
+
+
+@dataclass(frozen=True, slots=True)
+class PoseSettings(Settings):
+    """How the particles of the 2D puppet are searched, weighed and selected."""
+
+    particles: int = setting(48, "particles a part that each iteration keeps", low=4, high=1000)
+    iterations: int = setting(6, "rounds of proposing and selecting", low=0, high=1000)
+    modes: int = setting(16, "poses of the detector from which particles start", low=1, high=200)
+    solutions: int = setting(10, "diverse solutions that are given, the best one included", low=1, high=100)
+    seed: int = setting(
+        0, "seed of all random draws; also picks the letters that ids begin with", low=0, high=1_000_000
+    )
+    likelihood: bool = setting(True, "use the image evidence; without it only the body model judges")
+    shape: bool = setting(True, "let the shapes of the parts vary; without it all have their mean shape")
+    diverse: bool = setting(True, "keep diverse particles (D-PMP); without it the best ones (PMP)")
+    evidence_weight: float = setting(1.0, "weight of contour and colour", low=0.0, high=100.0)
+    detector_weight: float = setting(4.0, "weight of the detector's score of the joints", low=0.0, high=100.0)
+    spring: float = setting(0.03, "looseness of the joints between parts", unit="m", low=0.001, high=0.5)
+    scale_deviation: float = setting(0.08, "how far the scales of neighbours differ, as a share", low=0.001, high=1.0)
+    temperature: float = setting(2.0, "cost difference that matters in the diverse selection", low=0.01, high=100.0)
+    longest_side: int = setting(1280, "images are shrunk to this longer side first", unit="px", low=64, high=8192)
