@@ -23,6 +23,10 @@ FLOOR_SIZE = (1.0, 0.5)
 WALL_SIZE = (1.8, 1.2)
 """Least longer and shorter side in metres; a wall's are more than a person has, a floor may be cropped narrowly."""
 
+CELL, COVERED = 0.25, 0.6
+"""Metres, and the share of its sides' product that a plane's points must cover in cells of that size; slices through
+people and furniture cover less."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
@@ -100,6 +104,8 @@ def _best(
         normal = axes[:, 2] * np.sign(axes[:, 2] @ plane.normal)
         plane = Plane(normal, float(normal @ middle))
     # Percentiles, or single points far off would stretch a person's back to a wall.
-    along = np.percentile((on - middle) @ axes[:, :2], (5, 95), axis=0)
-    longer, shorter = along[1] - along[0]
-    return plane if longer >= size[0] and shorter >= size[1] else None
+    along = (on - middle) @ axes[:, :2]
+    longer, shorter = np.ptp(np.percentile(along, (5, 95), axis=0), axis=0)
+    covered = CELL**2 * len(np.unique(np.floor(along / CELL), axis=0))
+    wide = longer >= size[0] and shorter >= size[1]
+    return plane if wide and covered >= COVERED * longer * shorter else None
