@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.geometry import vertex_normals
 
-TANGENTIAL = 0.15
+TANGENTIAL = 0.05
 MIN_COSINE = 0.2
 
 
@@ -59,7 +59,7 @@ def attract(vertices: np.ndarray, faces: np.ndarray, cloud: Cloud, sigma: float)
     """Match both ways and return what draws the vertices to the cloud.
 
     Every vertex that the sensor sees goes to its closest cloud point, every cloud point to its closest vertex; pairs
-    whose normals disagree are dropped. A pair costs its distance along the cloud's normal, squared, plus 0.15 of its
+    whose normals disagree are dropped. A pair costs its distance along the cloud's normal, squared, plus 0.05 of its
     squared length, times the Geman-McClure weight (sigma^2 / (sigma^2 + d^2))^2. Either way weighs 1 in all.
 
     Args:

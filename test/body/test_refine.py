@@ -26,3 +26,11 @@ def test_a_further_term_draws_the_body_where_it_says() -> None:
     assert miss.max() < 0.01
     assert miss.mean() < 0.003
     np.testing.assert_allclose(widths, 0.2 * 0.25 ** (np.arange(5) / 4))
+
+
+def test_without_evidence_the_shape_is_the_expected_one() -> None:
+    model = StitchedPuppet.load("neutral")
+    expected = np.linspace(-1.5, 1.5, model.shape_count)
+    weights = RefineWeights(iterations=6, shape_center=expected)
+    body = Refiner(model).run(model.rest_state(), None, JointTargets.none(model), weights)
+    np.testing.assert_allclose(body.shape, np.tile(expected, (len(model.tree), 1)), atol=0.2)

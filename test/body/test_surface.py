@@ -96,7 +96,7 @@ def test_a_body_on_its_cloud_is_not_pulled(ball: Ball) -> None:
     vertices, faces, cloud = ball
     quadratic = attract(vertices, faces, cloud, 0.1)
     np.testing.assert_allclose(quadratic.vector, 0, atol=1e-12)
-    assert np.trace(quadratic.matrix.sum(axis=0)) == pytest.approx(2 * (1 + 3 * 0.15))
+    assert np.trace(quadratic.matrix.sum(axis=0)) == pytest.approx(2 * (1 + 3 * 0.05))
 
 
 def test_a_moved_body_is_pulled_back(ball: Ball) -> None:
