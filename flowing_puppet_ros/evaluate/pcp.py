@@ -21,7 +21,7 @@ Array = np.ndarray[Any, Any]
 
 THRESHOLD = 0.5
 FOUND = 0.75
-"""Share of the true torso's length that the ends of torso and head are off, on average, at most, if a person is found."""
+"""Share of the true torso's length that the ends of torso and head of a found person are off, on average, at most."""
 
 GROUPS = {
     "torso": ("torso",),

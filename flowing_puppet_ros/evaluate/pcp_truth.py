@@ -35,7 +35,7 @@ def read_truth(path: Path) -> Truth:
         return _annotations(path) or {
             number: [_person_sticks(one) for one in people] for number, people in read_keypoints(path).items()
         }
-    return {number: people for number, people in read_sticks(path).items()}
+    return dict(read_sticks(path).items())
 
 
 def _annotations(path: Path) -> Truth | None:

@@ -114,11 +114,11 @@ class PoseEstimator:
             raise InputError(f"an image must be (H,W) or (H,W,3) uint8, this one is {image.shape} {image.dtype}")
         if keypoints is None and self._detector is None:
             raise InputError("without a detector the pose needs keypoints of the people")
-        colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
         factor = min(1.0, self._settings.longest_side / max(image.shape[:2]))
         if factor < 1.0:
             height, width = np.maximum(np.rint(np.array(image.shape[:2]) * factor), 1).astype(int)
-            colour = cv2.resize(colour, (int(width), int(height)), interpolation=cv2.INTER_AREA)
+            image = cv2.resize(image, (int(width), int(height)), interpolation=cv2.INTER_AREA)
+        colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
         # Sums of several BLAS threads would differ in their last bits.
         with threadpool_limits(1):
             found = self._found(colour, keypoints, factor)
