@@ -2,7 +2,8 @@
 """Track people in a video, a folder of frames or a bag: joints, part outlines and depth order in every frame.
 
 People start at the keypoints of --init, are carried by optical flow, and are pulled back wherever keypoints are given
-again. A bag brings its own detections.
+again. A bag brings its own detections. At the end joints are smoothed along the flow, over the whole input, unless
+--live is given.
 """
 
 from __future__ import annotations
@@ -11,7 +12,8 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +21,11 @@ from tqdm import tqdm
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowSettings
+from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
-from flowing_puppet_ros.image.tracker import FlowingPuppetTracker
+from flowing_puppet_ros.image.smoothing import SmoothingSettings
+from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.tracks import puppet_entry, read_keypoints, write_tracks
 from flowing_puppet_ros.image.video import Frame, open_frames
 from flowing_puppet_ros.model.ds import DeformableStructures
@@ -29,6 +33,7 @@ from flowing_puppet_ros.model.ds import DeformableStructures
 BAG_SUFFIXES = frozenset({".mcap", ".db3"})
 
 type Detected = tuple[Frame, list[Keypoints] | None]
+type Tracked = tuple[int, int, str, list[TrackedPuppet]]  # index, stamp, path of a frame, and its people
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,19 +46,51 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
     parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object")
+    parser.add_argument("--live", action="store_true", help="use no frame after the one on show, as the nodes do")
     TrackerSettings.add_arguments(parser)
     FlowSettings.add_arguments(parser)
+    SmoothingSettings.add_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Track through the whole input and write the tracks."""
     model = DeformableStructures.load(arguments.model, arguments.parts)
     settings = TrackerSettings.from_arguments(arguments), FlowSettings.from_arguments(arguments)
+    smoothing = SmoothingSettings.from_arguments(arguments)
     tracker = FlowingPuppetTracker(model, *settings)
     detected, fps, count = _open(arguments)
-    frames: list[dict[str, Any]] = []
-    began, last = time.monotonic(), ""
-    for frame, detections in tqdm(detected, total=count or None, unit="frame", disable=None):
+    tally = _Tally()
+    steps = _tracked(tracker, tqdm(detected, total=count or None, unit="frame", disable=None))
+    people = _live(steps) if arguments.live else _whole(steps, Clip(model, smoothing))
+    began = time.monotonic()
+    write_tracks(arguments.out, model.joint_names, fps, tally.counted(_entries(people, model)))
+    if not tally.frames:
+        Path(arguments.out).unlink(missing_ok=True)
+        raise InputError(f"{arguments.input} has no image that can be used")
+    _summarise(arguments, tally, time.monotonic() - began)
+    return 0
+
+
+@dataclass
+class _Tally:
+    """What was written."""
+
+    frames: int = 0
+    with_people: int = 0
+    ids: set[str] = field(default_factory=set)
+
+    def counted(self, entries: Iterable[dict[str, Any]]) -> Iterator[dict[str, Any]]:
+        for entry in entries:
+            self.frames += 1
+            self.with_people += bool(entry["puppets"])
+            self.ids |= {puppet["id"] for puppet in entry["puppets"]}
+            yield entry
+
+
+def _tracked(tracker: FlowingPuppetTracker, detected: Iterable[Detected]) -> Iterator[tuple[Frame, TrackResult]]:
+    """Step through the frames; one that cannot be used is warned of and left out."""
+    last = ""
+    for frame, detections in detected:
         try:
             result = tracker.step(frame.image, frame.stamp_ns, detections)
         except InputError as error:
@@ -63,14 +100,28 @@ def run(arguments: argparse.Namespace) -> int:
             if warning != last:
                 _warn(f"frame {frame.index}: {warning}")
             last = warning
-        puppets = [puppet_entry(puppet, model.tree) for puppet in result.puppets]
-        entry = {"index": frame.index, "stamp_ns": frame.stamp_ns, "puppets": puppets}
-        frames.append(entry | ({"path": frame.path} if frame.path else {}))
-    if not frames:
-        raise InputError(f"{arguments.input} has no image that can be used")
-    write_tracks(arguments.out, model.joint_names, fps, frames)
-    _summarise(arguments, frames, time.monotonic() - began)
-    return 0
+        yield frame, result
+
+
+def _live(steps: Iterable[tuple[Frame, TrackResult]]) -> Iterator[Tracked]:
+    for frame, result in steps:
+        yield frame.index, frame.stamp_ns, frame.path, result.puppets
+
+
+def _whole(steps: Iterable[tuple[Frame, TrackResult]], clip: Clip) -> Iterator[Tracked]:
+    seen = []
+    for frame, result in steps:
+        clip.add(result)
+        seen.append((frame.index, frame.stamp_ns, frame.path))
+    for (index, stamp_ns, path), puppets in zip(seen, clip.people(), strict=True):
+        yield index, stamp_ns, path, puppets
+
+
+def _entries(tracked: Iterable[Tracked], model: DeformableStructures) -> Iterator[dict[str, Any]]:
+    for index, stamp_ns, path, puppets in tracked:
+        people = [puppet_entry(puppet, model.tree) for puppet in puppets]
+        entry: dict[str, Any] = {"index": index, "stamp_ns": stamp_ns, "puppets": people}
+        yield entry | ({"path": path} if path else {})
 
 
 def _warn(sentence: str) -> None:
@@ -115,13 +166,14 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
 
 
-def _summarise(arguments: argparse.Namespace, frames: list[dict[str, Any]], seconds: float) -> None:
-    ids = sorted({puppet["id"] for frame in frames for puppet in frame["puppets"]})
-    with_people = sum(bool(frame["puppets"]) for frame in frames)
+def _summarise(arguments: argparse.Namespace, tally: _Tally, seconds: float) -> None:
+    ids = sorted(tally.ids)
     if arguments.json:
-        counts = {"frames": len(frames), "frames_with_people": with_people, "ids": ids}
+        counts = {"frames": tally.frames, "frames_with_people": tally.with_people, "ids": ids}
         print(json.dumps({"input": arguments.input, "out": arguments.out} | counts | {"seconds": round(seconds, 3)}))
     else:
-        rate = len(frames) / max(seconds, 1e-9)
+        rate = tally.frames / max(seconds, 1e-9)
         names = ", ".join(ids) or "none"
-        print(f"{arguments.out}: {len(frames)} frames, people in {with_people}, ids {names}, {rate:.1f} frames/s")
+        print(
+            f"{arguments.out}: {tally.frames} frames, people in {tally.with_people}, ids {names}, {rate:.1f} frames/s"
+        )

@@ -48,8 +48,9 @@ class Person:
     """State of one track; joints in pixels of the image.
 
     `mean` (J, 2), isotropic `variance` (J,) px^2, `quality` (J,) of the detections behind each joint, `doubted`
-    (J, 2) last detected place that the gate refused (NaN none), `doubts` (J,) how often in a row it stood there and
-    `age` (J,) how many images ago a detection was last taken.
+    (J, 2) last detected place that the gate refused (NaN none), `doubts` (J,) how often in a row it stood there,
+    `age` (J,) how many images ago a detection was last taken, and `detected` (J, 3) this image's detection as x, y and
+    confidence, or None.
     """
 
     id: str
@@ -61,6 +62,7 @@ class Person:
     age: NDArray[np.int64]
     scale: float
     view: View
+    detected: Floats | None = None
     votes: float = 0.0
     unseen: int = 0
     missed: int = 0
@@ -82,7 +84,9 @@ class Person:
         votes = VIEW_TURNS if view == "front" else -VIEW_TURNS
         nowhere = np.full((count, 2), np.nan)
         doubts, age = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-        person = cls(identity, joints.copy(), variance, confidence.copy(), nowhere, doubts, age, scale, view, votes)
+        detected = np.column_stack([joints, confidence])
+        state = identity, joints.copy(), variance, confidence.copy(), nowhere, doubts, age, scale, view, detected, votes
+        person = cls(*state)
         person.settle(model)
         return person
 
@@ -130,6 +134,7 @@ class Person:
         there. Sets `detection_energy`, half the squared
         distance in deviations summed over the joints that were fused.
         """
+        self.detected = np.column_stack([joints, confidence])
         seen = np.isfinite(joints).all(axis=1) & (confidence > 0)
         noise = detection_variance(np.where(seen, confidence, 1.0), self.scale, settings)
         total = self.variance + noise

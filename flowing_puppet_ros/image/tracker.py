@@ -42,7 +42,8 @@ class TrackedPuppet:
 
     `joints` (J, 2) in the order of the model's joint_names, `confidence` (J,) in [0, 1], `scale` px/m, `view` front or
     back, `contours` one (K_i, 2) a part, `depth` (P,) paint order of each part, 0 farthest, `energy` the negative log
-    of the body prior, the flow's misfit and the distance of the detection (up to a constant; lower is better).
+    of the body prior, the flow's misfit and the distance of the detection (up to a constant; lower is better),
+    `detected` (J, 3) what this image's detection says, x, y and confidence, or None.
     """
 
     id: str
@@ -55,6 +56,7 @@ class TrackedPuppet:
     contours: tuple[Floats, ...]
     depth: tuple[int, ...]
     shape: PuppetShape
+    detected: Floats | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,13 +70,13 @@ class TrackResult:
     flow: FlowPair | None
     warnings: list[str]
     _model: DeformableStructures
-    _grid: Grid
+    grid: Grid
     _carriage: Carriage | None
 
     def labels(self, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Part labels (H, W) uint8 of all people, part index + 1, 0 background; `shape` is the image's if not given."""
-        height, width = shape or (self._grid.image[1], self._grid.image[0])
-        grid = Grid(self._grid.image, (width, height))
+        height, width = shape or (self.grid.image[1], self.grid.image[0])
+        grid = Grid(self.grid.image, (width, height))
         labels = paint_people(self._model, [puppet.shape for puppet in self.puppets], grid)
         parts = len(self._model.tree)
         return np.where(labels > 0, (labels - 1) % parts + 1, 0).astype(np.uint8)
@@ -173,6 +175,7 @@ class FlowingPuppetTracker:
         for person in self.people:
             person.unseen += 1
             person.detection_energy = 0.0
+            person.detected = None
         if detections is None:
             return
         found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
@@ -231,6 +234,7 @@ class FlowingPuppetTracker:
             shape.contours,
             depth,
             shape,
+            person.detected,
         )
 
 

@@ -11,18 +11,66 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.keypoints import Keypoints, normalise_name
-from flowing_puppet_ros.image.tracker import TrackedPuppet
+from flowing_puppet_ros.model.ds_shape import View
 from flowing_puppet_ros.model.tree import PartTree
+
+type Floats = NDArray[np.float64]
 
 DECIMALS = 2  # of a pixel
 MOST_DIGITS = 18  # of a frame's index
+
+
+class Puppet(Protocol):
+    """What the files say of one person in one image, see `tracker.TrackedPuppet`."""
+
+    @property
+    def id(self) -> str:
+        """Name of the person."""
+        ...
+
+    @property
+    def view(self) -> View:
+        """Side that the camera sees."""
+        ...
+
+    @property
+    def scale(self) -> float:
+        """Pixels per metre."""
+        ...
+
+    @property
+    def energy(self) -> float:
+        """Energy in nats; lower is more likely."""
+        ...
+
+    @property
+    def joints(self) -> Floats:
+        """Joints (J, 2) px."""
+        ...
+
+    @property
+    def confidence(self) -> Floats:
+        """Confidence (J,) in [0, 1]."""
+        ...
+
+    @property
+    def contours(self) -> tuple[Floats, ...]:
+        """Outline (K_i, 2) px of each part."""
+        ...
+
+    @property
+    def depth(self) -> tuple[int, ...]:
+        """Paint order of each part, 0 farthest."""
+        ...
 
 
 def read_keypoints(path: str | Path) -> dict[int, list[Keypoints]]:
@@ -61,7 +109,7 @@ def _person(names: tuple[str, ...], rows: Any, where: str) -> Keypoints:
     return Keypoints(names, values[:, :2], np.nan_to_num(values[:, 2]))
 
 
-def puppet_entry(puppet: TrackedPuppet, tree: PartTree) -> dict[str, Any]:
+def puppet_entry(puppet: Puppet, tree: PartTree) -> dict[str, Any]:
     """The JSON object of one puppet."""
     joints = [
         [_number(x), _number(y), _number(confidence, 3)]
@@ -79,11 +127,19 @@ def _number(value: float, decimals: int = DECIMALS) -> float | None:
     return round(float(value), decimals) if math.isfinite(value) else None
 
 
-def write_tracks(path: str | Path, joint_names: tuple[str, ...], fps: float, frames: list[dict[str, Any]]) -> None:
-    """Write tracks.json; InputError when the place cannot be written."""
-    document = {"joint_names": list(joint_names), "fps": fps, "frames": frames}
+def write_tracks(path: str | Path, joint_names: tuple[str, ...], fps: float, frames: Iterable[dict[str, Any]]) -> None:
+    """Write tracks.json frame by frame, and put it in place when it is whole; InputError when it cannot be written."""
+    place = Path(path)
+    draft = place.with_name(f".{place.name}.part")
     try:
-        Path(path).parent.mkdir(parents=True, exist_ok=True)
-        Path(path).write_text(json.dumps(document, allow_nan=False), encoding="utf-8")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with draft.open("w", encoding="utf-8") as file:
+            file.write(f'{{"joint_names": {json.dumps(list(joint_names))}, "fps": {json.dumps(fps)}, "frames": [')
+            for number, frame in enumerate(frames):
+                file.write(("," if number else "") + "\n" + json.dumps(frame, allow_nan=False))
+            file.write("\n]}\n")
+        draft.replace(place)
     except OSError as error:
         raise InputError(f"{path} cannot be written: {error.strerror}") from error
+    finally:
+        draft.unlink(missing_ok=True)

@@ -81,6 +81,22 @@ def test_same_bits_twice_and_another_seed_another_id(frames: Path, tmp_path: Pat
     assert json.loads(texts[0])["frames"][0]["puppets"] == []
 
 
+def test_live_uses_no_later_frame_and_the_whole_clip_does(frames: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    shaken = {str(k): [(np.array(start()) + [*rng.normal(0, 4, 2), 0]).tolist()] for k in range(6)}
+    joints = {}
+    for name, count, flags in (("l6", 6, ["--live"]), ("l4", 4, ["--live"]), ("b6", 6, []), ("b4", 4, [])):
+        init = write_keypoints(tmp_path / "k.json", {k: shaken[k] for k in list(shaken)[:count]})
+        assert main(["track", str(frames), "--init", str(init), "--out", str(tmp_path / name), *flags]) == 0
+        tracks = json.loads((tmp_path / name).read_text())
+        joints[name] = np.array([frame["puppets"][0]["joints"] for frame in tracks["frames"][:4]])
+    np.testing.assert_array_equal(joints["l6"], joints["l4"])
+    assert np.abs(joints["b6"] - joints["b4"]).max() > 0.1
+    # Joints below the image have no flow to follow.
+    shake = {name: np.linalg.norm(np.diff(at[:, PUPPET.joints[:, 1] < 230], 2, axis=0)) for name, at in joints.items()}
+    assert shake["b6"] < 0.5 * shake["l6"]
+
+
 def test_json_prints_one_object(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     init = write_keypoints(tmp_path / "k.json", {"0": [start()], "2": []})
     assert main(["track", str(frames), "--init", str(init), "--out", str(tmp_path / "o.json"), "--json"]) == 0

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole clip at once: the tracker runs through it, then every person's joints are smoothed along the flow.
+
+The images are seen once; what is kept of an image is some hundred numbers a person, however large the image is.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.image.smoothing import SmoothingSettings, joint_motion, smoothed
+from flowing_puppet_ros.image.tracker import TrackedPuppet, TrackResult
+from flowing_puppet_ros.model.ds import DeformableStructures
+
+type Floats = NDArray[np.float64]
+
+
+@dataclass(slots=True, eq=False)
+class _Moment:
+    """A person in one image: the tracked `puppet` without its outlines, and its motion from the image before."""
+
+    image: int
+    puppet: TrackedPuppet
+    body_energy: float
+    motion: Floats
+    trust: Floats
+
+
+@dataclass(slots=True, eq=False)
+class Clip:
+    """Collects the tracker's results of consecutive images and gives the smoothed people of each."""
+
+    model: DeformableStructures
+    settings: SmoothingSettings
+    images: int = 0
+    _tracks: dict[str, list[_Moment]] = field(default_factory=lambda: defaultdict(list))
+
+    def add(self, result: TrackResult) -> None:
+        """Take the result of the next image."""
+        for puppet in result.puppets:
+            track = self._tracks[puppet.id]
+            count = len(puppet.joints)
+            motion, trust = np.zeros((count, 2)), np.zeros(count)
+            if result.flow is not None and track and track[-1].image == self.images - 1:
+                before, after = _place(track[-1].puppet), _place(puppet)
+                motion, trust = joint_motion(result.flow, result.grid, before, after)
+            energy = self.model.energy(puppet.shape)
+            bare = replace(puppet, contours=(), shape=replace(puppet.shape, contours=()))
+            track.append(_Moment(self.images, bare, energy, motion, trust))
+        self.images += 1
+
+    def people(self) -> Iterator[list[TrackedPuppet]]:
+        """The people of each image, in the order of the images."""
+        joints = {identity: self._smoothed(track) for identity, track in self._tracks.items()}
+        at = dict.fromkeys(self._tracks, 0)
+        for image in range(self.images):
+            found = []
+            for identity, track in self._tracks.items():
+                k = at[identity]
+                if k < len(track) and track[k].image == image:
+                    found.append(self._puppet(track[k], joints[identity][k]))
+                    at[identity] = k + 1
+            yield found
+
+    def _smoothed(self, track: list[_Moment]) -> Floats:
+        """Joints (T, J, 2) of one person, whose images are consecutive."""
+        start = np.array([moment.puppet.joints for moment in track])
+        unknown = np.full((start.shape[1], 3), np.nan)
+        detected = np.array([unknown if m.puppet.detected is None else m.puppet.detected for m in track])
+        confidence = np.where(np.isfinite(detected).all(axis=2), detected[..., 2], 0.0)
+        motion, trust = np.array([m.motion for m in track[1:]]), np.array([m.trust for m in track[1:]])
+        if len(track) < 2 or not (confidence > 0).any():
+            return start
+        places = np.where(confidence[..., None] > 0, detected[..., :2], np.nan)
+        scale = float(np.median([moment.puppet.scale for moment in track]))
+        joints = smoothed(places, confidence, motion, trust, start, scale, self.settings)
+        # The body model has placed what nobody ever saw; along the flow alone it would drift.
+        never = ~(confidence > 0).any(axis=0)
+        joints[:, never] = start[:, never]
+        return joints
+
+    def _puppet(self, moment: _Moment, joints: Floats) -> TrackedPuppet:
+        puppet = moment.puppet
+        shape = self.model.puppet_from_joints(joints, puppet.scale, puppet.view)
+        energy = puppet.energy - moment.body_energy + self.model.energy(shape)
+        return replace(puppet, joints=joints, contours=shape.contours, shape=shape, energy=energy)
+
+
+def _place(puppet: TrackedPuppet) -> Floats:
+    """Where the flow is asked: at the detected joints, else at the tracked ones."""
+    if puppet.detected is None:
+        return puppet.joints
+    return np.where(np.isfinite(puppet.detected[:, :2]), puppet.detected[:, :2], puppet.joints)
