@@ -83,7 +83,8 @@ def test_same_bits_twice_and_another_seed_another_id(frames: Path, tmp_path: Pat
 
 def test_live_uses_no_later_frame_and_the_whole_clip_does(frames: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
-    shaken = {str(k): [(np.array(start()) + [*rng.normal(0, 4, 2), 0]).tolist()] for k in range(6)}
+    shift = np.column_stack([rng.normal(0, 4, (6, 2)), np.zeros(6)])
+    shaken = {str(k): [np.add(start(), shift[k]).tolist()] for k in range(6)}
     joints = {}
     for name, count, flags in (("l6", 6, ["--live"]), ("l4", 4, ["--live"]), ("b6", 6, []), ("b4", 4, [])):
         init = write_keypoints(tmp_path / "k.json", {k: shaken[k] for k in list(shaken)[:count]})
