@@ -13,7 +13,7 @@ import numpy as np
 
 from flowing_puppet_ros.body.particles import Particles
 from flowing_puppet_ros.body.points import PartPoints
-from flowing_puppet_ros.evidence.cloud import CloudGrid
+from flowing_puppet_ros.evidence.cloud import DataCost
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 TOO_CLOSE = 0.05  # metres between the centres of neighbours, Eq. 51
@@ -61,10 +61,10 @@ class Judged:
     interfaces: dict[int, np.ndarray]
 
     @classmethod
-    def judge(cls, points: PartPoints, particles: Particles, grid: CloudGrid, targets: JointTargets) -> Judged:
+    def judge(cls, points: PartPoints, particles: Particles, cloud: DataCost, targets: JointTargets) -> Judged:
         """Compare particles of one part with the cloud and with believed joints."""
         normals = points.normals @ particles.rotation.transpose(0, 2, 1)
-        distance, mismatch = grid.data_cost(points.surface.world(particles), normals)
+        distance, mismatch = cloud.data_cost(points.surface.world(particles), normals)
         weight = targets.weight[points.joint_index]
         gap = points.joints.world(particles) - targets.points[points.joint_index]
         interfaces = {edge: interface.world(particles) for edge, interface in points.interfaces.items()}

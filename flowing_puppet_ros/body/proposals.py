@@ -104,6 +104,25 @@ class Proposer:
             np.clip(shape, -DEVIATIONS, DEVIATIONS),
         )
 
+    def hang(self, part: int, parent: Particles, shape: np.ndarray, rng: np.random.Generator) -> Particles:
+        """Hang a part on particles of its parent, turned anyhow within the joint's limits.
+
+        Args:
+            part: which one.
+            parent: one particle for each new one.
+            shape: (S,) intrinsic shape of the new ones.
+            rng: source of all randomness.
+        """
+        edge, above = part - 1, self._model.tree.parents[part]
+        relative = rng.uniform(self._model.limit_low[edge], self._model.limit_high[edge], (len(parent), 3))
+        drawn = self._deformation[part, above][1].sample(rng, np.concatenate([relative, parent.pose], axis=1))
+        pose, shapes = np.clip(drawn, -DEVIATIONS, DEVIATIONS), np.tile(shape, (len(parent), 1))
+        rotation = parent.rotation @ so3.exp(relative)
+        weight = self._model.interfaces[edge].weight
+        target = np.average(self._points[above].interfaces[edge].world(parent), axis=1, weights=weight)
+        own = np.average(self._points[part].interfaces[edge].local(pose, shapes), axis=1, weights=weight)
+        return Particles(target - (rotation @ own[:, :, None])[:, :, 0], rotation, pose, shapes)
+
     def _from_neighbour(self, part: int, other: int, source: Judged, rng: np.random.Generator) -> Particles:
         """Stitch `part` to particles of its neighbour, with its deformation drawn given the neighbour's.
 

@@ -58,3 +58,14 @@ def local_stages(tree: PartTree) -> tuple[Stage, ...]:
     ones = np.ones(len(tree))
     middle = WalkNoise(center=0.02, rotation=0.12, pose=0.4, shape=0.2)
     return (Stage(0.7, half, ones, middle, False), Stage(1.0, half, ones, NARROW, True))
+
+
+def limb_stages(tree: PartTree) -> tuple[Stage, ...]:
+    """A schedule for one limb whose place is unknown while the rest of the body stays."""
+    half = np.full(len(tree) - 1, 0.5)
+    ones = np.ones(len(tree))
+    return (
+        Stage(0.5, half, ones, WIDE, False),
+        Stage(0.8, half, ones, NARROW, False),
+        Stage(1.0, half, ones, NARROW, True),
+    )

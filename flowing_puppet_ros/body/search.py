@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +14,13 @@ from flowing_puppet_ros.body.particles import Particles, particles_of, state_of
 from flowing_puppet_ros.body.points import PartPoints
 from flowing_puppet_ros.body.proposals import Proposer
 from flowing_puppet_ros.body.schedule import Stage, four_stages
-from flowing_puppet_ros.evidence.cloud import CloudGrid
+from flowing_puppet_ros.body.threads import ordered
+from flowing_puppet_ros.evidence.cloud import CloudGrid, DataCost
 from flowing_puppet_ros.inference.diverse import select_diverse
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product, message_foundation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+
+NO_GRIDS: Mapping[int, CloudGrid] = {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,47 +70,50 @@ class Search:
         iterations: int,
         rng: np.random.Generator,
         progress: Callable[[float], None] | None = None,
+        own: Mapping[int, CloudGrid] = NO_GRIDS,
+        threads: int = 1,
     ) -> Found:
         """Improve particles and return the best body.
 
         Args:
-            start: per part the first particles; their number stays.
+            start: per part the first particles; their number stays, and a part with a single one stays as it is.
             grid: the cloud.
             targets: believed joints.
             stages: schedule; the last one ends at 1.
             iterations: rounds of proposing and selecting.
             rng: source of all randomness.
             progress: called with the fraction done.
+            own: clouds of the parts that do not see `grid`.
+            threads: how many; the result does not depend on it.
         """
         counts = [len(particles) for particles in start]
+        grids = [own.get(part, grid) for part in range(len(start))]
+        searched = [part for part, count in enumerate(counts) if count > 1]
         judged = [
             Judged.judge(points, particles, grid, targets)
-            for points, particles in zip(self._points, start, strict=True)
+            for points, particles, grid in zip(self._points, start, grids, strict=True)
         ]
         best = self._solve(judged, stages[0])[0].assignment
         for iteration in range(iterations):
             stage = next(stage for stage in stages if iteration < stage.until * iterations or stage is stages[-1])
-            proposed = [self._propose(part, judged, best, stage, rng) for part in range(len(judged))]
-            judged = [
-                group.extend(Judged.judge(points, self._improve(points, new, grid, targets), grid, targets))
-                for points, group, new in zip(self._points, judged, proposed, strict=True)
-            ]
+            proposed = [(part, self._propose(part, judged, best, stage, rng)) for part in searched]
+            improved = ordered(lambda pair: self._improved(*pair, grids[pair[0]], targets), proposed, threads)
+            for part, new in zip(searched, improved, strict=True):
+                judged[part] = judged[part].extend(new)
             result, edges = self._solve(judged, stage)
-            judged = [
-                group.take(self._select(part, counts[part], result, edges, stage.greedy))
-                for part, group in enumerate(judged)
-            ]
+            for part in searched:
+                judged[part] = judged[part].take(self._select(part, counts[part], result, edges, stage.greedy))
             best = np.zeros(len(judged), dtype=np.int64)
             if progress is not None:
                 progress((iteration + 1) / iterations)
         result, _ = self._solve(judged, stages[-1])
         return Found(state_of(self._model, [group.particles for group in judged], result.assignment), result.cost)
 
-    def energy(self, state: BodyState, grid: CloudGrid) -> float:
+    def energy(self, state: BodyState, cloud: DataCost) -> float:
         """Eq. 50 of one body, with every weight as in the last stage of the search."""
         none = JointTargets.none(self._model)
         judged = [
-            Judged.judge(points, group, grid, none)
+            Judged.judge(points, group, cloud, none)
             for points, group in zip(self._points, particles_of(self._model, [state]), strict=True)
         ]
         return self._solve(judged, four_stages(self._model.tree)[-1])[0].cost
@@ -120,8 +126,9 @@ class Search:
             return self._proposer.walk(copies, stage.noise, rng, deformation_only=0.5)
         return self._proposer.propose(part, judged, stage.noise, self._weights.neighbours, rng)
 
-    def _improve(self, points: PartPoints, new: Particles, grid: CloudGrid, targets: JointTargets) -> Particles:
-        return improve(points, new, grid, targets, self._weights.lm_steps, self._weights.lm_points)
+    def _improved(self, part: int, new: Particles, grid: CloudGrid, targets: JointTargets) -> Judged:
+        moved = improve(self._points[part], new, grid, targets, self._weights.lm_steps, self._weights.lm_points)
+        return Judged.judge(self._points[part], moved, grid, targets)
 
     def _solve(self, judged: list[Judged], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
         """Run max-product with the weights of a stage (Eqs. 50-52)."""

@@ -10,14 +10,45 @@ the points that the cells around it have taken, which may miss the nearest one b
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numba import njit
+from scipy.spatial import cKDTree
 
 MAX_CELLS = 2_000_000
 DISTANCE_OFFSET = 0.001
 DISTANCE_POWER = 0.45
 MISMATCH_COSINE = np.cos(0.75 * np.pi)
+
+
+class DataCost(Protocol):
+    """A cloud that surface points are compared with."""
+
+    def data_cost(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `CloudGrid.data_cost`."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExactCloud:
+    """A cloud whose nearest points are found exactly: for one body rather than for many particles.
+
+    Attributes:
+        points: (N, 3) metres.
+        normals: (N, 3) unit vectors pointing out of the body.
+        tree: of `points`.
+    """
+
+    points: np.ndarray
+    normals: np.ndarray
+    tree: cKDTree
+
+    def data_cost(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The same as `CloudGrid.data_cost`."""
+        distance, index = self.tree.query(points)
+        cosine = (normals * self.normals[index]).sum(axis=-1)
+        cost = ((distance**2 + DISTANCE_OFFSET) ** DISTANCE_POWER).mean(axis=-1)
+        return cost, (cosine < MISMATCH_COSINE).mean(axis=-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

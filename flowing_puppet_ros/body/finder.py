@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finding a body of unknown pose: a search, and hypotheses of what it may have got wrong.
+
+The energy hardly tells a body from the same one turned around, and a limb in the air or on another limb costs little.
+The distance both ways, body to cloud and cloud to body, tells: every hypothesis is fitted and the closest body kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
+from flowing_puppet_ros.body.energy import JointTargets
+from flowing_puppet_ros.body.initial import sampled_bodies, turned_around
+from flowing_puppet_ros.body.judgement import Judgement, judged
+from flowing_puppet_ros.body.limbs import LimbSearch, limb_groups
+from flowing_puppet_ros.body.particles import Particles, particles_of
+from flowing_puppet_ros.body.points import part_points
+from flowing_puppet_ros.body.proposals import Proposer, WalkNoise
+from flowing_puppet_ros.body.refine import Refiner, RefineWeights
+from flowing_puppet_ros.body.schedule import four_stages, local_stages
+from flowing_puppet_ros.body.search import Search, SearchWeights
+from flowing_puppet_ros.body.threads import ordered, usable
+from flowing_puppet_ros.evidence.cloud import CloudGrid
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+from flowing_puppet_ros.settings import Settings, setting
+
+Progress = Callable[[float], None]
+# Steps of the finish of a hypothesis, rounds of limb hypotheses, and how many of a round are finished.
+HYPOTHESIS_STEPS, LIMB_ROUNDS, LIMBS_FINISHED = 12, 3, 3
+# A limb hypothesis must be this much closer than the body that it came from.
+CLOSER = 0.98
+
+
+@dataclass(frozen=True, slots=True)
+class FitterSettings(Settings):
+    """Settings of `BodyFitter`; the defaults are the fast ones, the thesis's are 80 particles and 120 iterations."""
+
+    particles: int = setting(40, "particles a part", low=4, high=1000)
+    iterations: int = setting(50, "rounds of the search when nothing is known of the pose", low=1, high=10000)
+    local_particles: int = setting(20, "particles a part when the pose is roughly known", low=4, high=1000)
+    local_iterations: int = setting(16, "rounds of the search when the pose is roughly known", low=0, high=10000)
+    lm_steps: int = setting(4, "Levenberg-Marquardt steps a new particle", low=0, high=50)
+    refine_iterations: int = setting(25, "Gauss-Newton steps of the finish", low=0, high=200)
+    cloud_points: int = setting(10000, "points that a cloud is thinned to", low=200, high=200000)
+    joint_strength: float = setting(0.02, "pull of an initial joint against the whole cloud's", low=0.0, high=100.0)
+    clip_factor: float = setting(2.0, "limb radii around the initial joints' axes that a cloud is clipped to, 0: none",
+                                 low=0.0, high=20.0)  # fmt: skip
+    restarts: int = setting(1, "searches from new starts while no body comes close to the cloud", low=0, high=20)
+    restart_distance: float = setting(0.02, "two-way distance at which a body is close", unit="m", low=0.0, high=1.0)
+    surface_finish: bool = setting(True, "let the surface leave the model's where a whole cloud is dense")
+    threads: int = setting(2, "threads, at most the cores there are; the result does not depend on it",
+                           low=1, high=64)  # fmt: skip
+    seed: int = setting(0, "seed of all that is random", low=0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """A body and what the cloud says of it."""
+
+    state: BodyState
+    judgement: Judgement
+
+    @property
+    def distance(self) -> float:
+        """Two-way distance, metres."""
+        return self.judgement.distance
+
+
+class BodyFinder:
+    """The search, its hypotheses and the finish, for one model."""
+
+    def __init__(self, model: StitchedPuppet, settings: FitterSettings) -> None:
+        self._model = model
+        self._settings = settings
+        self._threads = usable(settings.threads)
+        points = part_points(model)
+        self.search = Search(model, points, SearchWeights(lm_steps=settings.lm_steps))
+        self.refiner = Refiner(model)
+        self._proposer = Proposer(model, points)
+        self._limbs = LimbSearch(model, self.search, self._proposer)
+
+    def find(self, cloud: Cloud, rng: np.random.Generator, progress: Progress) -> BodyState:
+        """The body of a cloud of which nothing but the upright is known."""
+        grid = CloudGrid.build(cloud.points, cloud.normals)
+        none, steps = JointTargets.none(self._model), self._settings.refine_iterations
+        tries = 1 + self._settings.restarts
+        tried: list[Candidate] = []
+        for turn in range(tries):
+            for candidate in self._two_bodies(cloud, grid, rng, part_of(progress, turn / tries, (turn + 0.7) / tries)):
+                tried.append(self._mended(candidate, cloud, grid, rng))
+                best = min(tried, key=lambda candidate: candidate.distance)
+                if best.distance < self._settings.restart_distance:
+                    return self.finish(best.state, cloud, none, steps)
+        return self.finish(best.state, cloud, none, steps)
+
+    def near(
+        self, body: BodyState, grid: CloudGrid, targets: JointTargets, rng: np.random.Generator, progress: Progress
+    ) -> BodyState:
+        """Search around a body; the body itself is among the first particles."""
+        start = []
+        for group in particles_of(self._model, [body]):
+            copies = group.take(np.zeros(self._settings.local_particles - 1, dtype=np.int64))
+            walked = self._proposer.walk(copies, WalkNoise(0.02, 0.12, 0.5, 0.2), rng)
+            start.append(Particles.join([group, walked]))
+        stages, iterations = local_stages(self._model.tree), self._settings.local_iterations
+        return self.search.run(start, grid, targets, stages, iterations, rng, progress, threads=self._threads).state
+
+    def finish(self, body: BodyState, cloud: Cloud, targets: JointTargets, steps: int) -> BodyState:
+        """The body after `steps` of the Gauss-Newton over all parts."""
+        weights = RefineWeights(iterations=steps)
+        if cloud.viewpoint is not None:
+            # What is hidden is only known from the joints' usual angles and from usual shapes.
+            weights = RefineWeights(shape=1e-5, pairwise=4e-6, iterations=steps)
+        return self.refiner.run(body, cloud, targets, weights)
+
+    def _candidate(self, body: BodyState, cloud: Cloud) -> Candidate:
+        """A hypothesis after a short finish, judged."""
+        steps = min(HYPOTHESIS_STEPS, self._settings.refine_iterations)
+        state = self.finish(body, cloud, JointTargets.none(self._model), steps)
+        return Candidate(state, judged(self._model, self._model.vertices(state), cloud))
+
+    def _two_bodies(
+        self, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator, progress: Progress
+    ) -> list[Candidate]:
+        """Search with unknown yaw: the body found and the best one that faces the other way, the closer one first."""
+        none = JointTargets.none(self._model)
+        bodies = sampled_bodies(self._model, _body_center(cloud), self._settings.particles, rng)
+        noise = WalkNoise(center=0.05, rotation=0.1, pose=0.0, shape=0.0)
+        start = [self._proposer.walk(group, noise, rng) for group in particles_of(self._model, bodies)]
+        stages, iterations = four_stages(self._model.tree), self._settings.iterations
+        found = self.search.run(
+            start, grid, none, stages, iterations, rng, part_of(progress, 0.0, 0.8), threads=self._threads
+        )
+        body = self._candidate(found.state, cloud)
+        turned = self.near(turned_around(self._model, body.state), grid, none, rng, part_of(progress, 0.8, 1.0))
+        return sorted([body, self._candidate(turned, cloud)], key=lambda candidate: candidate.distance)
+
+    def _mended(self, body: Candidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> Candidate:
+        """The body with limbs moved to where they lie closer, while one seems to be in a wrong place."""
+        groups = limb_groups(self._model.tree)
+        for _ in range(LIMB_ROUNDS):
+            if not body.judgement.doubtful:
+                break
+            kept, streams = body, dict(zip(groups, rng.spawn(len(groups)), strict=True))
+
+            def moved(group: tuple[int, ...]) -> tuple[float, BodyState] | None:
+                state = self._limbs.run(kept.state, group, cloud, grid, streams[group])  # noqa: B023
+                if state is None:
+                    return None
+                return two_way_distance(self._model.vertices(state), self._model.faces, cloud), state
+
+            found = [pair for pair in ordered(moved, groups, self._threads) if pair is not None]
+            found.sort(key=lambda pair: pair[0])
+            states = [body.state, *(state for _, state in found[:LIMBS_FINISHED])]
+            candidates = ordered(lambda state: self._candidate(state, cloud), states, self._threads)
+            closest = min(candidates, key=lambda candidate: candidate.distance)
+            if closest.distance > CLOSER * body.distance:
+                break
+            body = closest
+        return body
+
+
+def part_of(progress: Progress, low: float, high: float) -> Progress:
+    """Progress of one stretch of the work."""
+    return lambda done: progress(low + (high - low) * done)
+
+
+def _body_center(cloud: Cloud) -> np.ndarray:
+    """Where the torso may be: the mean of the cloud, moved 10 cm into the body when only its front is seen."""
+    center = cloud.points.mean(axis=0)
+    if cloud.viewpoint is None:
+        return center
+    away = center - cloud.viewpoint
+    return center + 0.1 * away / max(float(np.linalg.norm(away)), 1e-9)

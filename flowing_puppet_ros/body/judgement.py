@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far a fitted body may be believed: what of it lies on the cloud, and what of the cloud lies on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
+from flowing_puppet_ros.body.geometry import vertex_normals
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+WIDTH = 0.04  # metres: a vertex or point that far from the other surface counts a quarter
+UNCOVERED = 0.05  # metres
+# A body with more of the cloud uncovered, or a part less on the cloud, has a limb in a wrong place, or may have.
+MUCH_UNCOVERED, LITTLE_ON_CLOUD = 0.01, 0.3
+LEAST_SEEN = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """A body against a cloud.
+
+    Attributes:
+        part_confidence: (16,) 0 to 1, how much of each part's seen surface lies on the cloud; 0 for unseen parts.
+        seen: (16,) whether at least a tenth of the part's surface is seen.
+        explained: 0 to 1, how much of the cloud lies on the body.
+        uncovered: share of the cloud's points that are farther than 5 cm from the body.
+        distance: mean over both ways of the distances between body and cloud, metres.
+    """
+
+    part_confidence: np.ndarray
+    seen: np.ndarray
+    explained: float
+    uncovered: float
+    distance: float
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether a limb may be in a wrong place."""
+        least = self.part_confidence[self.seen].min(initial=1.0)
+        return self.uncovered > MUCH_UNCOVERED or bool(least < LITTLE_ON_CLOUD)
+
+    @property
+    def confidence(self) -> float:
+        """0 to 1."""
+        return float(np.sqrt(self.part_confidence[self.seen].mean() * self.explained)) if self.seen.any() else 0.0
+
+    @property
+    def reliable(self) -> bool:
+        """Whether nothing speaks against the body."""
+        return not self.doubtful
+
+
+def judged(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> Judgement:
+    """Compare a body with vertices (V, 3), metres, with a cloud.
+
+    A vertex or a cloud point counts by the Geman-McClure weight of its distance to the other surface at 4 cm; a vertex
+    counts nothing where the normals disagree.
+    """
+    normals = vertex_normals(vertices, model.faces)
+    distance, index = cloud.tree.query(vertices)
+    weight = (WIDTH**2 / (WIDTH**2 + distance**2)) ** 2
+    weight *= (normals * cloud.normals[index]).sum(axis=1) > 0
+    seen = cloud.sees(vertices, normals)
+    owner, parts = model.part_of_vertex, len(model.tree)
+    count, size = np.bincount(owner[seen], minlength=parts), np.bincount(owner, minlength=parts)
+    share = np.bincount(owner[seen], weight[seen], minlength=parts) / np.maximum(count, 1)
+    back = cKDTree(vertices).query(cloud.points)[0]
+    return Judgement(
+        share,
+        count >= LEAST_SEEN * size,
+        float(((WIDTH**2 / (WIDTH**2 + back**2)) ** 2).mean()),
+        float((back > UNCOVERED).mean()),
+        two_way_distance(vertices, model.faces, cloud),
+    )

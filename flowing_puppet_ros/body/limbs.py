@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hypotheses of limbs: an arm or a leg is searched anew in what the rest of the body leaves of the cloud.
+
+The energy asks whether the body lies on the cloud, not whether the cloud is covered, so that two limbs may share the
+cloud of one. A limb that only sees the points which nothing else explains cannot.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from flowing_puppet_ros.body.correspondence import Cloud
+from flowing_puppet_ros.body.energy import JointTargets
+from flowing_puppet_ros.body.particles import Particles, particles_of
+from flowing_puppet_ros.body.proposals import Proposer
+from flowing_puppet_ros.body.schedule import limb_stages
+from flowing_puppet_ros.body.search import Search
+from flowing_puppet_ros.evidence.cloud import CloudGrid
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+from flowing_puppet_ros.model.tree import PartTree
+
+ARM = ("shoulder", "upper_arm", "lower_arm", "hand")
+LEG = ("upper_leg", "lower_leg", "foot")
+# Metres from the rest of the body at which a cloud point is left to the limb.
+EXPLAINED = 0.03
+# Share of the cloud that must be left for a limb: a person's arm has about 9 %, a leg 17 %.
+LEAST_LEFT = 0.01
+PARTICLES, ITERATIONS = 30, 18
+
+
+def limb_groups(tree: PartTree) -> tuple[tuple[int, ...], ...]:
+    """The parts of each leg and arm, from the trunk outwards, of both legs, of both arms and of all limbs."""
+    left_leg, right_leg, left_arm, right_arm = (
+        tuple(tree.index(f"{side}_{name}") for name in names) for names in (LEG, ARM) for side in ("left", "right")
+    )
+    legs, arms = left_leg + right_leg, left_arm + right_arm
+    return left_leg, right_leg, left_arm, right_arm, legs, arms, legs + arms
+
+
+class LimbSearch:
+    """Searches limbs of one model."""
+
+    def __init__(self, model: StitchedPuppet, search: Search, proposer: Proposer) -> None:
+        self._model = model
+        self._search = search
+        self._proposer = proposer
+
+    def left_over(self, body: BodyState, limbs: tuple[int, ...], cloud: Cloud) -> np.ndarray:
+        """Which points (N,) of the cloud nothing of the body but the limbs explains."""
+        rest = ~np.isin(self._model.part_of_vertex, limbs)
+        distance = cKDTree(self._model.vertices(body)[rest]).query(cloud.points, distance_upper_bound=EXPLAINED)[0]
+        return ~np.isfinite(distance)
+
+    def run(
+        self, body: BodyState, limbs: tuple[int, ...], cloud: Cloud, grid: CloudGrid, rng: np.random.Generator
+    ) -> BodyState | None:
+        """Search limbs anew in what the rest of the body leaves of the cloud.
+
+        Args:
+            body: the limbs as they are is among the first particles; its other parts stay.
+            limbs: parts, each after the one that it hangs on.
+            cloud: what to fit.
+            grid: of the whole cloud.
+            rng: source of all randomness.
+
+        Returns:
+            The body, or None when nearly nothing of the cloud is left.
+        """
+        left = self.left_over(body, limbs, cloud)
+        if np.count_nonzero(left) < LEAST_LEFT * len(left):
+            return None
+        own = CloudGrid.build(cloud.points[left], cloud.normals[left])
+        start = particles_of(self._model, [body])
+        for part in limbs:
+            above = start[self._model.tree.parents[part]]
+            parents = above.take(np.arange(PARTICLES - 1) % len(above))
+            start[part] = Particles.join([start[part], self._proposer.hang(part, parents, start[part].shape[0], rng)])
+        none, stages = JointTargets.none(self._model), limb_stages(self._model.tree)
+        return self._search.run(start, grid, none, stages, ITERATIONS, rng, own=dict.fromkeys(limbs, own)).state
