@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a cloud that was seen from one place says of a body: surface, free space, and what nobody can know.
+
+A point of the body may lie on the seen surface or anywhere behind it. It must not lie before it, nor beside the
+silhouette, because there the sensor looked through. The cloud is its own depth image: directions are looked up in a
+grid of the nearest seen directions, and rings of a LiDAR are as wide apart as the cloud says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.spatial import cKDTree
+
+MAX_CELLS = 60_000
+NEIGHBOUR = 4
+SPACING_SHARE = 90
+TOLERANCE = 1.5
+"""Spacings of the seen directions beyond which a direction is beside the silhouette."""
+MISS = 0.15
+"""Metres; nothing counts as farther off than this."""
+HIDDEN = 0.05
+"""Metres behind the seen surface from which on a point that faces the sensor is taken to be hidden by another part."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OneSidedView:
+    """A cloud as its sensor saw it.
+
+    Attributes:
+        viewpoint: (3,) metres.
+        axes: (3, 3), rows right, down and forward, forward towards the middle of the cloud.
+        directions: (N, 2) right and down over forward of the cloud's points.
+        depth: (N,) metres along forward.
+        tolerance: distance of directions from which on one is beside the silhouette.
+        low: (2,) centre of the first cell.
+        cell: edge of a cell.
+        nearest: (w, h) int32, index of the point seen nearest to the cell's centre.
+    """
+
+    viewpoint: np.ndarray
+    axes: np.ndarray
+    directions: np.ndarray
+    depth: np.ndarray
+    tolerance: float
+    low: np.ndarray
+    cell: float
+    nearest: np.ndarray
+
+    @classmethod
+    def build(cls, points: np.ndarray, viewpoint: np.ndarray) -> OneSidedView:
+        """Index a cloud (N, 3) in metres, seen from `viewpoint` (3,), which lies outside of it."""
+        axes = _axes(points.mean(axis=0) - viewpoint)
+        directions, depth = _project(points, viewpoint, axes)
+        tree = cKDTree(directions)
+        neighbours = min(NEIGHBOUR + 1, len(points))
+        spacing = float(np.percentile(tree.query(directions, k=neighbours)[0][:, -1], SPACING_SHARE))
+        low, high = directions.min(axis=0) - 4 * spacing, directions.max(axis=0) + 4 * spacing
+        cell = max(spacing / 2, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
+        shape = np.ceil((high - low) / cell).astype(np.int64) + 1
+        centres = np.stack(np.meshgrid(*(low[k] + cell * np.arange(shape[k]) for k in (0, 1)), indexing="ij"), axis=-1)
+        nearest = tree.query(centres.reshape(-1, 2))[1].astype(np.int32).reshape(shape)
+        tolerance = TOLERANCE * spacing
+        return cls(viewpoint, axes, directions, depth, tolerance, low, cell, np.ascontiguousarray(nearest))
+
+    def compare(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where points (N, 3) lie against the seen surface.
+
+        Returns:
+            How far beside the silhouette (N, 3), a vector in metres at a right angle to the ray, zero inside of it;
+            and how far behind the surface (N,), metres along forward, negative before it.
+        """
+        beside, behind = _compare(np.ascontiguousarray(points, dtype=np.float64), *self._arrays())
+        return beside, behind
+
+    def hidden(self, points: np.ndarray) -> np.ndarray:
+        """Which points (N,) of (N, 3) lie behind the seen surface so far that it hides them."""
+        beside, behind = self.compare(points)
+        return (behind > HIDDEN) & ~beside.any(axis=1)
+
+    def misfit(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean distance in metres by which surface points contradict the view, for many sets of points at once.
+
+        Args:
+            points: (P, K, 3) metres.
+            normals: (P, K, 3) unit normals.
+
+        Returns:
+            (P,) metres: beside the silhouette and before the surface the distance, on the surface too if the normal
+            faces the sensor, at most 5 cm behind it, nothing for a point behind the surface that faces away, never
+            more than 15 cm; and (P, K) bool, which points face the sensor.
+        """
+        return _misfit(np.ascontiguousarray(points), np.ascontiguousarray(normals), *self._arrays())
+
+    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, float, np.ndarray]:
+        return (
+            self.viewpoint, self.axes, self.directions, self.depth, self.tolerance, self.low, self.cell, self.nearest,
+        )  # fmt: skip
+
+
+def distances(targets: np.ndarray, points: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Distance (P, M) of every target (M, 3) to the nearest allowed point of each set (P, K, 3), at most 15 cm.
+
+    allowed: (P, K) bool. Metres.
+    """
+    return _distances(np.ascontiguousarray(targets), np.ascontiguousarray(points), allowed)
+
+
+def _axes(forward: np.ndarray) -> np.ndarray:
+    forward = forward / max(float(np.linalg.norm(forward)), 1e-9)
+    right = np.cross(forward, (0.0, 0.0, 1.0) if abs(forward[2]) < 0.9 else (1.0, 0.0, 0.0))
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def _project(points: np.ndarray, viewpoint: np.ndarray, axes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    local = (points - viewpoint) @ axes.T
+    depth = np.maximum(local[:, 2], 1e-6)
+    return np.ascontiguousarray(local[:, :2] / depth[:, None]), depth
+
+
+@njit(cache=True, inline="always")
+def _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
+    """Index of the point seen nearest in direction, depth, and the two components of what is beside the silhouette."""
+    x, y, z = x - viewpoint[0], y - viewpoint[1], z - viewpoint[2]
+    depth = max(axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z, 1e-6)
+    right = (axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z) / depth
+    down = (axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z) / depth
+    i = min(max(int(np.floor((right - low[0]) / cell + 0.5)), 0), nearest.shape[0] - 1)
+    j = min(max(int(np.floor((down - low[1]) / cell + 0.5)), 0), nearest.shape[1] - 1)
+    found = nearest[i, j]
+    dx, dy = right - directions[found, 0], down - directions[found, 1]
+    apart = np.sqrt(dx * dx + dy * dy)
+    share = (1 - tolerance / apart) * depth if apart > tolerance else 0.0
+    return found, depth, share * dx, share * dy
+
+
+@njit(cache=True)
+def _compare(points, viewpoint, axes, directions, seen, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
+    beside, behind = np.zeros((len(points), 3)), np.empty(len(points))
+    for k in range(len(points)):
+        found, depth, dx, dy = _look_up(
+            points[k, 0], points[k, 1], points[k, 2], viewpoint, axes, directions, tolerance, low, cell, nearest
+        )
+        behind[k] = depth - seen[found]
+        for axis in range(3):
+            beside[k, axis] = dx * axes[0, axis] + dy * axes[1, axis]
+    return beside, behind
+
+
+@njit(cache=True)
+def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
+    cost, facing = np.zeros(len(points)), np.zeros(points.shape[:2], dtype=np.bool_)
+    for p in range(len(points)):
+        for k in range(points.shape[1]):
+            x, y, z = points[p, k, 0], points[p, k, 1], points[p, k, 2]
+            found, depth, dx, dy = _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest)
+            toward = 0.0
+            for axis in range(3):
+                toward += (viewpoint[axis] - points[p, k, axis]) * normals[p, k, axis]
+            facing[p, k] = toward > 0
+            behind = depth - seen[found]
+            beside = np.sqrt(dx * dx + dy * dy)
+            if beside > 0:
+                cost[p] += min(beside, MISS)
+            elif behind < 0:
+                cost[p] += min(-behind, MISS)
+            elif facing[p, k]:
+                cost[p] += min(behind, HIDDEN)
+        cost[p] /= points.shape[1]
+    return cost, facing
+
+
+@njit(cache=True)
+def _distances(targets, points, allowed):  # type: ignore[no-untyped-def]
+    result = np.empty((len(points), len(targets)))
+    for p in range(len(points)):
+        for m in range(len(targets)):
+            best = MISS * MISS
+            for k in range(points.shape[1]):
+                if allowed[p, k]:
+                    dx = points[p, k, 0] - targets[m, 0]
+                    dy = points[p, k, 1] - targets[m, 1]
+                    dz = points[p, k, 2] - targets[m, 2]
+                    best = min(best, dx * dx + dy * dy + dz * dz)
+            result[p, m] = np.sqrt(best)
+    return result
