@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import argparse
 
-from flowing_puppet_ros.cli import evaluate_bodies
+from flowing_puppet_ros.cli import evaluate_bodies, evaluate_correspondence
 
-KINDS = {"bodies": evaluate_bodies}
+KINDS = {"bodies": evaluate_bodies, "correspondence": evaluate_correspondence}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
