@@ -24,6 +24,8 @@ from flowing_puppet_ros.body.refine import Refiner, RefineWeights
 from flowing_puppet_ros.body.schedule import four_stages, local_stages
 from flowing_puppet_ros.body.search import Search, SearchWeights
 from flowing_puppet_ros.body.threads import ordered, usable
+from flowing_puppet_ros.body.view_cloud import ViewCloud
+from flowing_puppet_ros.body.view_search import ViewSearch
 from flowing_puppet_ros.evidence.cloud import CloudGrid
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
@@ -82,9 +84,12 @@ class BodyFinder:
         self.refiner = Refiner(model)
         self._proposer = Proposer(model, points)
         self._limbs = LimbSearch(model, self.search, self._proposer)
+        self._view_search = ViewSearch(model, points, self._proposer, self.refiner)
 
     def find(self, cloud: Cloud, rng: np.random.Generator, progress: Progress) -> BodyState:
         """The body of a cloud of which nothing but the upright is known."""
+        if isinstance(cloud, ViewCloud):
+            return self._view_search.run(cloud, rng, self._settings.refine_iterations, progress)
         grid = CloudGrid.build(cloud.points, cloud.normals)
         none, steps = JointTargets.none(self._model), self._settings.refine_iterations
         tries = 1 + self._settings.restarts
@@ -111,11 +116,8 @@ class BodyFinder:
 
     def finish(self, body: BodyState, cloud: Cloud, targets: JointTargets, steps: int) -> BodyState:
         """The body after `steps` of the Gauss-Newton over all parts."""
-        weights = RefineWeights(iterations=steps)
-        if cloud.viewpoint is not None:
-            # What is hidden is only known from the joints' usual angles and from usual shapes.
-            weights = RefineWeights(shape=1e-5, pairwise=4e-6, iterations=steps)
-        return self.refiner.run(body, cloud, targets, weights)
+        terms = [cloud.free_space] if isinstance(cloud, ViewCloud) else []
+        return self.refiner.run(body, cloud, targets, RefineWeights(iterations=steps), terms)
 
     def _candidate(self, body: BodyState, cloud: Cloud) -> Candidate:
         """A hypothesis after a short finish, judged."""
@@ -128,7 +130,7 @@ class BodyFinder:
     ) -> list[Candidate]:
         """Search with unknown yaw: the body found and the best one that faces the other way, the closer one first."""
         none = JointTargets.none(self._model)
-        bodies = sampled_bodies(self._model, _body_center(cloud), self._settings.particles, rng)
+        bodies = sampled_bodies(self._model, cloud.points.mean(axis=0), self._settings.particles, rng)
         noise = WalkNoise(center=0.05, rotation=0.1, pose=0.0, shape=0.0)
         start = [self._proposer.walk(group, noise, rng) for group in particles_of(self._model, bodies)]
         stages, iterations = four_stages(self._model.tree), self._settings.iterations
@@ -167,12 +169,3 @@ class BodyFinder:
 def part_of(progress: Progress, low: float, high: float) -> Progress:
     """Progress of one stretch of the work."""
     return lambda done: progress(low + (high - low) * done)
-
-
-def _body_center(cloud: Cloud) -> np.ndarray:
-    """Where the torso may be: the mean of the cloud, moved 10 cm into the body when only its front is seen."""
-    center = cloud.points.mean(axis=0)
-    if cloud.viewpoint is None:
-        return center
-    away = center - cloud.viewpoint
-    return center + 0.1 * away / max(float(np.linalg.norm(away)), 1e-9)

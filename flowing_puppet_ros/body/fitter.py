@@ -16,6 +16,7 @@ from flowing_puppet_ros.body.initial import body_from_joints, joint_targets
 from flowing_puppet_ros.body.judgement import judged
 from flowing_puppet_ros.body.nonrigid import FinishWeights, SurfaceFinish
 from flowing_puppet_ros.body.normals import estimated_normals, thinned
+from flowing_puppet_ros.body.view_cloud import VIEW_POINTS, ViewCloud
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud import CloudGrid, ExactCloud
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -104,7 +105,8 @@ class BodyFitter:
             raise InputError(
                 f"the cloud is {extent:.3g} m wide, which is no person; check the unit or cut out one person"
             )
-        points, normals = thinned(points, normals, self.settings.cloud_points)
+        limit = self.settings.cloud_points
+        points, normals = thinned(points, normals, limit if viewpoint is None else min(limit, VIEW_POINTS))
         places = len(np.unique(points, axis=0))
         if places < MIN_POINTS:
             raise InputError(
@@ -112,7 +114,7 @@ class BodyFitter:
             )
         if normals is None:
             normals = estimated_normals(points, viewpoint)
-        return Cloud.of(points, normals, viewpoint)
+        return Cloud.of(points, normals) if viewpoint is None else ViewCloud.seen_from(points, normals, viewpoint)
 
     def _fit_from_joints(
         self,

@@ -12,6 +12,10 @@ from flowing_puppet_ros.body.correspondence import Cloud, Quadratic
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.one_sided import OneSidedView
 
+VIEW_POINTS = 4000
+"""More points than that of one side add time and no accuracy."""
+NEAREST = 0.05
+"""Metres before the sensor."""
 BEFORE = 0.01
 """Metres before the seen surface up to which a vertex is left alone: noise."""
 
@@ -31,11 +35,13 @@ class ViewCloud(Cloud):
         """Index a cloud; arguments as of `Cloud`.
 
         Raises:
-            InputError: when the viewpoint lies within the cloud.
+            InputError: when part of the cloud lies behind the sensor.
         """
-        if np.all((points.min(axis=0) < viewpoint) & (viewpoint < points.max(axis=0))):
+        forward = points.mean(axis=0) - viewpoint
+        if ((points - viewpoint) @ forward < NEAREST * np.linalg.norm(forward)).any():
             raise InputError(
-                f"the sensor at {np.round(viewpoint, 2).tolist()} stands within the cloud; it cannot have seen one side"
+                f"the sensor at {np.round(viewpoint, 2).tolist()} m stands within the cloud and cannot have seen one"
+                " side of it; check the frame or fit it as a whole cloud"
             )
         return cls(points, normals, cKDTree(points), viewpoint, OneSidedView.build(points, viewpoint))
 
