@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exact max-product on a tree of part filters over a grid: distance transforms up and down the tree, best placements.
+
+Y. Yang and D. Ramanan: Articulated Human Detection with Flexible Mixtures of Parts, PAMI 2013, and P. F. Felzenszwalb
+and D. P. Huttenlocher: Distance Transforms of Sampled Functions, 2012. A part has a type and a cell (x, y); a
+placement scores the filter responses plus, for every child, `bias[child type, parent type]` less its spring.
+All layers (types of parts) are stacked: layers first[i] to first[i + 1] are the types of part i. Parents come before
+their children.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+type Floats = NDArray[np.float32]
+type Integers = NDArray[np.int64]
+
+NOWHERE = np.float32(-1e9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartTree:
+    """P parts with L layers in all.
+
+    `parents` (P,), -1 for the root, which is part 0; `first` (P + 1,); `anchor` (L, 2) where a part of this type
+    stands from its parent, in cells (x, y); `spring` (L, 2) what a squared cell of deviation costs along x and y;
+    `bias` (L, T): of a layer and the type of its parent (T is the most types of a part), in the first column the
+    bias of the root's layers.
+    """
+
+    parents: Integers
+    first: Integers
+    anchor: Floats
+    spring: Floats
+    bias: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Beliefs:
+    """What the passes leave, all (L, H, W): `up` unary scores with the messages of the children, `message` (P, T, H, W)
+    of each part to its parent's types, and `down` the messages from the parents (None before the downward pass).
+    """
+
+    up: Floats
+    message: Floats
+    down: Floats | None
+
+
+def upward(tree: PartTree, unary: Floats) -> Beliefs:
+    """Messages from the leaves to the root for the layers' scores `unary` (L, H, W)."""
+    up = unary.copy()
+    types = tree.bias.shape[1]
+    message = np.full((len(tree.parents), types, *unary.shape[1:]), NOWHERE, np.float32)
+    _upward(tree.parents, tree.first, tree.anchor, tree.spring, tree.bias, up, message)
+    return Beliefs(up, message, None)
+
+
+def downward(tree: PartTree, beliefs: Beliefs) -> Beliefs:
+    """Add the messages from the root to the leaves; `up + down` are then the max-marginals of every layer."""
+    down = np.zeros_like(beliefs.up)
+    _downward(tree.parents, tree.first, tree.anchor, tree.spring, tree.bias, beliefs.up, beliefs.message, down)
+    return Beliefs(beliefs.up, beliefs.message, down)
+
+
+def best_placement(tree: PartTree, beliefs: Beliefs, fixed: tuple[int, int, int, int] | None = None) -> Integers:
+    """The best placement (P, 3): layer, x, y of every part.
+
+    With `fixed` (part, layer, x, y) the best one in which that part is so; this needs the downward pass.
+    """
+    placement = np.full((len(tree.parents), 3), -1, np.int64)
+    down = np.zeros((0, 0, 0), np.float32) if beliefs.down is None else beliefs.down
+    if fixed is None:
+        root = beliefs.up[: tree.first[1]]
+        layer, y, x = np.unravel_index(int(root.argmax()), root.shape)
+        placement[0] = layer, x, y
+    else:
+        placement[fixed[0]] = fixed[1:]
+        _trace_up(
+            fixed[0],
+            tree.parents,
+            tree.first,
+            tree.anchor,
+            tree.spring,
+            tree.bias,
+            beliefs.up,
+            beliefs.message,
+            down,
+            placement,
+        )
+    _trace_down(tree.parents, tree.first, tree.anchor, tree.spring, tree.bias, beliefs.up, placement)
+    return placement
+
+
+def score_of(tree: PartTree, unary: Floats, placement: Integers) -> float:
+    """Score of a placement (P, 3)."""
+    layer, x, y = placement.T
+    total = float(unary[layer, y, x].sum())
+    total += float(tree.bias[layer[0], 0])
+    for part in range(1, len(layer)):
+        parent = tree.parents[part]
+        off = placement[part, 1:] - placement[parent, 1:] - tree.anchor[layer[part]]
+        total += float(tree.bias[layer[part], layer[parent] - tree.first[parent]])
+        total -= float(tree.spring[layer[part]] @ (off * off))
+    return total
+
+
+@njit(cache=True)
+def transform(scores: Floats, anchor: Floats, spring: Floats, out: Floats) -> None:
+    """out[y, x] = max over (v, u) of scores[v, u] - sx (u - x - ax)^2 - sy (v - y - ay)^2; arrays (H, W), a and s (2,)."""
+    height, width = scores.shape
+    longest = max(height, width)
+    line, result = np.empty(longest, np.float32), np.empty(longest, np.float32)
+    peaks, borders = np.empty(longest, np.int64), np.empty(longest + 1, np.float32)
+    for y in range(height):
+        _transform_line(scores[y], width, anchor[0], spring[0], peaks, borders, out[y])
+    for x in range(width):
+        for y in range(height):
+            line[y] = out[y, x]
+        _transform_line(line, height, anchor[1], spring[1], peaks, borders, result)
+        for y in range(height):
+            out[y, x] = result[y]
+
+
+@njit(cache=True)
+def _transform_line(
+    values: Floats, count: int, anchor: float, spring: float, peaks: Integers, borders: Floats, out: Floats
+) -> None:
+    """Upper envelope of the parabolas values[u] - spring (x - u)^2, read at x + anchor."""
+    top = 0
+    peaks[0] = 0
+    borders[0], borders[1] = np.float32(-np.inf), np.float32(np.inf)
+    inverse = np.float32(0.5) / np.float32(spring)
+    for u in range(1, count):
+        while True:
+            v = peaks[top]
+            at = np.float32(0.5) * (u + v) - (values[u] - values[v]) * inverse / (u - v)
+            if at > borders[top] or top == 0:
+                break
+            top -= 1
+        if at <= borders[top]:
+            at = borders[top]
+            peaks[top] = u
+        else:
+            top += 1
+            peaks[top] = u
+            borders[top] = at
+        borders[top + 1] = np.float32(np.inf)
+    k = 0
+    for x in range(count):
+        place = np.float32(x + anchor)
+        while borders[k + 1] < place:
+            k += 1
+        off = place - np.float32(peaks[k])
+        out[x] = values[peaks[k]] - np.float32(spring) * off * off
+
+
+@njit(cache=True)
+def _upward(
+    parents: Integers, first: Integers, anchor: Floats, spring: Floats, bias: Floats, up: Floats, message: Floats
+) -> None:
+    height, width = up.shape[1:]
+    moved = np.empty((height, width), np.float32)
+    for layer in range(first[1]):
+        up[layer] += bias[layer, 0]
+    for part in range(len(parents) - 1, 0, -1):
+        parent = parents[part]
+        for layer in range(first[part], first[part + 1]):
+            transform(up[layer], anchor[layer], spring[layer], moved)
+            for type_ in range(first[parent + 1] - first[parent]):
+                _keep_larger(message[part, type_], moved, bias[layer, type_])
+        for type_ in range(first[parent + 1] - first[parent]):
+            up[first[parent] + type_] += message[part, type_]
+
+
+@njit(cache=True)
+def _keep_larger(target: Floats, values: Floats, add: float) -> None:
+    flat, other, more = target.reshape(-1), values.reshape(-1), np.float32(add)
+    for i in range(flat.size):
+        flat[i] = max(flat[i], other[i] + more)
+
+
+@njit(cache=True)
+def _downward(
+    parents: Integers,
+    first: Integers,
+    anchor: Floats,
+    spring: Floats,
+    bias: Floats,
+    up: Floats,
+    message: Floats,
+    down: Floats,
+) -> None:
+    height, width = up.shape[1:]
+    for part in range(1, len(parents)):
+        parent = parents[part]
+        start, count = first[parent], first[parent + 1] - first[parent]
+        rest = up[start : start + count] + down[start : start + count] - message[part, :count]
+        best = np.empty((height, width), np.float32)
+        for layer in range(first[part], first[part + 1]):
+            best[:] = NOWHERE
+            for type_ in range(count):
+                _keep_larger(best, rest[type_], bias[layer, type_])
+            transform(best, -anchor[layer], spring[layer], down[layer])
+
+
+@njit(cache=True)
+def _trace_up(
+    start: int,
+    parents: Integers,
+    first: Integers,
+    anchor: Floats,
+    spring: Floats,
+    bias: Floats,
+    up: Floats,
+    message: Floats,
+    down: Floats,
+    placement: Integers,
+) -> None:
+    """Place the ancestors of a placed part, each the best given its placed child."""
+    height, width = up.shape[1:]
+    part = start
+    while parents[part] >= 0:
+        parent = parents[part]
+        layer, x, y = placement[part]
+        best = np.float32(-np.inf)
+        for type_ in range(first[parent + 1] - first[parent]):
+            above = first[parent] + type_
+            for v in range(height):
+                dy = np.float32(y - v) - anchor[layer, 1]
+                for u in range(width):
+                    dx = np.float32(x - u) - anchor[layer, 0]
+                    score = up[above, v, u] + down[above, v, u] - message[part, type_, v, u] + bias[layer, type_]
+                    score -= spring[layer, 0] * dx * dx + spring[layer, 1] * dy * dy
+                    if score > best:
+                        best = score
+                        placement[parent, 0], placement[parent, 1], placement[parent, 2] = above, u, v
+        part = parent
+
+
+@njit(cache=True)
+def _trace_down(
+    parents: Integers, first: Integers, anchor: Floats, spring: Floats, bias: Floats, up: Floats, placement: Integers
+) -> None:
+    """Place every part that has no place yet, the best given its parent."""
+    height, width = up.shape[1:]
+    for part in range(1, len(parents)):
+        if placement[part, 0] >= 0:
+            continue
+        parent = parents[part]
+        above, x, y = placement[parent]
+        type_ = above - first[parent]
+        best = np.float32(-np.inf)
+        for layer in range(first[part], first[part + 1]):
+            for v in range(height):
+                dy = np.float32(v - y) - anchor[layer, 1]
+                for u in range(width):
+                    dx = np.float32(u - x) - anchor[layer, 0]
+                    score = up[layer, v, u] + bias[layer, type_]
+                    score -= spring[layer, 0] * dx * dx + spring[layer, 1] * dy * dy
+                    if score > best:
+                        best = score
+                        placement[part, 0], placement[part, 1], placement[part, 2] = layer, u, v
