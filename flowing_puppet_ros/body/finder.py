@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowing_puppet_ros.body.bank import BodyBank
 from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.initial import sampled_bodies, turned_around
@@ -84,7 +85,8 @@ class BodyFinder:
         self.refiner = Refiner(model)
         self._proposer = Proposer(model, points)
         self._limbs = LimbSearch(model, self.search, self._proposer)
-        self._view_search = ViewSearch(model, points, self._proposer, self.refiner)
+        self.bank = BodyBank(model, points)
+        self._view_search = ViewSearch(model, self.bank, self._proposer, self.refiner)
 
     def find(self, cloud: Cloud, rng: np.random.Generator, progress: Progress) -> BodyState:
         """The body of a cloud of which nothing but the upright is known."""

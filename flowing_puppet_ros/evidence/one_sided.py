@@ -108,6 +108,11 @@ def distances(targets: np.ndarray, points: np.ndarray, allowed: np.ndarray) -> n
     return _distances(np.ascontiguousarray(targets), np.ascontiguousarray(points), allowed)
 
 
+def mean_distance(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Mean distance (P,) of the points of each set (P, K, 3) to their nearest target (M, 3), each at most 15 cm."""
+    return _mean_distance(np.ascontiguousarray(points), np.ascontiguousarray(targets))
+
+
 def _axes(forward: np.ndarray) -> np.ndarray:
     forward = forward / max(float(np.linalg.norm(forward)), 1e-9)
     right = np.cross(forward, (0.0, 0.0, 1.0) if abs(forward[2]) < 0.9 else (1.0, 0.0, 0.0))
@@ -186,4 +191,20 @@ def _distances(targets, points, allowed):  # type: ignore[no-untyped-def]
                     dz = points[p, k, 2] - targets[m, 2]
                     best = min(best, dx * dx + dy * dy + dz * dz)
             result[p, m] = np.sqrt(best)
+    return result
+
+
+@njit(cache=True)
+def _mean_distance(points, targets):  # type: ignore[no-untyped-def]
+    result = np.zeros(len(points))
+    for p in range(len(points)):
+        for k in range(points.shape[1]):
+            best = MISS * MISS
+            for m in range(len(targets)):
+                dx = points[p, k, 0] - targets[m, 0]
+                dy = points[p, k, 1] - targets[m, 1]
+                dz = points[p, k, 2] - targets[m, 2]
+                best = min(best, dx * dx + dy * dy + dz * dz)
+            result[p] += np.sqrt(best)
+        result[p] /= points.shape[1]
     return result
