@@ -13,11 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
+from flowing_puppet_ros.body.correspondence import Cloud
 from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, checked_cloud
 from flowing_puppet_ros.body.normals import thinned
 from flowing_puppet_ros.body.refine import Refiner, RefineWeights
+from flowing_puppet_ros.body.view_cloud import ViewCloud
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
@@ -33,7 +34,7 @@ MOST_STRETCH = 2.0  # frames' steps that a motion may go on unseen
 class BodyTrackerSettings(Settings):
     """Settings of `BodyTracker`."""
 
-    points: int = setting(5000, "points that a tracked cloud is thinned to", low=200, high=200000)
+    points: int = setting(5000, "points that a tracked cloud from all sides is thinned to", low=200, high=200000)
     steps: int = setting(5, "Gauss-Newton steps a frame", low=1, high=100)
     lost_ratio: float = setting(1.4, "two-way distance, against the best since the last search, of a lost track",
                                 low=1.0, high=10.0)  # fmt: skip
@@ -44,11 +45,10 @@ class BodyTrackerSettings(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """A body, the time of its cloud (nanoseconds), and its two-way distance (metres)."""
+    """A fit and the time of its cloud, nanoseconds."""
 
-    state: BodyState
+    fit: BodyFit
     stamp: int
-    distance: float
 
 
 class BodyTracker:
@@ -90,49 +90,50 @@ class BodyTracker:
         Raises:
             InputError: when the cloud cannot be the surface of a person; the track goes on with the next one.
         """
-        points, normals = thinned(*checked_cloud(points, normals), self._settings.points)
+        points, normals = checked_cloud(points, normals)
+        if viewpoint is None:
+            points, normals = thinned(points, normals, self._settings.points)
         if self._last is not None and not 0 < stamp - self._last.stamp <= 1e9 * self._settings.longest_gap:
             self.reset()
         with threadpool_limits(limits=1):
             cloud = self._fitter.cloud(points, normals, viewpoint)
-            found = None if self._last is None else self._tracked(self._last, cloud, stamp)
-            if found is None or self._is_lost(found):
-                found = self._searched(found, cloud, stamp, seed)
-            self._before, self._last = self._last, found
-            self._best = min(self._best, found.distance)
-            self._frames += 1
-            return self._fitter.result(found.state, cloud)
+            fit = None if self._last is None else self._tracked(self._predicted(self._last, stamp), cloud)
+            if fit is None or self._is_lost(fit):
+                fit = self._searched(fit, cloud, seed)
+        self._before, self._last = self._last, _Seen(fit, stamp)
+        self._best = min(self._best, fit.two_way_distance)
+        self._frames += 1
+        return fit
 
-    def _tracked(self, last: _Seen, cloud: Cloud, stamp: int) -> _Seen:
+    def _tracked(self, start: BodyState, cloud: Cloud) -> BodyFit:
         """A few steps from where the person should be; when they do not get there, more steps that look farther."""
-        start = self._predicted(last, stamp)
-        found = self._refined(start, cloud, stamp, NARROW, self._settings.steps)
-        if self._is_lost(found):
-            wide = self._refined(start, cloud, stamp, WIDE, WIDE_STEPS)
-            found = min(found, wide, key=lambda seen: seen.distance)
-            self.counters["widened"] += 1
-        else:
+        fit = self._refined(start, cloud, NARROW, self._settings.steps)
+        if not self._is_lost(fit):
             self.counters["tracked"] += 1
-        return found
+            return fit
+        self.counters["widened"] += 1
+        wide = self._refined(start, cloud, WIDE, WIDE_STEPS)
+        return min(fit, wide, key=lambda found: found.two_way_distance)
 
-    def _searched(self, tracked: _Seen | None, cloud: Cloud, stamp: int, seed: int | None) -> _Seen:
+    def _searched(self, tracked: BodyFit | None, cloud: Cloud, seed: int | None) -> BodyFit:
         """The full fit, unless the tracked body is closer to the cloud; its distance is the new measure of lost."""
         self.counters["searched"] += 1
-        fit = self._fitter.fit(cloud.points, cloud.normals, viewpoint=cloud.viewpoint, seed=seed)
-        found = _Seen(fit.state, stamp, fit.two_way_distance)
-        if tracked is not None and tracked.distance <= found.distance:
-            found = tracked
+        found = self._fitter.fit(cloud.points, cloud.normals, viewpoint=cloud.viewpoint, seed=seed)
+        # Without the surface of its own that a full fit may have, or it would come and go with the searches.
+        fit = self._fitter.result(found.state, cloud)
+        if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
+            fit = tracked
         else:
             self.reset()
-        self._best = found.distance
-        return found
+        self._best = fit.two_way_distance
+        return fit
 
     def _predicted(self, last: _Seen, stamp: int) -> BodyState:
         """The last body, moved on by its last motion in proportion to the time."""
         if self._before is None:
-            return last.state
+            return last.fit.state
         share = min((stamp - last.stamp) / (last.stamp - self._before.stamp), MOST_STRETCH)
-        before, state = self._before.state, last.state
+        before, state = self._before.fit.state, last.fit.state
         turn = rotation.log(np.swapaxes(before.rotation, -1, -2) @ state.rotation)
         return replace(
             state,
@@ -140,16 +141,12 @@ class BodyTracker:
             rotation=state.rotation @ rotation.exp(share * turn),
         )
 
-    def _refined(self, start: BodyState, cloud: Cloud, stamp: int, widths: tuple[float, float], steps: int) -> _Seen:
+    def _refined(self, start: BodyState, cloud: Cloud, widths: tuple[float, float], steps: int) -> BodyFit:
         weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps)
-        weights = replace(
-            weights,
-            shape=weights.shape + BELIEF * min(self._frames, MOST_FRAMES),
-            shape_center=start.shape.mean(axis=0),
-        )
-        state = self._refiner.run(start, cloud, self._none, weights)
-        vertices = self._fitter.model.vertices(state)
-        return _Seen(state, stamp, two_way_distance(vertices, self._fitter.model.faces, cloud))
+        learned = BELIEF * min(self._frames, MOST_FRAMES)
+        weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
+        terms = [cloud.free_space] if isinstance(cloud, ViewCloud) else []
+        return self._fitter.result(self._refiner.run(start, cloud, self._none, weights, terms), cloud)
 
-    def _is_lost(self, found: _Seen) -> bool:
-        return found.distance > self._settings.lost_ratio * self._best + self._settings.lost_distance
+    def _is_lost(self, fit: BodyFit) -> bool:
+        return fit.two_way_distance > self._settings.lost_ratio * self._best + self._settings.lost_distance
