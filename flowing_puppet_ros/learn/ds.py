@@ -19,7 +19,7 @@ from flowing_puppet_ros.model.ds_joints import JOINT_NAMES
 from flowing_puppet_ros.model.ds_multiview import VIEW_NAMES
 from flowing_puppet_ros.settings import make_out_folder
 
-POSES = 1500
+POSES = 3000
 POSES_A_VIEW = 600
 MOST_COMPONENTS = 30
 
