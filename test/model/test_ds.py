@@ -213,7 +213,7 @@ def test_completed_legs_hang_below_an_upper_body(model: DeformableStructures) ->
     legs = np.array([name.endswith(("hip", "knee", "ankle", "foot")) for name in model.joint_names])
     confidence[legs] = 0.0
     filled = model.complete_joints(joints, confidence, SCALE)
-    assert np.linalg.norm(filled[legs] - joints[legs], axis=1).max() < 0.25 * SCALE
+    assert np.linalg.norm(filled[legs] - joints[legs], axis=1).max() < 0.3 * SCALE
 
 
 @pytest.mark.parametrize("view", ["front", "back"])
