@@ -6,12 +6,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.geometry import vertex_normals
 
 TANGENTIAL = 0.05
 MIN_COSINE = 0.2
+# Metres that a normal turned by one radian counts in the search for the closest point: the other side of a finger or of
+# an arm on the hip is farther away than it seems.
+TURN_LENGTH = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,58 +59,70 @@ class Quadratic:
     vector: np.ndarray
 
 
-def attract(vertices: np.ndarray, faces: np.ndarray, cloud: Cloud, sigma: float) -> Quadratic:
-    """Match both ways and return what draws the vertices to the cloud.
+class Matches:
+    """Matches both ways between a cloud and the bodies of one fit."""
 
-    Every vertex that the sensor sees goes to its closest cloud point, every cloud point to its closest vertex; pairs
-    whose normals disagree are dropped. A pair costs its distance along the cloud's normal, squared, plus 0.05 of its
-    squared length, times the Geman-McClure weight (sigma^2 / (sigma^2 + d^2))^2. Either way weighs 1 in all.
+    def __init__(self, cloud: Cloud, most: int | None = None) -> None:
+        """Prepare a cloud; of more than `most` points only every second, third ... looks for a vertex of its own."""
+        self._cloud = cloud
+        self._placed = _placed(cloud.points, cloud.normals)
+        self._tree = cKDTree(self._placed)
+        step = 1 if most is None else max(1, -(-len(cloud.points) // most))
+        self._looking = np.arange(0, len(cloud.points), step)
 
-    Args:
-        vertices: (V, 3) metres.
-        faces: (F, 3), outward.
-        cloud: what to fit.
-        sigma: width of the robust kernel, metres.
-    """
-    normals = vertex_normals(vertices, faces)
-    distance, index = cloud.tree.query(vertices)
-    seen = cloud.sees(vertices, normals)
-    pairs = _pairs(np.arange(len(vertices)), index, distance, seen, normals, cloud, sigma, max(int(seen.sum()), 1))
-    back_distance, back_index = cKDTree(vertices).query(cloud.points)
-    everything = np.ones(len(cloud.points), dtype=bool)
-    rows = np.arange(len(cloud.points))
-    back = _pairs(back_index, rows, back_distance, everything, normals, cloud, sigma, len(cloud.points))
-    vertex, point, weight = (np.concatenate(both) for both in zip(pairs, back, strict=True))
-    normal = cloud.normals[point]
-    gap = vertices[vertex] - cloud.points[point]
-    along = weight * (normal * gap).sum(axis=1)
-    vector = along[:, None] * normal + (TANGENTIAL * weight)[:, None] * gap
-    matrix = weight[:, None, None] * (normal[:, :, None] * normal[:, None, :] + TANGENTIAL * np.eye(3))
-    return Quadratic(
-        _sum_rows(vertex, matrix.reshape(-1, 9), len(vertices)).reshape(-1, 3, 3),
-        _sum_rows(vertex, vector, len(vertices)),
-    )
+    def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float) -> Quadratic:
+        """Match both ways and return what draws the vertices to the cloud.
 
+        Every vertex that the sensor sees goes to its closest cloud point, every cloud point to its closest vertex,
+        where opposite normals count as 6 cm more; pairs whose normals disagree are dropped. A pair costs its distance
+        along the cloud's normal, squared, plus 0.05 of its squared length, times the Geman-McClure weight
+        (sigma^2 / (sigma^2 + d^2))^2. Either way weighs 1 in all.
 
-def _pairs(
-    vertex: np.ndarray,
-    point: np.ndarray,
-    distance: np.ndarray,
-    allowed: np.ndarray,
-    normals: np.ndarray,
-    cloud: Cloud,
-    sigma: float,
-    count: int,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Vertex, cloud point and weight of the pairs that pass the normal gate."""
-    cosine = (normals[vertex] * cloud.normals[point]).sum(axis=1)
-    kept = allowed & (cosine > MIN_COSINE)
-    weight = (sigma**2 / (sigma**2 + distance[kept] ** 2)) ** 2 / count
-    return vertex[kept], point[kept], weight
+        Args:
+            vertices: (V, 3) metres.
+            faces: (F, 3), outward.
+            sigma: width of the robust kernel, metres.
+        """
+        cloud, looking = self._cloud, self._looking
+        normals = vertex_normals(vertices, faces)
+        placed = _placed(vertices, normals)
+        seen = np.flatnonzero(cloud.sees(vertices, normals))
+        there = self._tree.query(placed[seen])[1]
+        back = cKDTree(placed).query(self._placed[looking])[1]
+        matrix, vector = np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3))
+        for vertex, point in ((seen, there), (back, looking)):
+            _add_pairs(
+                vertex, point, vertices, normals, cloud.points, cloud.normals, sigma**2, 1 / max(len(point), 1),
+                matrix, vector,
+            )  # fmt: skip
+        return Quadratic(matrix, vector)
 
 
-def _sum_rows(group: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
-    return np.stack([np.bincount(group, column, minlength=count) for column in values.T], axis=1)
+def _placed(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    return np.hstack([points, TURN_LENGTH * normals])
+
+
+@njit(cache=True, nogil=True)
+def _add_pairs(  # type: ignore[no-untyped-def]
+    vertex, point, vertices, normals, points, point_normals, squared_width, share, matrix, vector
+):
+    gap = np.empty(3)
+    for k in range(len(vertex)):
+        v, p = vertex[k], point[k]
+        cosine, along, squared = 0.0, 0.0, 0.0
+        for i in range(3):
+            gap[i] = vertices[v, i] - points[p, i]
+            cosine += normals[v, i] * point_normals[p, i]
+            along += gap[i] * point_normals[p, i]
+            squared += gap[i] ** 2
+        if cosine <= MIN_COSINE:
+            continue
+        weight = share * (squared_width / (squared_width + squared)) ** 2
+        for i in range(3):
+            vector[v, i] += weight * (along * point_normals[p, i] + TANGENTIAL * gap[i])
+            matrix[v, i, i] += weight * TANGENTIAL
+            for j in range(3):
+                matrix[v, i, j] += weight * point_normals[p, i] * point_normals[p, j]
 
 
 def two_way_distance(vertices: np.ndarray, faces: np.ndarray, cloud: Cloud) -> float:

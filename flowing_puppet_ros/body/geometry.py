@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
@@ -20,11 +21,23 @@ def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
 
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     """Area-weighted unit normals (V, 3) of a triangle mesh; zero where a vertex has no face."""
-    corners = vertices[faces]
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return _vertex_normals(np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces))
+
+
+@njit(cache=True, nogil=True)
+def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     normals = np.zeros_like(vertices)
-    for axis in range(3):
+    for face in range(len(faces)):
+        a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
+        ux, uy, uz = vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+        vx, vy, vz = vertices[c, 0] - vertices[a, 0], vertices[c, 1] - vertices[a, 1], vertices[c, 2] - vertices[a, 2]
+        x, y, z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
         for corner in range(3):
-            normals[:, axis] += np.bincount(faces[:, corner], cross[:, axis], minlength=len(vertices))
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return normals / np.where(length > 0, length, 1)
+            normals[faces[face, corner], 0] += x
+            normals[faces[face, corner], 1] += y
+            normals[faces[face, corner], 2] += z
+    for vertex in range(len(vertices)):
+        length = np.sqrt((normals[vertex] ** 2).sum())
+        if length > 0:
+            normals[vertex] /= length
+    return normals

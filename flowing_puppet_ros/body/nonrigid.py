@@ -2,7 +2,7 @@
 """The non-rigid finish: every vertex of a fitted body moves by itself onto the cloud, and its neighbours with it.
 
 What no pose and no learned shape can express (a belly, a face, a fist) is left over after the fit of the parts. Here
-the unknowns are free offsets of all vertices. They are drawn by the matches of `correspondence.attract` and held
+the unknowns are free offsets of all vertices. They are drawn by the matches of `correspondence.Matches` and held
 together by the squared differences between every offset and the mean of its neighbours' (the umbrella operator of
 Kobbelt et al., SIGGRAPH 1998), which lets smooth corrections pass and resists wrinkles.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags_array, eye_array
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
-from flowing_puppet_ros.body.correspondence import Cloud, attract
+from flowing_puppet_ros.body.correspondence import Cloud, Matches
 
 # Weight of the squared offsets themselves: where the cloud says nothing at all, nothing moves.
 ANCHOR = 0.01
@@ -70,12 +70,12 @@ class SurfaceFinish:
     def run(self, vertices: np.ndarray, cloud: Cloud) -> np.ndarray:
         """Move fitted vertices (V, 3), metres, onto a cloud that shows all sides; (V, 3)."""
         weights, count = self._weights, len(vertices)
-        offsets = np.zeros_like(vertices)
+        matches, offsets = Matches(cloud), np.zeros_like(vertices)
         ratio = weights.sigma_end / weights.sigma_start
         for turn in range(weights.iterations):
             sigma = weights.sigma_start * ratio ** (turn / max(weights.iterations - 1, 1))
-            drawn = attract(vertices + offsets, self._faces, cloud, sigma)
-            # `attract` weighs 1 over all vertices.
+            drawn = matches.attract(vertices + offsets, self._faces, sigma)
+            # The matches either way weigh 1 over all vertices.
             offsets += self._solve(count * drawn.matrix, count * drawn.vector + self._stiff @ offsets)
         return vertices + offsets
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.body.correspondence import Cloud, Quadratic, attract
+from flowing_puppet_ros.body.correspondence import Cloud, Matches, Quadratic
 from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.joint_prior import JointPrior
 from flowing_puppet_ros.body.points import PointSet
@@ -24,6 +24,8 @@ MAX_COEFFICIENT = 3.5
 MAX_TURN = 0.5
 # Joints are believed this many times more widely than closest points are.
 JOINT_WIDTH = 2.5
+# Cloud points that look for a vertex in every step; more make the steps slower and not better.
+MATCHED = 5000
 
 # What else draws the body's vertices (V, 3), given the width in metres of the robust kernel at this step.
 SurfaceTerm = Callable[[np.ndarray, float], Quadratic]
@@ -95,7 +97,8 @@ class Refiner:
         )
         drawn = list(terms)
         if cloud is not None:
-            drawn.append(lambda vertices, sigma: attract(vertices, self._model.faces, cloud, sigma))
+            matches = Matches(cloud, MATCHED)
+            drawn.append(lambda vertices, sigma: matches.attract(vertices, self._model.faces, sigma))
         ratio = weights.sigma_end / weights.sigma_start
         for step in range(weights.iterations):
             sigma = weights.sigma_start * ratio ** (step / max(weights.iterations - 1, 1))
