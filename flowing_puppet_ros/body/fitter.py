@@ -26,6 +26,7 @@ __all__ = ["BodyFit", "BodyFitter", "FitterSettings", "Progress", "checked_cloud
 MIN_POINTS = 50
 # Points that a cloud needs before it may shape the surface more finely than the model does.
 DENSE_CLOUD = 3000
+PROMISE_POINTS = 1500
 # Widest sides, in metres, between which a cloud may be a person or a part of one, with some surroundings.
 PERSON_EXTENT = (0.1, 20.0)
 
@@ -115,6 +116,16 @@ class BodyFitter:
         if normals is None:
             normals = estimated_normals(points, viewpoint)
         return Cloud.of(points, normals) if viewpoint is None else ViewCloud.seen_from(points, normals, viewpoint)
+
+    def promise(self, points: np.ndarray, viewpoint: np.ndarray | None = None) -> float:
+        """How well, in metres, any upright body may explain a cloud (N, 3) in metres; lower is better, and fast.
+
+        Compares frames in which a cloud may be meant before one is fitted in.
+        """
+        points = thinned(points, None, PROMISE_POINTS)[0]
+        unknown = np.zeros_like(points)
+        cloud = Cloud.of(points, unknown) if viewpoint is None else ViewCloud.seen_from(points, unknown, viewpoint)
+        return self._finder.bank.promise(cloud)
 
     def _fit_from_joints(
         self,

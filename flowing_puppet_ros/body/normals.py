@@ -23,19 +23,20 @@ def thinned(points: np.ndarray, normals: np.ndarray | None, limit: int) -> tuple
     Returns:
         Points and normals; untouched when they are few enough.
     """
-    size = float(np.ptp(points, axis=0).max()) / 400
-    kept, kept_normals = points, normals
+    if len(points) <= limit:
+        return points, normals
+    kept = points if normals is None else np.concatenate([points, normals], axis=1)
+    size, weight = float(np.ptp(points, axis=0).max()) / 400, np.ones(len(points))
     while len(kept) > limit:
-        cells = np.floor((points - points.min(axis=0)) / size).astype(np.int64)
-        _, group = np.unique(cells, axis=0, return_inverse=True)
-        count = np.bincount(group)[:, None]
-        kept = _sums(points, group) / count
-        if normals is not None:
-            total = _sums(normals, group)
-            length = np.linalg.norm(total, axis=1, keepdims=True)
-            kept_normals = total / np.where(length > 1e-9, length, 1)
+        cells = np.floor((kept[:, :3] - kept[:, :3].min(axis=0)) / size).astype(np.int64)
+        _, group = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_inverse=True)
+        total = np.bincount(group, weight)
+        kept, weight = _sums(kept * weight[:, None], group) / total[:, None], total
         size *= max(1.05, np.sqrt(len(kept) / limit))
-    return kept, kept_normals
+    if normals is None:
+        return kept, None
+    length = np.linalg.norm(kept[:, 3:], axis=1, keepdims=True)
+    return np.ascontiguousarray(kept[:, :3]), kept[:, 3:] / np.where(length > 1e-9, length, 1)
 
 
 def _sums(values: np.ndarray, group: np.ndarray) -> np.ndarray:

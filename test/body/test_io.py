@@ -5,8 +5,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from flowing_puppet_ros.body.frames import UP_NAMES, Y_UP, Frame, guess_scale, up_candidates
+from flowing_puppet_ros.body.frames import (
+    UP_NAMES,
+    Frame,
+    all_candidates,
+    axis_of,
+    guess_scale,
+    seen_from_origin,
+    up_candidates,
+    upright,
+)
 from flowing_puppet_ros.body.io import Scan, read_scan, storable, write_ply
 from flowing_puppet_ros.errors import InputError
 
@@ -125,16 +136,26 @@ def test_pickles_and_wrong_arrays_are_refused(tmp_path: Path) -> None:
 
 
 def test_frame_there_and_back() -> None:
-    frame = Frame(0.01, Y_UP)
+    frame = Frame(0.01, upright(axis_of("y")))
     points = np.random.default_rng(0).normal(size=(5, 3))
     np.testing.assert_allclose(frame.to_scan(frame.to_body(points)), points)
     np.testing.assert_allclose(frame.to_body(np.array([[0.0, 100.0, 0.0]])), [[0.0, 0.0, 1.0]])
 
 
-@pytest.mark.parametrize(("name", "up"), [("y", [0, 1, 0]), ("z", [0, 0, 1]), ("-y", [0, -1, 0])])
-def test_every_up_axis_becomes_z(name: str, up: list[float]) -> None:
-    assert np.linalg.det(UP_NAMES[name]) == pytest.approx(1)
-    np.testing.assert_allclose(UP_NAMES[name] @ up, [0, 0, 1])
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda up: np.linalg.norm(up) > 0.1))
+def test_every_direction_becomes_z_by_a_rotation(up: list[float]) -> None:
+    turn = upright(np.array(up))
+    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    np.testing.assert_allclose(turn @ up, [0, 0, np.linalg.norm(up)], atol=1e-9)
+    np.testing.assert_allclose(Frame(0.01, turn).up, np.array(up) / np.linalg.norm(up), atol=1e-9)
+
+
+def test_people_with_y_up_look_along_z_and_z_up_stays() -> None:
+    assert np.array_equal(upright(axis_of("z")), np.eye(3))
+    assert np.array_equal(upright(axis_of("y")) @ [0, 0, 1], [1, 0, 0])
+    assert np.array_equal(axis_of("-x"), [-1, 0, 0])
+    assert len({tuple(axis_of(name)) for name in UP_NAMES}) == 6
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.01, 0.001])
@@ -154,9 +175,37 @@ def test_closed_surface_of_no_usual_size_is_scaled_to_an_adult() -> None:
 
 
 def test_up_is_the_long_side_and_open_when_two_are_alike() -> None:
+    cloud = np.random.default_rng(0).uniform(0, 1, (500, 3))
+
+    def names(sides: list[float], one_sided: bool) -> list[str]:
+        found = up_candidates(cloud * sides, one_sided)
+        return [next(name for name in UP_NAMES if np.array_equal(axis_of(name), up)) for up in found]
+
+    assert names([0.5, 0.4, 1.7], False) == ["z"]
+    assert names([0.5, 1.7, 0.4], False) == ["y"]
+    assert names([0.5, 1.7, 0.4], True) == ["y", "-y"]
+    assert names([0.3, 1.7, 1.75], False) == ["z", "y"]
+
+
+def test_people_who_lie_askew_have_their_length_among_the_directions() -> None:
+    cloud = np.random.default_rng(0).normal(size=(500, 3)) * [0.5, 0.15, 0.1]
+    assert len(all_candidates(cloud)) == 6
+    turn = upright(np.array([1.0, 1.0, 0.2])).T
+    askew = all_candidates(cloud[:, [1, 2, 0]] @ turn.T)
+    assert len(askew) == 8
+    np.testing.assert_allclose(np.abs(askew[6] @ turn[:, 2]), 1, atol=0.01)
+    np.testing.assert_allclose(askew[6], -askew[7])
+
+
+@pytest.mark.parametrize("count", [500, 6000])
+def test_one_side_is_told_from_a_whole_body_by_what_lies_behind(count: int) -> None:
     rng = np.random.default_rng(0)
-    cloud = rng.uniform(0, 1, (500, 3))
-    assert up_candidates(Scan(cloud * [0.5, 0.4, 1.7]), 1.0, False) == ["z"]
-    assert up_candidates(Scan(cloud * [0.5, 1.7, 0.4]), 1.0, False) == ["y"]
-    assert up_candidates(Scan(cloud * [0.5, 1.7, 0.4]), 1.0, True) == ["y", "-y"]
-    assert up_candidates(Scan(cloud * [0.3, 1.7, 1.75]), 1.0, False) == ["z", "y"]
+    normals = rng.normal(size=(count * 2, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    place = np.array([3.0, -1.0, 0.2])
+    body = normals * [0.15, 0.2, 0.85] + place
+    front = body[(normals / [0.15, 0.2, 0.85] * body).sum(axis=1) < 0]
+    noise = 0.005 * rng.normal(size=front.shape)
+    assert seen_from_origin(front + noise)
+    assert not seen_from_origin(body[:count])
+    assert not seen_from_origin(front - place)
