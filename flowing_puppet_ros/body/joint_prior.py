@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.gaussian import Gaussian
 
 
@@ -32,13 +31,12 @@ class JointPrior:
         self._precision = np.linalg.inv(pairwise.covariance + ridge**2 * np.eye(len(pairwise.mean)))
 
     def quadratic(
-        self, parent_rotation: np.ndarray, child_rotation: np.ndarray, parent_pose: np.ndarray, child_pose: np.ndarray
+        self, relative: np.ndarray, parent_pose: np.ndarray, child_pose: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Hessian and gradient of half the squared Mahalanobis distance.
 
         Args:
-            parent_rotation: (3, 3).
-            child_rotation: (3, 3).
+            relative: (3,) Rodrigues vector of the child's rotation in the parent's frame.
             parent_pose: (D,) coefficients.
             child_pose: (D',) coefficients.
 
@@ -46,7 +44,6 @@ class JointPrior:
             Square matrix and vector over [parent's rotation increment, child's rotation increment (both multiplied
             on the right), parent's pose, child's pose].
         """
-        relative = so3.log(parent_rotation.T @ child_rotation)
         inverse = inverse_left_jacobian(relative)
         deviation = np.concatenate([relative, parent_pose, child_pose]) - self._mean
         jacobian = np.zeros((len(deviation), len(deviation) + 3))

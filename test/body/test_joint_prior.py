@@ -39,7 +39,7 @@ def test_gradient_equals_numerical_derivative() -> None:
         deviation = np.concatenate([turned, poses + step[6:]]) - gaussian.mean
         return float(0.5 * deviation @ precision @ deviation)
 
-    hessian, gradient = prior.quadratic(parent, child, poses[:3], poses[3:])
+    hessian, gradient = prior.quadratic(so3.log(parent.T @ child), poses[:3], poses[3:])
     numerical = [(cost(row) - cost(-row)) / (2 * STEP) for row in STEP * np.eye(11)]
     np.testing.assert_allclose(gradient, numerical, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(hessian, hessian.T, atol=1e-9)
