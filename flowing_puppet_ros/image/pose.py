@@ -22,7 +22,7 @@ from flowing_puppet_ros.image.pose_parts import Particles, limited, particles_of
 from flowing_puppet_ros.image.pose_search import Person, PoseSearch
 from flowing_puppet_ros.image.pose_settings import PoseSettings
 from flowing_puppet_ros.image.pose_solutions import Solution, joint_confidence, searched_parts, solutions_of
-from flowing_puppet_ros.image.tracker import TrackedPuppet, letters
+from flowing_puppet_ros.image.tracker import letters
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_multiview import VIEW_HEADINGS, MultiViewStructures
 from flowing_puppet_ros.model.ds_render import depth_order
@@ -55,19 +55,30 @@ class Detector(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedPuppet:
-    """One person: the best puppet, and `solutions`: the first is that puppet, the others differ in the arms.
+    """One person in one image, pixels of the image.
 
-    `gender_probability` says how likely each of the models is that were to be compared.
+    `joints` (J, 2) in the order of the joint_names of `model`, `confidence` (J,) in [0, 1], `scale` px/m, `view` front
+    or back, `contours` one (K_i, 2) a part, `depth` (P,) paint order of each part, 0 farthest, `energy` the negative
+    log of the posterior (Eq. 15, up to a constant). Of `solutions` the first is this puppet and the others differ in
+    the arms; `gender_probability` says how likely each of the models is that were to be compared.
     """
 
-    puppet: TrackedPuppet
+    id: str
+    model: str
+    joints: Array
+    confidence: Array
+    scale: float
+    view: View
+    energy: float
+    contours: tuple[Array, ...]
+    depth: tuple[int, ...]
     solutions: tuple[Solution, ...]
     gender_probability: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Seen:
-    """How a person is seen: the models of each gender, front or back, and the heading in radians.
+    """How a person is seen: the models of each gender, front or back, the heading in radians, the parts in search.
 
     The heading is that of the mirror image where the camera sees the back.
     """
@@ -75,6 +86,7 @@ class Seen:
     models: tuple[DeformableStructures, ...]
     view: View
     heading: float
+    parts: tuple[int, ...]
 
 
 class PoseEstimator:
@@ -157,14 +169,15 @@ class PoseEstimator:
         model = models[0]
         scene = None if self._likelihood is None else Window.around(self._likelihood, image, joints, scale)
         person = Person(scene, found, scale, np.array([1.0 if view == "front" else -1.0, 1.0]))
-        search = self._search(model, searched_parts(model, np.isfinite(joints).all(axis=1)))
+        seen = Seen(models, view, heading, searched_parts(model, np.isfinite(joints).all(axis=1)))
+        search = self._search(model, seen.parts)
         start = self._start(model, search, person, view, rng)
         person = self._coloured(search, start, person)
         judged, result = search.run(start, person, rng)
         solutions = solutions_of(model, search, judged, person, self._settings.solutions)
         best = solutions[0].joints
         sure = joint_confidence(model, search, judged, result, person, best)
-        return self._answer(image, solutions, sure, person, Seen(models, view, heading), index, factor)
+        return self._answer(image, solutions, sure, person, seen, index, factor)
 
     def _turned(self, joints: Array, confidence: Array, view: View) -> tuple[tuple[DeformableStructures, ...], float]:
         """The models for the side from which a person is seen, and the person's heading in radians.
@@ -226,7 +239,10 @@ class PoseEstimator:
         known = (sure > 0).astype(float)
         shapes = [completed(model, best.joints, known, best.scale, seen.view) for model in seen.models]
         energies = np.array(
-            [self._energy(model, shape, person) for model, shape in zip(seen.models, shapes, strict=True)]
+            [
+                self._search(model, seen.parts).energy(particles_of([shape], model.bone, person.mirror), person)
+                for model, shape in zip(seen.models, shapes, strict=True)
+            ]
         )
         probability = np.exp(energies.min() - energies) / np.exp(energies.min() - energies).sum()
         chosen = int(probability.argmax())
@@ -237,10 +253,6 @@ class PoseEstimator:
         order = depth_order(model, seen.view, seen.heading)
         depth = tuple(int(rank) for rank in np.argsort(order))
         placed = _rescaled(shape, factor)
-        puppet = TrackedPuppet(
-            letters(self._settings.seed) + str(index + 1), model.name, placed.joints, np.clip(confidence, 0.0, 1.0),
-            placed.scale, seen.view, best.energy, placed.contours, depth, placed,
-        )  # fmt: skip
         others = tuple(
             Solution(
                 _unshrunk(completed(model, one.joints, known, one.scale, seen.view).joints, factor),
@@ -250,12 +262,11 @@ class PoseEstimator:
             for one in solutions
         )
         genders = {one.gender: float(value) for one, value in zip(seen.models, probability, strict=True)}
-        return PosedPuppet(puppet, others, genders)
-
-    def _energy(self, model: DeformableStructures, shape: PuppetShape, person: Person) -> float:
-        """Energy of one puppet of one model, all parts on their joints."""
-        parts = searched_parts(model, np.ones(len(model.joint_names), bool))
-        return self._search(model, parts).energy(particles_of([shape], model.bone, person.mirror), person)
+        identity = letters(self._settings.seed) + str(index + 1)
+        return PosedPuppet(
+            identity, model.name, placed.joints, np.clip(confidence, 0.0, 1.0), placed.scale, seen.view, best.energy,
+            placed.contours, depth, others, genders,
+        )  # fmt: skip
 
 
 def completed(model: DeformableStructures, joints: Array, confidence: Array, scale: float, view: View) -> PuppetShape:
