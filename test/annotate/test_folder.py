@@ -62,7 +62,11 @@ def test_a_12_megapixel_image_is_shown_whole_and_a_larger_one_reduced(tmp_path: 
     write_image(tmp_path / "a.png", size=(3000, 4000))
     write_image(tmp_path / "b.png", size=(5000, 4000))
     folder = ImageFolder(tmp_path)
-    shown = [cv2.imdecode(np.frombuffer(folder.picture(key), np.uint8), cv2.IMREAD_COLOR).shape for key in folder.items]
+    shown = []
+    for key in folder.items:
+        picture = cv2.imdecode(np.frombuffer(folder.picture(key), np.uint8), cv2.IMREAD_COLOR)
+        assert picture is not None
+        shown.append(picture.shape)
     assert shown[0] == (3000, 4000, 3)
     assert 0.98 * SHOWN_PIXELS < shown[1][0] * shown[1][1] <= SHOWN_PIXELS
     assert folder.image("b.png").shape == (5000, 4000, 3)

@@ -13,13 +13,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Page
+from playwright.sync_api import Browser, Page, ViewportSize
 
 from flowing_puppet_ros.annotate.store import FILE
 from flowing_puppet_ros.model.ds_joints import JOINT_NAMES
 
 ELBOW = JOINT_NAMES[10].index("left_elbow")
-WINDOW = {"width": 1100, "height": 700}
+WINDOW = ViewportSize(width=1100, height=700)
 
 
 class Tool:
