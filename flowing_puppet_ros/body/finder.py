@@ -34,8 +34,8 @@ from flowing_puppet_ros.settings import Settings, setting
 Progress = Callable[[float], None]
 # Steps of the finish of a hypothesis, rounds of limb hypotheses, and how many of a round are finished.
 HYPOTHESIS_STEPS, LIMB_ROUNDS, LIMBS_FINISHED = 12, 3, 3
-# A limb hypothesis must be this much closer than the body that it came from.
-CLOSER = 0.98
+# A limb hypothesis must be this much closer than the body that it came from, and none helps a body so many metres off.
+CLOSER, HOPELESS = 0.98, 0.06
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,9 +68,9 @@ class Candidate:
     judgement: Judgement
 
     @property
-    def distance(self) -> float:
-        """Two-way distance, metres."""
-        return self.judgement.distance
+    def cost(self) -> float:
+        """What candidates are compared by, metres."""
+        return self.judgement.cost
 
 
 class BodyFinder:
@@ -99,8 +99,8 @@ class BodyFinder:
         for turn in range(tries):
             for candidate in self._two_bodies(cloud, grid, rng, part_of(progress, turn / tries, (turn + 0.7) / tries)):
                 tried.append(self._mended(candidate, cloud, grid, rng))
-                best = min(tried, key=lambda candidate: candidate.distance)
-                if best.distance < self._settings.restart_distance:
+                best = min(tried, key=lambda candidate: candidate.cost)
+                if best.cost < self._settings.restart_distance:
                     return self.finish(best.state, cloud, none, steps)
         return self.finish(best.state, cloud, none, steps)
 
@@ -141,31 +141,31 @@ class BodyFinder:
         )
         body = self._candidate(found.state, cloud)
         turned = self.near(turned_around(self._model, body.state), grid, none, rng, part_of(progress, 0.8, 1.0))
-        return sorted([body, self._candidate(turned, cloud)], key=lambda candidate: candidate.distance)
+        return sorted([body, self._candidate(turned, cloud)], key=lambda candidate: candidate.cost)
 
     def _mended(self, body: Candidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> Candidate:
         """The body with limbs moved to where they lie closer, while one seems to be in a wrong place."""
-        groups = limb_groups(self._model.tree)
         for _ in range(LIMB_ROUNDS):
-            if not body.judgement.doubtful:
+            if not body.judgement.doubtful or body.cost > HOPELESS:
                 break
-            kept, streams = body, dict(zip(groups, rng.spawn(len(groups)), strict=True))
-
-            def moved(group: tuple[int, ...]) -> tuple[float, BodyState] | None:
-                state = self._limbs.run(kept.state, group, cloud, grid, streams[group])  # noqa: B023
-                if state is None:
-                    return None
-                return two_way_distance(self._model.vertices(state), self._model.faces, cloud), state
-
-            found = [pair for pair in ordered(moved, groups, self._threads) if pair is not None]
-            found.sort(key=lambda pair: pair[0])
-            states = [body.state, *(state for _, state in found[:LIMBS_FINISHED])]
+            states = [body.state, *self._limbs_moved(body.state, cloud, grid, rng)[:LIMBS_FINISHED]]
             candidates = ordered(lambda state: self._candidate(state, cloud), states, self._threads)
-            closest = min(candidates, key=lambda candidate: candidate.distance)
-            if closest.distance > CLOSER * body.distance:
+            closest = min(candidates, key=lambda candidate: candidate.cost)
+            if closest.cost > CLOSER * body.cost:
                 break
             body = closest
         return body
+
+    def _limbs_moved(self, body: BodyState, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> list[BodyState]:
+        """Bodies with some of the limbs searched anew, the closest to the cloud first."""
+        groups = limb_groups(self._model.tree)
+        found = ordered(
+            lambda pair: self._limbs.run(body, pair[0], cloud, grid, pair[1]),
+            list(zip(groups, rng.spawn(len(groups)), strict=True)),
+            self._threads,
+        )
+        bodies = [state for state in found if state is not None]
+        return sorted(bodies, key=lambda s: two_way_distance(self._model.vertices(s), self._model.faces, cloud))
 
 
 def part_of(progress: Progress, low: float, high: float) -> Progress:

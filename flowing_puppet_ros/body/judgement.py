@@ -9,14 +9,17 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
+from flowing_puppet_ros.body.energy import TOO_CLOSE
 from flowing_puppet_ros.body.geometry import vertex_normals
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 WIDTH = 0.04  # metres: a vertex or point that far from the other surface counts a quarter
-UNCOVERED = 0.05  # metres
+UNCOVERED = 0.04  # metres
 # A body with more of the cloud uncovered, or a part less on the cloud, has a limb in a wrong place, or may have.
-MUCH_UNCOVERED, LITTLE_ON_CLOUD = 0.01, 0.3
+MUCH_UNCOVERED, LITTLE_ON_CLOUD = 0.005, 0.3
 LEAST_SEEN = 0.1
+# What a folded limb costs in metres of distance: limbs vanish into limbs where they would otherwise be in the air.
+FOLDED_COST = 0.003
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,7 +30,8 @@ class Judgement:
         part_confidence: (16,) 0 to 1, how much of each part's seen surface lies on the cloud; 0 for unseen parts.
         seen: (16,) whether at least a tenth of the part's surface is seen.
         explained: 0 to 1, how much of the cloud lies on the body.
-        uncovered: share of the cloud's points that are farther than 5 cm from the body.
+        uncovered: share of the cloud's points that are farther than 4 cm from the body.
+        folded: joints at which the parts on both sides lie in each other (their centres less than 5 cm apart, Eq. 51).
         distance: mean over both ways of the distances between body and cloud, metres.
     """
 
@@ -35,13 +39,19 @@ class Judgement:
     seen: np.ndarray
     explained: float
     uncovered: float
+    folded: int
     distance: float
+
+    @property
+    def cost(self) -> float:
+        """What hypotheses are compared by, metres."""
+        return self.distance + FOLDED_COST * self.folded
 
     @property
     def doubtful(self) -> bool:
         """Whether a limb may be in a wrong place."""
         least = self.part_confidence[self.seen].min(initial=1.0)
-        return self.uncovered > MUCH_UNCOVERED or bool(least < LITTLE_ON_CLOUD)
+        return self.uncovered > MUCH_UNCOVERED or self.folded > 0 or bool(least < LITTLE_ON_CLOUD)
 
     @property
     def confidence(self) -> float:
@@ -69,10 +79,13 @@ def judged(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> Judgeme
     count, size = np.bincount(owner[seen], minlength=parts), np.bincount(owner, minlength=parts)
     share = np.bincount(owner[seen], weight[seen], minlength=parts) / np.maximum(count, 1)
     back = cKDTree(vertices).query(cloud.points)[0]
+    centers = np.stack([vertices[owner == part].mean(axis=0) for part in range(parts)])
+    apart = [np.linalg.norm(centers[parent] - centers[child]) for parent, child in model.tree.edges]
     return Judgement(
         share,
         count >= LEAST_SEEN * size,
         float(((WIDTH**2 / (WIDTH**2 + back**2)) ** 2).mean()),
         float((back > UNCOVERED).mean()),
+        int(np.sum(np.array(apart) < TOO_CLOSE)),
         two_way_distance(vertices, model.faces, cloud),
     )

@@ -61,11 +61,7 @@ def local_stages(tree: PartTree) -> tuple[Stage, ...]:
 
 
 def limb_stages(tree: PartTree) -> tuple[Stage, ...]:
-    """A schedule for one limb whose place is unknown while the rest of the body stays."""
+    """A schedule for limbs whose place is unknown while the rest of the body stays; it ends with many modes."""
     half = np.full(len(tree) - 1, 0.5)
     ones = np.ones(len(tree))
-    return (
-        Stage(0.5, half, ones, WIDE, False),
-        Stage(0.8, half, ones, NARROW, False),
-        Stage(1.0, half, ones, NARROW, True),
-    )
+    return (Stage(0.6, half, ones, WIDE, False), Stage(1.0, half, ones, NARROW, False))

@@ -20,6 +20,7 @@ from flowing_puppet_ros.inference.diverse import select_diverse
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product, message_foundation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
+EXCLUDED = 1e6  # cost of a particle that is not to be used
 NO_GRIDS: Mapping[int, CloudGrid] = {}
 
 
@@ -46,10 +47,26 @@ class SearchWeights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """Result of a search: the best body, and the cost of Eq. 50 with the weights of the last stage."""
+    """Result of a search.
+
+    Attributes:
+        state: the best body.
+        cost: of Eq. 50 with the weights of the last stage.
+        judged: the last particles of every part.
+    """
 
     state: BodyState
     cost: float
+    judged: list[Judged]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turn:
+    """What all iterations of one search share: the cloud of every part, believed joints, and threads."""
+
+    grids: list[CloudGrid]
+    targets: JointTargets
+    threads: int
 
 
 class Search:
@@ -71,12 +88,13 @@ class Search:
         rng: np.random.Generator,
         progress: Callable[[float], None] | None = None,
         own: Mapping[int, CloudGrid] = NO_GRIDS,
+        keep: int | None = None,
         threads: int = 1,
     ) -> Found:
         """Improve particles and return the best body.
 
         Args:
-            start: per part the first particles; their number stays, and a part with a single one stays as it is.
+            start: per part the first particles; a part with a single one stays as it is.
             grid: the cloud.
             targets: believed joints.
             stages: schedule; the last one ends at 1.
@@ -84,30 +102,57 @@ class Search:
             rng: source of all randomness.
             progress: called with the fraction done.
             own: clouds of the parts that do not see `grid`.
+            keep: particles a part that go on after all of the start were improved; None for as many as there are.
             threads: how many; the result does not depend on it.
         """
-        counts = [len(particles) for particles in start]
-        grids = [own.get(part, grid) for part in range(len(start))]
-        searched = [part for part, count in enumerate(counts) if count > 1]
+        turn = _Turn([own.get(part, grid) for part in range(len(start))], targets, threads)
         judged = [
             Judged.judge(points, particles, grid, targets)
-            for points, particles, grid in zip(self._points, start, grids, strict=True)
+            for points, particles, grid in zip(self._points, start, turn.grids, strict=True)
         ]
+        searched = [part for part, particles in enumerate(start) if len(particles) > 1]
+        counts = [len(particles) if keep is None else min(keep, len(particles)) for particles in start]
+        if keep is not None:
+            judged = self._go_on(judged, {part: start[part] for part in searched}, counts, stages[0], turn)
         best = self._solve(judged, stages[0])[0].assignment
         for iteration in range(iterations):
             stage = next(stage for stage in stages if iteration < stage.until * iterations or stage is stages[-1])
-            proposed = [(part, self._propose(part, judged, best, stage, rng)) for part in searched]
-            improved = ordered(lambda pair: self._improved(*pair, grids[pair[0]], targets), proposed, threads)
-            for part, new in zip(searched, improved, strict=True):
-                judged[part] = judged[part].extend(new)
-            result, edges = self._solve(judged, stage)
-            for part in searched:
-                judged[part] = judged[part].take(self._select(part, counts[part], result, edges, stage.greedy))
+            proposed = {part: self._propose(part, judged, best, stage, rng) for part in searched}
+            judged = self._go_on(judged, proposed, counts, stage, turn)
             best = np.zeros(len(judged), dtype=np.int64)
             if progress is not None:
                 progress((iteration + 1) / iterations)
         result, _ = self._solve(judged, stages[-1])
-        return Found(state_of(self._model, [group.particles for group in judged], result.assignment), result.cost)
+        return Found(self._body(judged, result), result.cost, judged)
+
+    def modes(self, found: Found, part: int) -> list[BodyState]:
+        """The best body with each of the particles that a search left of a part."""
+        nodes, edges = self._costs(found.judged, four_stages(self._model.tree)[-1])
+        bodies = []
+        for particle in range(len(nodes[part])):
+            only = np.full(len(nodes[part]), EXCLUDED)
+            only[particle] = nodes[part][particle]
+            costs = [*nodes[:part], only, *nodes[part + 1 :]]
+            bodies.append(self._body(found.judged, max_product(self._model.tree, costs, edges)))
+        return bodies
+
+    def _body(self, judged: list[Judged], result: MaxProduct) -> BodyState:
+        return state_of(self._model, [group.particles for group in judged], result.assignment)
+
+    def _go_on(
+        self, judged: list[Judged], proposed: dict[int, Particles], counts: list[int], stage: Stage, turn: _Turn
+    ) -> list[Judged]:
+        """Improve proposed particles, add them to the present ones, and keep `counts` of each part, the best first."""
+        improved = ordered(
+            lambda pair: self._improved(*pair, turn.grids[pair[0]], turn.targets), proposed.items(), turn.threads
+        )
+        judged = list(judged)
+        for part, new in zip(proposed, improved, strict=True):
+            judged[part] = judged[part].extend(new)
+        result, edges = self._solve(judged, stage)
+        for part in proposed:
+            judged[part] = judged[part].take(self._select(part, counts[part], result, edges, stage.greedy))
+        return judged
 
     def energy(self, state: BodyState, cloud: DataCost) -> float:
         """Eq. 50 of one body, with every weight as in the last stage of the search."""
@@ -131,7 +176,12 @@ class Search:
         return Judged.judge(self._points[part], moved, grid, targets)
 
     def _solve(self, judged: list[Judged], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
-        """Run max-product with the weights of a stage (Eqs. 50-52)."""
+        """Run max-product with the weights of a stage."""
+        nodes, edges = self._costs(judged, stage)
+        return max_product(self._model.tree, nodes, edges), edges
+
+    def _costs(self, judged: list[Judged], stage: Stage) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Costs of every part's particles and of every edge's pairs with the weights of a stage (Eqs. 50-52)."""
         nodes = [
             beta * (group.distance + self._weights.mismatch * group.mismatch) + group.pull
             for beta, group in zip(stage.data, judged, strict=True)
@@ -143,7 +193,7 @@ class Search:
             weight = self._model.interfaces[edge].weight
             cost = stitching_costs(weight, a.interfaces[edge], b.interfaces[edge], centers, self._weights.stitch)
             edges.append(stage.stitch[edge] * cost)
-        return max_product(self._model.tree, nodes, edges), edges
+        return nodes, edges
 
     def _select(self, part: int, count: int, result: MaxProduct, edges: list[np.ndarray], greedy: bool) -> np.ndarray:
         """Choose the particles to keep, the one of the best body first."""

@@ -1,12 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ring of synthetic cameras that several tests look through."""
+"""A ring of synthetic cameras that several tests look through; the capsule man can be imported."""
 
+import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.camera import Camera
+
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 def _look_at(eye: np.ndarray, focal: float, size: tuple[int, int], lens: tuple[float, ...]) -> Camera:
