@@ -18,7 +18,6 @@ from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, checked_cloud
 from flowing_puppet_ros.body.normals import thinned
 from flowing_puppet_ros.body.refine import Refiner, RefineWeights
-from flowing_puppet_ros.body.view_cloud import ViewCloud
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
@@ -36,9 +35,9 @@ class BodyTrackerSettings(Settings):
 
     points: int = setting(5000, "points that a tracked cloud from all sides is thinned to", low=200, high=200000)
     steps: int = setting(5, "Gauss-Newton steps a frame", low=1, high=100)
-    lost_ratio: float = setting(1.4, "two-way distance, against the best since the last search, of a lost track",
+    lost_ratio: float = setting(1.3, "two-way distance, against the best since the last search, of a lost track",
                                 low=1.0, high=10.0)  # fmt: skip
-    lost_distance: float = setting(0.003, "distance that must be added to that", unit="m", low=0.0, high=1.0)
+    lost_distance: float = setting(0.001, "distance that must be added to that", unit="m", low=0.0, high=1.0)
     longest_gap: float = setting(0.5, "gap between clouds after which a body is searched for again", unit="s",
                                  low=0.01, high=60.0)  # fmt: skip
 
@@ -130,10 +129,11 @@ class BodyTracker:
 
     def _predicted(self, last: _Seen, stamp: int) -> BodyState:
         """The last body, moved on by its last motion in proportion to the time."""
+        state = last.fit.state
         if self._before is None:
-            return last.fit.state
+            return state
         share = min((stamp - last.stamp) / (last.stamp - self._before.stamp), MOST_STRETCH)
-        before, state = self._before.fit.state, last.fit.state
+        before = self._before.fit.state
         turn = rotation.log(np.swapaxes(before.rotation, -1, -2) @ state.rotation)
         return replace(
             state,
@@ -145,8 +145,9 @@ class BodyTracker:
         weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps)
         learned = BELIEF * min(self._frames, MOST_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
-        terms = [cloud.free_space] if isinstance(cloud, ViewCloud) else []
-        return self._fitter.result(self._refiner.run(start, cloud, self._none, weights, terms), cloud)
+        # What turns to the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
+        facing = Cloud(cloud.points, cloud.normals, cloud.tree, cloud.viewpoint)
+        return self._fitter.result(self._refiner.run(start, facing, self._none, weights), cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
         return fit.two_way_distance > self._settings.lost_ratio * self._best + self._settings.lost_distance
