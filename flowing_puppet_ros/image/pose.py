@@ -36,7 +36,7 @@ OUTSIDE = 0.1
 GUESSED = 0.05
 """Confidence, times the person's, of joints that nothing but the model placed."""
 
-SURELY_SIDEWAYS = 0.9
+SURELY_SIDEWAYS = 0.97
 """Probability of not facing the camera from which a model of another view is taken."""
 
 DETECTION_TRUST = 0.3

@@ -29,6 +29,9 @@ SHIFT, TURN, GROW, DEFORM = 0.02, 0.12, 0.03, 0.35
 PERSON_SCALE = 0.15
 """Deviation of a torso's scale from the one that the person was found at, as a share."""
 
+WRIST_WEIGHT = 2.0
+"""Weight of the detector's score of wrists relative to other joints: their maps know most of the whole arm."""
+
 GRID = 0.04  # metres between the places at which wrists are considered
 REACH = 0.8  # metres from the shoulder
 
@@ -127,7 +130,8 @@ class PoseSearch:
         places = self.joints(k, particles, person.mirror)[:, -len(self._joints[k]) :]
         for index, name in enumerate(self._joints[k]):
             score = person.found.joint_score(name, np.ascontiguousarray(places[:, index]))
-            cost -= settings.detector_weight / len(self._joints[k]) * score
+            weight = settings.detector_weight * (WRIST_WEIGHT if name.endswith("wrist") else 1.0)
+            cost -= weight / len(self._joints[k]) * score
         return Judged(particles, cost)
 
     def _flattened(self, particles: Particles) -> Particles:

@@ -15,16 +15,16 @@ from flowing_puppet_ros.model.ds_joints import PART_JOINTS
 
 Array = np.ndarray[Any, Any]
 
-APART = 0.12
+APART = 0.15
 """Distance in metres at which two hypotheses of a wrist are different ones."""
 
 NEAR = 0.1
 """Metres within which other particles agree with a joint."""
 
-EVENNESS = 4.0
+EVENNESS = 8.0
 """Cost difference at which a hypothesis counts 1/e of the best one when diverse ones are chosen."""
 
-DOUBT = 3.0
+DOUBT = 6.0
 """Cost difference at which a particle counts 1/e of the best one in a joint's confidence."""
 
 _FORBIDDEN = 1e9
