@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure speed as ratios taken in one run: look-ups, steps, search, growth, tracking, whole fits."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evaluate.bench import Bench
+from flowing_puppet_ros.evaluate.tables import text_table
+
+PARTS = {
+    "look-ups": Bench.look_ups,
+    "steps": Bench.steps,
+    "search": Bench.search,
+    "growth": Bench.growth,
+    "tracking": Bench.tracking,
+    "fits": Bench.fits,
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flowing-puppet bench`."""
+    parser.add_argument("parts", nargs="*", metavar="PART", help=f"{', '.join(PARTS)}; without any, all")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the body that is fitted [%(default)s]")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of tables")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure the chosen parts, print the figures and return the exit status."""
+    unknown = next((part for part in arguments.parts if part not in PARTS), None)
+    if unknown is not None:
+        raise InputError(f"{unknown!r} is no part of the bench; choose from {', '.join(PARTS)}")
+    if arguments.seed < 0:
+        raise InputError(f"--seed is {arguments.seed}; it must be 0 or more")
+    bench, figures = Bench(arguments.seed), {}
+    for part in arguments.parts or PARTS:
+        print(f"measuring {part}", file=sys.stderr)
+        figures[part] = PARTS[part](bench)
+        if not arguments.json:
+            print(f"{part}: {PARTS[part].__doc__}\n{text_table(figures[part])}\n", flush=True)
+    if arguments.json:
+        print(json.dumps(figures))
+    return 0
