@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit bodies: `ros2 launch flowing_puppet_ros bodies.launch.py points:=/camera/points`, or from calibrated cameras.
 
-With `cameras:=cam01,cam02,cam03` the images of these namespaces are tracked, their visual hull is carved, and bodies
-are fitted to the hull; the poses of the cameras are read from /tf_static.
+With `cameras:=cam01,cam02,cam03` the images of these namespaces are tracked, one person is cut out of them and carved
+as a visual hull, and a body is fitted to the silhouettes; the poses of the cameras are read from /tf_static.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ CONFIG = Path(__file__).resolve().parent.parent / "config"
 
 
 def nodes(context: LaunchContext) -> list[Node]:
-    """Return the body fitter, and in front of it the trackers and the hull of the named cameras."""
+    """Return the body fitter, and in front of it the trackers and the silhouettes of the named cameras."""
     given = {name: LaunchConfiguration(name).perform(context) for name in ("cameras", "points", "initial", "image")}
     folder = Path(LaunchConfiguration("config").perform(context))
     clock = {"use_sim_time": LaunchConfiguration("use_sim_time")}
@@ -47,7 +47,7 @@ def nodes(context: LaunchContext) -> list[Node]:
     return [
         *(node("puppet_tracker", camera, [("image", given["image"])]) for camera in cameras),
         node("visual_hull", remappings=of_cameras, cameras=",".join(cameras)),
-        node("body_fitter", remappings=[("points", "hull"), ("initial", "hull/joints")]),
+        node("body_fitter"),
     ]
 
 

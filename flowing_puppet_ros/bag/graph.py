@@ -26,13 +26,16 @@ from flowing_puppet_ros.stream.puppet_tracker import PuppetTrackerComponent
 from flowing_puppet_ros.stream.visual_hull import VisualHullComponent
 
 IMAGE_NAMES = ("image", "image_raw", "image_color", "image_rect", "image_rect_color")
-LEAST_CAMERAS = 3
-"""Calibrated cameras from which a hull is worth building."""
+LEAST_CAMERAS = 2
+"""Calibrated cameras from which a person is fitted and a hull is built."""
 
 
 @dataclass(slots=True, eq=False)
 class Instance:
-    """A component in the graph: the namespace of its relative topics, and topics that stand for its ports."""
+    """A component in the graph: the namespace of its relative topics, and topics that stand for its ports.
+
+    An input that stands for no topic ("") gets nothing.
+    """
 
     name: str
     component: Component
@@ -64,6 +67,8 @@ class Graph:
         for instance in self.instances:
             for port in instance.component.inputs:
                 topic = instance.topic(port.name)
+                if not topic:
+                    continue
                 kinds = (port.type, COMPRESSED_IMAGE) if port.compressed else (port.type,)
                 if recorded.get(topic, port.type) in kinds:
                     found.setdefault(topic, []).append((instance, port.name))
@@ -98,8 +103,8 @@ def build_graph(
 ) -> Graph:
     """Make the components that the topics (name -> type) of a recording can feed.
 
-    One tracker a camera; a visual hull of three or more cameras that `frames` connects (`infos`: topic -> its first
-    CameraInfo); a body fitter for the hull and one for every cloud topic. `settings` are those of each kind of
+    One tracker a camera; a visual hull of two or more cameras that `frames` connects (`infos`: topic -> its first
+    CameraInfo); a body fitter for their silhouettes and one for every cloud topic. `settings` are those of each kind of
     component by its name. What the recording holds of their outputs is not used: it is made anew. InputError lists
     what there is when nothing can be used.
     """
@@ -213,8 +218,7 @@ def _hull_and_fitter(
     hull = VisualHullComponent(chosen, factory)  # type: ignore[arg-type]
     renamed = {f"{camera.name}/image": camera.image for camera in cameras}
     fitter = BodyFitterComponent(_settings(BodyFitterComponent, "body_fitter", settings), factory)  # type: ignore[arg-type]
-    fitter.expects("initial", True)
-    joined = {"points": "/hull", "initial": "/hull/joints"}
+    joined = {"silhouettes": "/silhouettes", "points": "", "initial": ""}
     return [Instance("visual_hull", hull, "", renamed), Instance("body_fitter", fitter, "", joined)]
 
 
@@ -223,7 +227,7 @@ def _cloud_fitter(
 ) -> Instance:
     namespace = cloud.rpartition("/")[0]
     fitter = BodyFitterComponent(_settings(BodyFitterComponent, "body_fitter", settings), factory)  # type: ignore[arg-type]
-    instance = Instance(f"{cloud.lstrip('/')}/body_fitter", fitter, namespace, {"points": cloud})
+    instance = Instance(f"{cloud.lstrip('/')}/body_fitter", fitter, namespace, {"points": cloud, "silhouettes": ""})
     fitter.expects("initial", topics.get(instance.topic("initial")) == BODIES)
     return instance
 

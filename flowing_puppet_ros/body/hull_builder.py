@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the tracked puppets of several calibrated cameras to triangulated joints and a visual hull."""
+"""From the tracked puppets of several calibrated cameras to silhouettes, triangulated joints and a visual hull."""
 
 from __future__ import annotations
 
@@ -37,25 +37,38 @@ class PuppetView:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class HullSet:
-    """What one synchronised set gives, in the world frame of the cameras' extrinsics, metres.
+class PersonSet:
+    """One person in the cameras at one instant, in the world frame of the cameras' extrinsics, metres.
 
-    `points` (N,3) and outward `normals` (N,3) of the hull, empty when there is none and `problem` says why in one
-    sentence; `joints` (J,3) and `confidence` (J,), NaN and 0 where fewer than two views agree; the `silhouettes`.
+    `joints` (J,3) and `confidence` (J,), NaN and 0 where fewer than two views agree; the `silhouettes` of all cameras;
+    `masks` (h,w) of those that can be used, fewer than two when `problem` says why in one sentence.
     """
 
-    points: Floats
-    normals: Floats
     joints: Floats
     confidence: Floats
     silhouettes: dict[str, Silhouette]
     problem: str = ""
 
+    @property
+    def masks(self) -> dict[str, NDArray[np.uint8]]:
+        """The masks by camera that can be used."""
+        return {name: each.mask for name, each in self.silhouettes.items() if not each.problem}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Hull:
+    """Surface `points` (N,3) and outward `normals` (N,3); none when `problem` says why in one sentence."""
+
+    points: Floats
+    normals: Floats
+    problem: str = ""
+
 
 class HullBuilder:
-    """Keeps the cameras and their backgrounds, and builds the hull of one person for each set that is asked for.
+    """Keeps the cameras and their backgrounds, cuts one person out of each set that is asked for and carves its hull.
 
-    Every frame of every camera goes through `observe`, which is cheap; `build` takes the observations of one instant.
+    Every frame of every camera goes through `observe`, which is cheap; `cut` takes the observations of one instant, and
+    `carve` what it found.
     """
 
     def __init__(self, settings: HullBuilderSettings | None = None) -> None:
@@ -100,8 +113,8 @@ class HullBuilder:
             )
         return self._estimator(name).observe(image, labels, scale, person)
 
-    def build(self, views: Mapping[str, PuppetView]) -> HullSet:
-        """Triangulate the joints and carve the hull of one set; cameras with an unusable mask are left out.
+    def cut(self, views: Mapping[str, PuppetView]) -> PersonSet:
+        """Cut the silhouettes of one set and triangulate its joints.
 
         `views` maps camera names to what they saw at one instant. Raises InputError for a camera without
         calibration.
@@ -110,23 +123,26 @@ class HullBuilder:
         if missing:
             raise InputError(f"camera {missing[0]} has no calibration; is its camera_info published?")
         silhouettes = {name: self._estimator(name).cut(view.observation) for name, view in views.items()}
-        joints, confidence = self._joints(views)
-        empty = np.zeros((0, 3))
-        usable = [name for name, silhouette in silhouettes.items() if not silhouette.problem]
-        if len(usable) < MIN_VIEWS:
+        usable = sum(not silhouette.problem for silhouette in silhouettes.values())
+        problem = ""
+        if usable < MIN_VIEWS:
             reasons = "; ".join(f"{name}: {each.problem}" for name, each in silhouettes.items() if each.problem)
-            problem = f"a visual hull needs {MIN_VIEWS} usable silhouettes, got {len(usable)} ({reasons})"
-            return HullSet(empty, empty, joints, confidence, silhouettes, problem)
-        cameras = [self.cameras[name] for name in usable]
-        masks = [silhouettes[name].mask for name in usable]
+            problem = f"a person needs {MIN_VIEWS} usable silhouettes, got {usable} ({reasons})"
+        return PersonSet(*self._joints(views), silhouettes, problem)
+
+    def carve(self, person: PersonSet) -> Hull:
+        """Carve the hull of a person; cameras with an unusable mask are left out."""
+        empty = np.zeros((0, 3))
+        if person.problem:
+            return Hull(empty, empty, person.problem)
+        cameras, masks = [self.cameras[name] for name in person.masks], list(person.masks.values())
         try:
-            bounds = bounds_of_joints(joints, self.settings.margin)
+            bounds = bounds_of_joints(person.joints, self.settings.margin)
             if bounds is None:
                 bounds = bounds_of_masks(cameras, masks, self.settings.margin)
-            points, normals = visual_hull(cameras, masks, bounds, self.settings)
+            return Hull(*visual_hull(cameras, masks, bounds, self.settings))
         except PuppetError as error:
-            return HullSet(empty, empty, joints, confidence, silhouettes, str(error))
-        return HullSet(points, normals, joints, confidence, silhouettes)
+            return Hull(empty, empty, str(error))
 
     def _estimator(self, name: str) -> SilhouetteEstimator:
         return self._estimators.setdefault(name, SilhouetteEstimator(self.settings))

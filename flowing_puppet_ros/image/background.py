@@ -93,9 +93,7 @@ class Background:
 
     def shadow(self, image: Images) -> NDArray[np.bool_]:
         """Pixels (h,w) that are darker than the background by much the same factor in all channels."""
-        factor = (image + 1.0) / (self.mean + 1.0)
-        darkest, brightest = factor.min(axis=2), factor.max(axis=2)
-        return (brightest < 1) & (darkest > _DARKEST_SHADOW) & (brightest - darkest < _SHADOW_TINT)
+        return _shadow(self.mean, np.ascontiguousarray(image))
 
     def _same_scene(self, image: Images, bare: NDArray[np.bool_]) -> bool:
         judged = bare & self.known
@@ -145,3 +143,17 @@ def _difference(mean, variance, image):  # type: ignore[no-untyped-def]  # pragm
                     levels[y, x] = delta
                     spread[y, x] = np.sqrt(variance[y, x, c])
     return levels, spread
+
+
+@njit(cache=True)
+def _shadow(mean, image):  # type: ignore[no-untyped-def]  # pragma: no cover
+    height, width, channels = image.shape
+    shadow = np.zeros((height, width), np.bool_)
+    for y in range(height):
+        for x in range(width):
+            darkest, brightest = np.inf, 0.0
+            for c in range(channels):
+                factor = (image[y, x, c] + 1.0) / (mean[y, x, c] + 1.0)
+                darkest, brightest = min(darkest, factor), max(brightest, factor)
+            shadow[y, x] = brightest < 1 and darkest > _DARKEST_SHADOW and brightest - darkest < _SHADOW_TINT
+    return shadow

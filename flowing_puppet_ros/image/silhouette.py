@@ -24,9 +24,10 @@ Mask = NDArray[np.uint8]
 # Lengths on the body in metres, from a trial on real recordings.
 _SURE_CORE = 0.03  # this far inside the puppet is body
 _POSSIBLE_FRINGE = 0.07  # this far outside the puppet may be body
+_UNKNOWN_FRINGE = 0.035  # the same where the background is not known: there colour alone leaks into what is similar
 _BARE_DISTANCE = 0.10  # farther than this outside the puppet is background
 _STRAY_REACH = 0.7  # how far a limb may lie from where the puppet has it
-_CROP_MARGIN = 0.25  # surroundings that GrabCut learns the colours of the background from
+_CROP_MARGIN = 0.15  # surroundings that GrabCut learns the colours of the background from
 _SPECK = 0.006  # radius of the opening that removes specks and threads
 
 # Background differences: d in grey levels, z in spreads softened by the camera's noise.
@@ -43,7 +44,7 @@ class SilhouetteSettings(BackgroundSettings):
     """How silhouettes are cut out, and how the background is learned."""
 
     max_side: int = setting(480, "longest image side that silhouettes are cut at", unit="px", low=64, high=8192)
-    cut_rounds: int = setting(2, "GrabCut rounds", low=1, high=10)
+    cut_rounds: int = setting(1, "GrabCut rounds", low=1, high=10)
     area_change: float = setting(
         0.35,
         "a mask whose area differs from its running median by more than this share is not used",
@@ -148,7 +149,7 @@ class SilhouetteEstimator:
         seed[other] = cv2.GC_FGD
         seed[same] = cv2.GC_BGD
         distance = distance_to(puppet)
-        seed[distance > _POSSIBLE_FRINGE * scale] = cv2.GC_BGD
+        seed[distance > np.where(known, _POSSIBLE_FRINGE, _UNKNOWN_FRINGE) * scale] = cv2.GC_BGD
         # A limb that the puppet has elsewhere still hangs on the body and is no shadow.
         stray = other & ~self.background.shadow(observation.image) & (distance <= _STRAY_REACH * scale)
         stray &= distance_to(observation.others) > _BARE_DISTANCE * scale

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds in, fitted bodies out."""
+"""Point clouds or silhouettes in, fitted bodies out."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import setting
 from flowing_puppet_ros.stream.clouds import decode_cloud, make_cloud
-from flowing_puppet_ros.stream.component import BODIES, POINT_CLOUD, TRANSFORMS, Component, Output, Port
+from flowing_puppet_ros.stream.component import BODIES, POINT_CLOUD, SILHOUETTES, TRANSFORMS, Component, Output, Port
 from flowing_puppet_ros.stream.messages import MessageFactory, make_transform, stamp_ns
 from flowing_puppet_ros.stream.people import Joint, joints_of, make_bodies, make_body
 from flowing_puppet_ros.stream.shapes import make_deletions, make_mesh_marker, make_part_poses, make_topology
+from flowing_puppet_ros.stream.silhouettes import SilhouetteBodies
 from flowing_puppet_ros.stream.waiting import Line, Shelf
 
 # Rotation of the cloud's frame to one whose z axis points up, by the axis of the cloud's frame that does.
@@ -32,8 +34,8 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class BodyFitterSettings(FitterSettings):
-    """Settings of the fit, and of what the component reads and waits for."""
+class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings):
+    """Settings of the fits, and of what the component reads and waits for."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     up: str = setting("z", "axis of the cloud's frame that points up (-y in optical frames)", choices=tuple(_UPRIGHT))
@@ -46,12 +48,17 @@ class BodyFitterSettings(FitterSettings):
 class BodyFitterComponent(Component):
     """Fits a body to each cloud; starts from the joints on `initial` when somebody publishes them.
 
-    Each fit draws its random numbers from the seed and the cloud's stamp, so it does not depend on which clouds came
-    before it or were dropped.
+    Each fit to a cloud draws its random numbers from the seed and the cloud's stamp, so it does not depend on which
+    clouds came before it or were dropped. What comes on `silhouettes` has its joints with it and is fitted at once;
+    nothing in that is random, and the last good body of a person only helps where the joints lead astray.
     """
 
     settings_type = BodyFitterSettings
-    inputs = (Port("points", POINT_CLOUD, "sensor"), Port("initial", BODIES, optional=True))
+    inputs = (
+        Port("points", POINT_CLOUD, "sensor"),
+        Port("initial", BODIES, optional=True),
+        Port("silhouettes", SILHOUETTES),
+    )
     outputs = (
         Port("bodies", BODIES),
         Port("body_meshes", "visualization_msgs/msg/MarkerArray", lazy=True),
@@ -67,13 +74,15 @@ class BodyFitterComponent(Component):
         self._settings = settings
         self._model = StitchedPuppet.load(settings.model)
         self._fitter = BodyFitter(self._model, settings)
+        self._silhouettes = SilhouetteBodies(self._model, settings)
         self._line = Line()
         self._initial = Shelf()
         self._shown: dict[str, int] = {}
         self._topology_sent = False
 
     def reset(self) -> None:
-        """Forget what waits."""
+        """Forget what waits and whom the silhouettes showed."""
+        self._silhouettes.reset()
         self._line.clear()
         self._initial.clear()
 
@@ -115,6 +124,8 @@ class BodyFitterComponent(Component):
         return int(np.random.SeedSequence([self._settings.seed, max(stamp, 0)]).generate_state(1)[0])
 
     def _process(self, port: str, message: Any) -> Output:
+        if port == "silhouettes":
+            return self._fit_silhouettes(message)
         stamp = stamp_ns(message)
         if port == "points":
             self._line.waiting.append((stamp, message))
@@ -146,6 +157,19 @@ class BodyFitterComponent(Component):
             bodies, fits = make_bodies(self.factory, cloud.header, []), []
         self.counters["bodies"] += len(fits)
         return [("bodies", bodies), *self._shapes(cloud.header, fits)]
+
+    def _fit_silhouettes(self, message: Any) -> Output:
+        self.counters["silhouettes"] += 1
+        fits: list[tuple[str, BodyFit]] = []
+        try:
+            fits.append(self._silhouettes.fit(message))
+        except InputError as error:
+            self._unusable(error)
+        self.counters["bodies"] += len(fits)
+        self.counters["doubtful bodies"] += sum(not fit.reliable for _, fit in fits)
+        bodies = [make_body(self.factory, identity, self._model, fit) for identity, fit in fits]
+        made = make_bodies(self.factory, message.header, bodies)
+        return [("bodies", made), *self._shapes(message.header, fits)]
 
     def _shapes(self, header: Any, fits: list[tuple[str, BodyFit]]) -> Output:
         outputs: Output = []

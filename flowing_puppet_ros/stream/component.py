@@ -27,6 +27,7 @@ POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 PUPPETS = "flowing_puppet_msgs/msg/PuppetArray"
 BODIES = "flowing_puppet_msgs/msg/BodyArray"
+SILHOUETTES = "flowing_puppet_msgs/msg/SilhouetteSet"
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images, part labels and puppets of several calibrated cameras in; visual hull and triangulated joints out."""
+"""Images, part labels and puppets of several calibrated cameras in; silhouettes, joints and visual hull out."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from flowing_puppet_ros.body.camera import Camera
 from flowing_puppet_ros.body.hull import MIN_VIEWS
-from flowing_puppet_ros.body.hull_builder import HullBuilder, HullBuilderSettings, HullSet
+from flowing_puppet_ros.body.hull_builder import HullBuilder, HullBuilderSettings, PersonSet
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import setting
 from flowing_puppet_ros.stream.clouds import make_cloud
@@ -18,6 +18,7 @@ from flowing_puppet_ros.stream.component import (
     IMAGE,
     POINT_CLOUD,
     PUPPETS,
+    SILHOUETTES,
     TRANSFORMS,
     Component,
     Output,
@@ -27,6 +28,7 @@ from flowing_puppet_ros.stream.images import decode_image, decode_labels
 from flowing_puppet_ros.stream.messages import FrameTree, MessageFactory, make_header, stamp_ns
 from flowing_puppet_ros.stream.pairing import Pairing
 from flowing_puppet_ros.stream.people import make_bodies, make_joints
+from flowing_puppet_ros.stream.silhouettes import make_silhouettes
 from flowing_puppet_ros.stream.views import PersonView, same_person, view_of
 
 _OF_CAMERA = ("image", "part_labels", "puppets")
@@ -39,14 +41,18 @@ class VisualHullSettings(HullBuilderSettings):
     cameras: str = setting("", "names of the cameras, separated by commas")
     frame: str = setting("", "frame of the hull; empty for the topmost frame of the cameras on /tf_static")
     slop: float = setting(0.008, "largest difference of stamps within one set of images", unit="s", low=0.0, high=1.0)
-    every: int = setting(6, "sets with a person from one hull to the next; all teach the background", low=1, high=9999)
+    every: int = setting(6, "sets with a person from one hull to the next; all give silhouettes", low=1, high=9999)
 
 
 class VisualHullComponent(Component):
-    """Carves the hull of one person; its joints are triangulated from the puppets of the same images."""
+    """Cuts one person out of the images and carves its hull; its joints are triangulated from the puppets."""
 
     settings_type = VisualHullSettings
-    outputs = (Port("hull", POINT_CLOUD), Port("hull/joints", BODIES))
+    outputs = (
+        Port("silhouettes", SILHOUETTES, lazy=True),
+        Port("hull", POINT_CLOUD),
+        Port("hull/joints", BODIES),
+    )
 
     def __init__(self, settings: VisualHullSettings, factory: MessageFactory) -> None:
         """Make the ports of the cameras named in the settings; InputError when there are fewer than two."""
@@ -119,13 +125,21 @@ class VisualHullComponent(Component):
             if len(views) < MIN_VIEWS:
                 return []
             self._seen += 1
-            if self._seen % self._settings.every:
+            carve = self._seen % self._settings.every == 0
+            if not carve and "silhouettes" not in self._wanted:
                 return []
-            found = self._builder.build({name: view.hull_view for name, view in views.items()})
+            person = self._builder.cut({name: view.hull_view for name, view in views.items()})
         except InputError as error:
             self._unusable(error)
             return []
-        return self._publish(stamp, next(iter(views.values())).joint_names, found)
+        header = make_header(self.factory, stamp, self._frame)
+        names = next(iter(views.values())).joint_names
+        joints = make_joints(self.factory, names, person.joints, person.confidence)
+        confidence = float(person.confidence.mean())
+        body = self.factory.make("flowing_puppet_msgs/msg/Body", id="b1", confidence=confidence, joints=joints)
+        headers = {name: complete[name][1]["image"].header for name in views}
+        outputs = self._silhouettes(header, body, person, headers)
+        return outputs + self._hull(header, body, person) if carve else outputs
 
     def _cameras(self) -> dict[str, Camera]:
         """The calibrated cameras; InputError names what is missing."""
@@ -160,19 +174,26 @@ class VisualHullComponent(Component):
             views[name] = view_of(self._builder, name, image, labels, puppet)
         return views
 
-    def _publish(self, stamp: int, names: tuple[str, ...], found: HullSet) -> Output:
-        header = make_header(self.factory, stamp, self._frame)
-        joints = make_joints(self.factory, names, found.joints, found.confidence)
-        body = self.factory.make(
-            "flowing_puppet_msgs/msg/Body", id="b1", confidence=float(found.confidence.mean()), joints=joints
-        )
-        outputs: Output = [("hull/joints", make_bodies(self.factory, header, [body] if joints else []))]
-        if found.problem:
-            self._warn(found.problem)
+    def _silhouettes(self, header: Any, body: Any, person: PersonSet, headers: dict[str, Any]) -> Output:
+        if "silhouettes" not in self._wanted:
+            return []
+        if person.problem:
+            self._warn(person.problem)
+            self.counters["sets without silhouettes"] += 1
+            return []
+        self.counters["silhouettes"] += 1
+        cameras = self._builder.cameras
+        return [("silhouettes", make_silhouettes(self.factory, header, body, cameras, person.masks, headers))]
+
+    def _hull(self, header: Any, body: Any, person: PersonSet) -> Output:
+        outputs: Output = [("hull/joints", make_bodies(self.factory, header, [body] if body.joints else []))]
+        hull = self._builder.carve(person)
+        if hull.problem:
+            self._warn(hull.problem)
             self.counters["sets without hull"] += 1
         else:
             self.counters["hulls"] += 1
-            outputs.append(("hull", make_cloud(self.factory, header, found.points, found.normals)))
+            outputs.append(("hull", make_cloud(self.factory, header, hull.points, hull.normals)))
         return outputs
 
 

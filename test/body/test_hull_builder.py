@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Puppets of several cameras to a hull and joints: the whole path on drawn spheres, and what goes wrong on the way."""
+"""Puppets of several cameras to masks, joints and a hull: the whole path on drawn spheres, and what goes wrong."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -44,40 +44,42 @@ def view(made: HullBuilder, name: str, seed: int = 0, empty: bool = False) -> Pu
 
 def test_a_ball_in_four_cameras_becomes_points_normals_and_joints(ring: Ring) -> None:
     made = builder(ring(4))
-    result = made.build({name: view(made, name) for name in made.cameras})
-    assert result.problem == ""
-    np.testing.assert_allclose(result.joints, JOINTS, atol=1e-6)
-    np.testing.assert_allclose(result.confidence, 0.9)
-    radius = np.linalg.norm(result.points, axis=1)
+    person = made.cut({name: view(made, name) for name in made.cameras})
+    hull = made.carve(person)
+    assert person.problem == hull.problem == ""
+    np.testing.assert_allclose(person.joints, JOINTS, atol=1e-6)
+    np.testing.assert_allclose(person.confidence, 0.9)
+    radius = np.linalg.norm(hull.points, axis=1)
     assert radius.min() > 0.33 and radius.max() < 0.6
-    assert ((result.points * result.normals).sum(axis=1) > 0).mean() > 0.99
-    assert set(result.silhouettes) == set(made.cameras)
+    assert ((hull.points * hull.normals).sum(axis=1) > 0).mean() > 0.99
+    assert set(person.silhouettes) == set(person.masks) == set(made.cameras)
 
 
 def test_a_camera_with_a_bad_mask_is_left_out(ring: Ring) -> None:
     made = builder(ring(4))
     views = {name: view(made, name, empty=name == "cam2") for name in made.cameras}
-    result = made.build(views)
+    person = made.cut(views)
     others = builder(ring(4))
     del views["cam2"]
-    expected = others.build({name: view(others, name) for name in views})
-    assert result.problem == "" and result.silhouettes["cam2"].problem
-    np.testing.assert_allclose(result.points, expected.points, atol=1e-6)
+    expected = others.carve(others.cut({name: view(others, name) for name in views}))
+    assert person.problem == "" and person.silhouettes["cam2"].problem and "cam2" not in person.masks
+    np.testing.assert_allclose(made.carve(person).points, expected.points, atol=1e-6)
 
 
 def test_too_few_usable_silhouettes_still_give_the_joints(ring: Ring) -> None:
     made = builder(ring(3))
-    result = made.build({name: view(made, name, empty=name != "cam1") for name in made.cameras})
-    assert result.points.shape == result.normals.shape == (0, 3)
-    assert "needs 2 usable silhouettes, got 1 (cam0: no puppet in the image; cam2: no puppet" in result.problem
-    np.testing.assert_allclose(result.joints, JOINTS, atol=1e-6)
+    person = made.cut({name: view(made, name, empty=name != "cam1") for name in made.cameras})
+    hull = made.carve(person)
+    assert hull.points.shape == hull.normals.shape == (0, 3)
+    assert "needs 2 usable silhouettes, got 1 (cam0: no puppet in the image; cam2: no puppet" in hull.problem
+    np.testing.assert_allclose(person.joints, JOINTS, atol=1e-6)
 
 
 def test_one_camera_gives_neither_hull_nor_joints(ring: Ring) -> None:
     made = builder(ring(1))
-    result = made.build({"cam0": view(made, "cam0")})
-    assert "got 1" in result.problem
-    assert np.isnan(result.joints).all() and result.joints.shape == (4, 3)
+    person = made.cut({"cam0": view(made, "cam0")})
+    assert "got 1" in made.carve(person).problem
+    assert np.isnan(person.joints).all() and person.joints.shape == (4, 3)
 
 
 def test_unknown_joints_leave_the_search_to_the_masks(ring: Ring) -> None:
@@ -86,9 +88,10 @@ def test_unknown_joints_leave_the_search_to_the_masks(ring: Ring) -> None:
     for name in made.cameras:
         seen = view(made, name)
         views[name] = PuppetView(seen.observation, np.full((4, 2), np.nan), np.zeros(4))
-    result = made.build(views)
-    assert result.problem == "" and np.isnan(result.joints).all()
-    assert np.linalg.norm(result.points, axis=1).min() > 0.33
+    person = made.cut(views)
+    hull = made.carve(person)
+    assert hull.problem == "" and np.isnan(person.joints).all()
+    assert np.linalg.norm(hull.points, axis=1).min() > 0.33
 
 
 def test_contradicting_cameras_are_a_problem_not_an_error(ring: Ring) -> None:
@@ -96,7 +99,7 @@ def test_contradicting_cameras_are_a_problem_not_an_error(ring: Ring) -> None:
     views = {name: view(made, name) for name in made.cameras}
     aside = replace(made.cameras["cam1"], translation=made.cameras["cam1"].translation + np.array([0.9, 0, 0]))
     made.cameras["cam1"] = aside
-    assert "no common space" in made.build(views).problem
+    assert "no common space" in made.carve(made.cut(views)).problem
 
 
 def test_a_moved_camera_learns_its_background_anew(ring: Ring) -> None:
@@ -109,12 +112,12 @@ def test_a_moved_camera_learns_its_background_anew(ring: Ring) -> None:
     assert made.background_share("cam0") == 0
 
 
-def test_a_set_observed_before_a_reset_is_still_built(ring: Ring) -> None:
+def test_a_set_observed_before_a_reset_is_still_cut(ring: Ring) -> None:
     made = builder(ring(4))
     views = {name: view(made, name) for name in made.cameras}
     made.reset()
     assert made.background_share("cam0") == 0
-    assert made.build(views).problem == ""
+    assert made.cut(views).problem == ""
 
 
 def test_images_of_another_size_and_unknown_cameras_are_refused(ring: Ring) -> None:
@@ -123,4 +126,4 @@ def test_images_of_another_size_and_unknown_cameras_are_refused(ring: Ring) -> N
         made.observe("cam0", np.zeros((50, 100, 3), np.uint8), np.zeros((50, 100), np.uint8), 100.0)
     seen = view(made, "cam0")
     with pytest.raises(InputError, match="camera side has no calibration"):
-        made.build({"side": seen})
+        made.cut({"side": seen})

@@ -24,7 +24,7 @@ SKIN = texture(2, (190, 120, 90), 30)
 SKIN[230:] = texture(3, (60, 60, 70), 15)[230:]
 WALL[:200, 180:] = texture(4, (190, 130, 100), 20)[:200, 180:]  # much like the person's upper half
 WALL[300:] = texture(5, (70, 70, 70), 10)[300:]  # much like the legs
-POLE = slice(140, 225), slice(252, 264)  # where the walk below ends, beside the trunk
+POLE = slice(140, 225), slice(250, 257)  # where the walk below ends, beside the trunk, within the fringe
 WALL[POLE] = SKIN[POLE]
 
 

@@ -102,7 +102,7 @@ def test_bodies_from_cameras() -> None:
     assert {name for name, _ in started} <= set(COMPONENTS)
     assert nodes[2].named["parameters"][-1] == {"cameras": "a,b"}
     assert dict(nodes[2].named["remappings"])["b/image"] == "b/image_raw"
-    assert dict(nodes[3].named["remappings"]) == {"points": "hull", "initial": "hull/joints"}
+    assert nodes[3].named["remappings"] == []
 
 
 @pytest.mark.parametrize("name", ["puppet_tracker.launch.py", "bodies.launch.py"])

@@ -21,9 +21,10 @@ from flowing_puppet_ros.stream.messages import stamp_ns
 pytestmark = pytest.mark.ros
 GOLDEN = Path(__file__).resolve().parents[2] / "bags" / "golden" / "golden.mcap"
 CAMERAS = ("cam1", "cam2", "cam3", "cam4")
-SETTINGS = {"visual_hull": {"every": 4}, "body_fitter": {"local_iterations": 3, "refine_iterations": 5}}
+SETTINGS = {"visual_hull": {"every": 4}, "body_fitter": {"outline_steps": 3}}
 COMPARED = {
     **{f"/{camera}/puppets": "flowing_puppet_msgs/msg/PuppetArray" for camera in CAMERAS},
+    "/silhouettes": "flowing_puppet_msgs/msg/SilhouetteSet",
     "/hull": "sensor_msgs/msg/PointCloud2",
     "/hull/joints": "flowing_puppet_msgs/msg/BodyArray",
     "/bodies": "flowing_puppet_msgs/msg/BodyArray",
@@ -63,7 +64,7 @@ def start_all(start: Callable[..., Path]) -> None:
     hull = {"cameras": ",".join(CAMERAS), **SETTINGS["visual_hull"]}
     start("visual_hull", *arguments(hull), *kept(*images, *infos))
     fitter = arguments(SETTINGS["body_fitter"])
-    start("body_fitter", "-r", "points:=/hull", "-r", "initial:=/hull/joints", *fitter, *kept("/hull"))
+    start("body_fitter", *fitter, *kept())
 
 
 def equal(a: Any, b: Any) -> bool:
@@ -80,7 +81,7 @@ def equal(a: Any, b: Any) -> bool:
 def test_live_results_equal_the_replay(start: Callable[..., Path], peer: Any, tmp_path: Path) -> None:
     wanted = expected(tmp_path)
     assert len(wanted["/cam1/puppets"]) == 8
-    assert len(wanted["/bodies"]) == 2
+    assert len(wanted["/bodies"]) == 8
     received: dict[str, dict[int, Any]] = {topic: {} for topic in COMPARED}
 
     def keep(topic: str, raw: bytes) -> None:
@@ -94,7 +95,7 @@ def test_live_results_equal_the_replay(start: Callable[..., Path], peer: Any, tm
     # With the nodes listening to one another, the recording can begin.
     peer.spin_until(lambda: all(peer.count_publishers(topic) for topic in COMPARED), "the nodes")
     peer.spin_until(
-        lambda: peer.count_subscribers("/cam4/part_labels") and peer.count_subscribers("/hull") > 1, "joins"
+        lambda: peer.count_subscribers("/cam4/part_labels") and peer.count_subscribers("/silhouettes") > 1, "joins"
     )
     script = Path(__file__).with_name("publish_bag.py")
     with subprocess.Popen([sys.executable, script, GOLDEN, "0.5"]) as publisher:
