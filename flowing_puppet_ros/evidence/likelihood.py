@@ -92,7 +92,7 @@ class Scene:
     head: Array | None
 
     def with_torso(self, torso: Array, head: Array) -> Scene:
-        """Take the colours of sleeves and skin from the person whose contours `torso` and `head` (K,2) px were found."""
+        """Take the colours of sleeves and skin from the person with the contours `torso` and `head` (K,2) px."""
         skin = self.likelihood.skin.map(self.colours, head)
         return replace(self, skin=skin, torso=torso_map(self.colours, torso, head), head=np.array(head))
 
