@@ -77,7 +77,7 @@ def measure_methods(
             began = time.process_time()
             posed = [
                 PosedSticks(
-                    sticks_of(model.joint_names, one.puppet.joints),
+                    sticks_of(model.joint_names, one.joints),
                     np.stack([sticks_of(model.joint_names, solution.joints) for solution in one.solutions]),
                 )
                 for one in estimator.estimate(image)
