@@ -21,11 +21,13 @@ from flowing_puppet_ros.body.refine import Refiner, RefineWeights
 from flowing_puppet_ros.body.view_cloud import ViewCloud
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-STARTS, KEPT = 6, 3
+STARTS, KEPT = 12, 3
 LIMB_SAMPLES, LIMB_ROUNDS = 600, 3
 CHAINS = (("shoulder", "upper_arm", "lower_arm", "hand"), ("upper_leg", "lower_leg", "foot"))
 TRIED = 0.003
 """Metres by which a limb may look worse than the present one before Gauss-Newton and still be tried."""
+SPARSE = 2000
+"""Points below which a cloud is a LiDAR's: a few hundred points with centimetres of noise."""
 ROUGH = RefineWeights(sigma_start=0.2, sigma_end=0.08, iterations=8)
 CLOSE = RefineWeights(sigma_start=0.06, sigma_end=0.04, iterations=5)
 
@@ -59,7 +61,7 @@ class ViewSearch:
         found = []
         for turn, body in enumerate(self._starts(cloud, coarse)):
             body = self._with_better_limbs(body, cloud, coarse, rng)
-            body = self._refined(body, cloud, RefineWeights(sigma_start=0.08, iterations=steps))
+            body = self._refined(body, cloud, _finish(cloud, steps))
             found.append((self._bank.cost(body, coarse), body))
             progress((turn + 1) / KEPT)
         return min(found, key=lambda pair: pair[0])[1]
@@ -111,3 +113,10 @@ class ViewSearch:
     def _refined(self, body: BodyState, cloud: ViewCloud, weights: RefineWeights) -> BodyState:
         none = JointTargets.none(self._model)
         return self._refiner.run(body, cloud, none, weights, terms=[cloud.free_space])
+
+
+def _finish(cloud: ViewCloud, steps: int) -> RefineWeights:
+    """Noise of centimetres must not bend a body: sparse clouds take a wider kernel and heavier priors."""
+    if len(cloud.points) >= SPARSE:
+        return RefineWeights(sigma_start=0.08, iterations=steps)
+    return RefineWeights(pose=1e-6, shape=5e-6, pairwise=1e-7, sigma_start=0.08, sigma_end=0.05, iterations=steps)
