@@ -84,7 +84,7 @@ class BodyFinder:
         self.search = Search(model, points, SearchWeights(lm_steps=settings.lm_steps))
         self.refiner = Refiner(model)
         self._proposer = Proposer(model, points)
-        self._limbs = LimbSearch(model, self.search, self._proposer)
+        self.limbs = LimbSearch(model, self.search, self._proposer)
         self.bank = BodyBank(model, points)
         self._view_search = ViewSearch(model, self.bank, self._proposer, self.refiner)
 
@@ -98,7 +98,7 @@ class BodyFinder:
         tried: list[Candidate] = []
         for turn in range(tries):
             for candidate in self._two_bodies(cloud, grid, rng, part_of(progress, turn / tries, (turn + 0.7) / tries)):
-                tried.append(self._mended(candidate, cloud, grid, rng))
+                tried.append(self.mended(candidate, cloud, grid, rng))
                 best = min(tried, key=lambda candidate: candidate.cost)
                 if best.cost < self._settings.restart_distance:
                     return self.finish(best.state, cloud, none, steps)
@@ -121,7 +121,7 @@ class BodyFinder:
         terms = [cloud.free_space] if isinstance(cloud, ViewCloud) else []
         return self.refiner.run(body, cloud, targets, RefineWeights(iterations=steps), terms)
 
-    def _candidate(self, body: BodyState, cloud: Cloud) -> Candidate:
+    def candidate(self, body: BodyState, cloud: Cloud) -> Candidate:
         """A hypothesis after a short finish, judged."""
         steps = min(HYPOTHESIS_STEPS, self._settings.refine_iterations)
         state = self.finish(body, cloud, JointTargets.none(self._model), steps)
@@ -139,17 +139,17 @@ class BodyFinder:
         found = self.search.run(
             start, grid, none, stages, iterations, rng, part_of(progress, 0.0, 0.8), threads=self._threads
         )
-        body = self._candidate(found.state, cloud)
+        body = self.candidate(found.state, cloud)
         turned = self.near(turned_around(self._model, body.state), grid, none, rng, part_of(progress, 0.8, 1.0))
-        return sorted([body, self._candidate(turned, cloud)], key=lambda candidate: candidate.cost)
+        return sorted([body, self.candidate(turned, cloud)], key=lambda candidate: candidate.cost)
 
-    def _mended(self, body: Candidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> Candidate:
+    def mended(self, body: Candidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> Candidate:
         """The body with limbs moved to where they lie closer, while one seems to be in a wrong place."""
         for _ in range(LIMB_ROUNDS):
             if not body.judgement.doubtful or body.cost > HOPELESS:
                 break
             states = [body.state, *self._limbs_moved(body.state, cloud, grid, rng)[:LIMBS_FINISHED]]
-            candidates = ordered(lambda state: self._candidate(state, cloud), states, self._threads)
+            candidates = ordered(lambda state: self.candidate(state, cloud), states, self._threads)
             closest = min(candidates, key=lambda candidate: candidate.cost)
             if closest.cost > CLOSER * body.cost:
                 break
@@ -160,7 +160,7 @@ class BodyFinder:
         """Bodies with some of the limbs searched anew, the closest to the cloud first."""
         groups = limb_groups(self._model.tree)
         found = ordered(
-            lambda pair: self._limbs.run(body, pair[0], cloud, grid, pair[1]),
+            lambda pair: self.limbs.run(body, pair[0], cloud, grid, pair[1]),
             list(zip(groups, rng.spawn(len(groups)), strict=True)),
             self._threads,
         )
