@@ -29,17 +29,17 @@ MOST_FRAMES = 30  # that are remembered of a shape, or a first mistake would sta
 MOST_STRETCH = 2.0  # frames' steps that a motion may go on unseen
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class BodyTrackerSettings(Settings):
     """Settings of `BodyTracker`."""
 
-    points: int = setting(5000, "points that a tracked cloud from all sides is thinned to", low=200, high=200000)
-    steps: int = setting(5, "Gauss-Newton steps a frame", low=1, high=100)
-    lost_ratio: float = setting(1.3, "two-way distance, against the best since the last search, of a lost track",
-                                low=1.0, high=10.0)  # fmt: skip
-    lost_distance: float = setting(0.001, "distance that must be added to that", unit="m", low=0.0, high=1.0)
-    longest_gap: float = setting(0.5, "gap between clouds after which a body is searched for again", unit="s",
-                                 low=0.01, high=60.0)  # fmt: skip
+    track_points: int = setting(5000, "points that a tracked cloud from all sides is thinned to", low=200, high=200000)
+    track_steps: int = setting(5, "Gauss-Newton steps a frame", low=1, high=100)
+    track_lost_ratio: float = setting(1.3, "two-way distance, against the best since the last search, of a lost track",
+                                      low=1.0, high=10.0)  # fmt: skip
+    track_lost_distance: float = setting(0.001, "distance that must be added to that", unit="m", low=0.0, high=1.0)
+    track_longest_gap: float = setting(0.5, "gap between clouds after which a body is searched for again", unit="s",
+                                       low=0.01, high=60.0)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,8 +91,8 @@ class BodyTracker:
         """
         points, normals = checked_cloud(points, normals)
         if viewpoint is None:
-            points, normals = thinned(points, normals, self._settings.points)
-        if self._last is not None and not 0 < stamp - self._last.stamp <= 1e9 * self._settings.longest_gap:
+            points, normals = thinned(points, normals, self._settings.track_points)
+        if self._last is not None and not 0 < stamp - self._last.stamp <= 1e9 * self._settings.track_longest_gap:
             self.reset()
         with threadpool_limits(limits=1):
             cloud = self._fitter.cloud(points, normals, viewpoint)
@@ -106,7 +106,7 @@ class BodyTracker:
 
     def _tracked(self, start: BodyState, cloud: Cloud) -> BodyFit:
         """A few steps from where the person should be; when they do not get there, more steps that look farther."""
-        fit = self._refined(start, cloud, NARROW, self._settings.steps)
+        fit = self._refined(start, cloud, NARROW, self._settings.track_steps)
         if not self._is_lost(fit):
             self.counters["tracked"] += 1
             return fit
@@ -150,4 +150,4 @@ class BodyTracker:
         return self._fitter.result(self._refiner.run(start, facing, self._none, weights), cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
-        return fit.two_way_distance > self._settings.lost_ratio * self._best + self._settings.lost_distance
+        return fit.two_way_distance > self._settings.track_lost_ratio * self._best + self._settings.track_lost_distance

@@ -124,7 +124,7 @@ class Bench:
         """Milliseconds a frame of a tracked walk after the first, by what is known of the cloud."""
         rows = []
         for sides in ("all", "one"):
-            tracker = BodyTracker(self._fitter, BodyTrackerSettings(points=TRACKED_POINTS))
+            tracker = BodyTracker(self._fitter, BodyTrackerSettings(track_points=TRACKED_POINTS))
             seconds = []
             for frame in range(TRACKED_FRAMES):
                 state = replace(self._body, center=self._body.center + np.array([WALK * frame, 0.0, 0.0]))

@@ -15,7 +15,7 @@ from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 FRAME = 50_000_000  # nanoseconds
-SETTINGS = BodyTrackerSettings(points=1500)
+SETTINGS = BodyTrackerSettings(track_points=1500)
 
 
 class _KnowingFitter(BodyFitter):
@@ -117,7 +117,7 @@ def test_time_that_jumps_starts_a_new_track(fitter: _KnowingFitter, person: Body
 
 
 def test_a_wrong_search_does_not_replace_a_better_track(fitter: _KnowingFitter, person: BodyState) -> None:
-    tracker = BodyTracker(fitter, BodyTrackerSettings(points=1500, lost_ratio=1.0, lost_distance=0.0))
+    tracker = BodyTracker(fitter, BodyTrackerSettings(track_points=1500, track_lost_ratio=1.0, track_lost_distance=0.0))
     fitter.truth = person
     for frame in range(4):
         fit = tracker.step(*_cloud(fitter.model, person, frame, noise=0.002 * frame), frame * FRAME)
