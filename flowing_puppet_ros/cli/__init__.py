@@ -39,10 +39,9 @@ def main(argv: list[str] | None = None) -> int:
     chosen = parser.parse_args(argv)
     module = import_module(f"flowing_puppet_ros.cli.{chosen.verb}")
     verb_parser = argparse.ArgumentParser(prog=f"flowing-puppet {chosen.verb}", description=module.__doc__)
-    module.add_arguments(verb_parser)
-    arguments = verb_parser.parse_args(chosen.arguments)
     try:
-        return module.run(arguments)
+        module.add_arguments(verb_parser)
+        return module.run(verb_parser.parse_args(chosen.arguments))
     except PuppetError as error:
         print(f"flowing-puppet {chosen.verb}: {error}", file=sys.stderr)
         return error.exit_status

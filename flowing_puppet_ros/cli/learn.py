@@ -1,22 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learn a body model from synthetic people: `ds`, the 2D puppet, or `sp`, the 3D one (needs the Anny body)."""
+"""Learn the body models `ds` and `sp` from synthetic people, or `likelihood` and `detector` from annotated images."""
 
 from __future__ import annotations
 
 import argparse
+from importlib import import_module
+from types import ModuleType
 
-from flowing_puppet_ros.learn import ds, sp_command
+from flowing_puppet_ros.errors import InputError
 
-MODELS = {"ds": ds, "sp": sp_command}
+MODULES = {"ds": "ds", "sp": "sp_command", "likelihood": "likelihood_command", "detector": "detector_command"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add one sub-command a model."""
-    models = parser.add_subparsers(dest="model", required=True, metavar="ds|sp")
-    for name, module in MODELS.items():
-        module.add_arguments(models.add_parser(name, description=module.__doc__))
+    """Add one sub-command for each thing that is learned; InputError where what only `learn` needs is absent."""
+    kinds = parser.add_subparsers(dest="kind", required=True, metavar="|".join(MODULES))
+    for name in MODULES:
+        module = _module(name)
+        module.add_arguments(kinds.add_parser(name, description=module.__doc__))
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Learn the chosen model and return the exit status."""
-    return MODELS[arguments.model].run(arguments)
+    """Learn what was chosen and return the exit status."""
+    status: int = _module(arguments.kind).run(arguments)
+    return status
+
+
+def _module(name: str) -> ModuleType:
+    try:
+        return import_module(f"flowing_puppet_ros.learn.{MODULES[name]}")
+    except ModuleNotFoundError as error:
+        raise InputError(f"learning needs {error.name}; pip install 'flowing_puppet_ros[learn]'") from error
