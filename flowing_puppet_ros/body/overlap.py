@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.body.camera import Camera
 from flowing_puppet_ros.body.outline import Outline, distances_outside
-from flowing_puppet_ros.image.distance import distance_to
+from flowing_puppet_ros.image.distance import signed_distance
 
 Floats = NDArray[np.float64]
 
@@ -35,8 +35,7 @@ def _fill(mask, pixels, faces):  # type: ignore[no-untyped-def]  # pragma: no co
     for face in range(len(faces)):
         a, b, c = pixels[faces[face, 0]], pixels[faces[face, 1]], pixels[faces[face, 2]]
         low, high = min(a[1], b[1], c[1]), max(a[1], b[1], c[1])
-        # Written so that NaN fails it too.
-        if not (high >= 0 and low <= height - 1 and min(a[0], b[0], c[0]) <= width and max(a[0], b[0], c[0]) >= -1):
+        if not np.isfinite(a[0] + a[1] + b[0] + b[1] + c[0] + c[1]):
             continue
         for y in range(max(0, int(np.ceil(low))), min(height - 1, int(np.floor(high))) + 1):
             left, right = np.inf, -np.inf
@@ -62,14 +61,15 @@ def outline_gap(drawn: NDArray[np.bool_], outline: Outline, depth: float) -> tup
 
     In metres at `depth` metres from the camera. NaN when either outline is nowhere in the image.
     """
-    edge = drawn & (distance_to(~drawn) < 1.5)
+    signed = signed_distance(drawn.astype(np.uint8))
+    edge = drawn & (signed > -0.7)
     edge[0] = edge[-1] = edge[:, 0] = edge[:, -1] = False
     if not edge.any() or not len(outline.points):
         return np.nan, np.nan
     # A pixel on the edge lies half a pixel inside the outline.
     there = np.abs(outline.distance[edge] + 0.5)
     column, row = np.clip(np.rint(outline.points).astype(int), 0, np.array(drawn.shape[::-1]) - 1).T
-    back = distance_to(edge)[row, column]
+    back = np.abs(signed[row, column])
     metres = depth / outline.camera.focal
     return (
         float(there.mean() + back.mean()) / 2 * metres,
