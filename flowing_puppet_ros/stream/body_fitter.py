@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
 from flowing_puppet_ros.body.silhouette_fit import SilhouetteFitterSettings
+from flowing_puppet_ros.body.tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import setting
@@ -34,13 +35,14 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings):
+class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings, BodyTrackerSettings):
     """Settings of the fits, and of what the component reads and waits for."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     up: str = setting("z", "axis of the cloud's frame that points up (-y in optical frames)", choices=tuple(_UPRIGHT))
     view: str = setting("full", "cloud from all sides, or from one sensor at the frame's origin",
                         choices=("full", "single"))  # fmt: skip
+    track: bool = setting(False, "follow one person through the clouds that come without initial joints")
     wait: int = setting(1, "newer clouds that may come before a cloud goes on without its initial joints",
                         low=0, high=50)  # fmt: skip
 
@@ -49,8 +51,9 @@ class BodyFitterComponent(Component):
     """Fits a body to each cloud; starts from the joints on `initial` when somebody publishes them.
 
     Each fit to a cloud draws its random numbers from the seed and the cloud's stamp, so it does not depend on which
-    clouds came before it or were dropped. What comes on `silhouettes` has its joints with it and is fitted at once;
-    nothing in that is random, and the last good body of a person only helps where the joints lead astray.
+    clouds came before it or were dropped, unless a person is tracked. What comes on `silhouettes` has its joints with
+    it and is fitted at once; nothing in that is random, and the last good body of a person only helps where the joints
+    lead astray.
     """
 
     settings_type = BodyFitterSettings
@@ -74,6 +77,7 @@ class BodyFitterComponent(Component):
         self._settings = settings
         self._model = StitchedPuppet.load(settings.model)
         self._fitter = BodyFitter(self._model, settings)
+        self._tracker = BodyTracker(self._fitter, settings)
         self._silhouettes = SilhouetteBodies(self._model, settings)
         self._line = Line()
         self._initial = Shelf()
@@ -81,8 +85,9 @@ class BodyFitterComponent(Component):
         self._topology_sent = False
 
     def reset(self) -> None:
-        """Forget what waits and whom the silhouettes showed."""
+        """Forget what waits, whom the silhouettes showed and who was tracked."""
         self._silhouettes.reset()
+        self._tracker.reset()
         self._line.clear()
         self._initial.clear()
 
@@ -91,30 +96,30 @@ class BodyFitterComponent(Component):
         return self._release(final=True)
 
     def fit(
-        self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None
+        self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None, track: bool = False
     ) -> tuple[Any, list[tuple[str, BodyFit]]]:
         """Fit the bodies in a PointCloud2 message, one for each body in `initial` (a BodyArray) or else one.
 
-        Returns the BodyArray message and (id, fit) of each of its bodies, in the cloud's frame. InputError in one
-        sentence when the cloud cannot be used.
+        With `track` the one without `initial` goes on from the last cloud's. Returns the BodyArray message and
+        (id, fit) of each of its bodies, in the cloud's frame. InputError in one sentence when the cloud cannot be used.
         """
         turn = _UPRIGHT[self._settings.up]
         points, normals = decode_cloud(cloud)
         upright = points @ turn.T
         turned = None if normals is None else normals @ turn.T
+        viewpoint = np.zeros(3) if self._settings.view == "single" else None
         starts: list[tuple[str, dict[str, Joint] | None]] = [("b1", None)]
         if initial is not None and initial.bodies:
             starts = [(body.id or f"b{k + 1}", joints_of(body)) for k, body in enumerate(initial.bodies)]
         fits = []
         for identity, joints in starts:
-            fit = self._fitter.fit(
-                upright,
-                turned,
-                initial=None if joints is None else _turned_joints(joints, turn),
-                viewpoint=np.zeros(3) if self._settings.view == "single" else None,
-                seed=seed,
-                progress=progress,
-            )
+            if track and joints is None:
+                fit = self._tracker.step(upright, turned, stamp_ns(cloud), viewpoint, seed)
+            else:
+                given = None if joints is None else _turned_joints(joints, turn)
+                fit = self._fitter.fit(
+                    upright, turned, initial=given, viewpoint=viewpoint, seed=seed, progress=progress
+                )
             fits.append((identity, _turned_back(fit, turn)))
         bodies = [make_body(self.factory, identity, self._model, fit) for identity, fit in fits]
         return make_bodies(self.factory, cloud.header, bodies), fits
@@ -151,7 +156,7 @@ class BodyFitterComponent(Component):
     def _fit_one(self, stamp: int, cloud: Any, initial: Any | None) -> Output:
         self.counters["clouds"] += 1
         try:
-            bodies, fits = self.fit(cloud, initial, self.seed_of(stamp))
+            bodies, fits = self.fit(cloud, initial, self.seed_of(stamp), track=self._settings.track)
         except InputError as error:
             self._unusable(error)
             bodies, fits = make_bodies(self.factory, cloud.header, []), []
