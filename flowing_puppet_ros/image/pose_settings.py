@@ -22,7 +22,7 @@ class PoseSettings(Settings):
     likelihood: bool = setting(True, "use the image evidence; without it only the body model judges")
     shape: bool = setting(True, "let the shapes of the parts vary; without it all have their mean shape")
     diverse: bool = setting(True, "keep diverse particles (D-PMP); without it the best ones (PMP)")
-    evidence_weight: float = setting(1.0, "weight of contour and colour", low=0.0, high=100.0)
+    evidence_weight: float = setting(4.0, "weight of contour and colour", low=0.0, high=100.0)
     detector_weight: float = setting(3.0, "weight of the detector's score of the joints", low=0.0, high=100.0)
     spring: float = setting(0.03, "looseness of the joints between parts", unit="m", low=0.001, high=0.5)
     scale_deviation: float = setting(0.08, "how far the scales of neighbours differ, as a share", low=0.001, high=1.0)

@@ -10,7 +10,8 @@ import pytest
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.keypoints import Keypoints
-from flowing_puppet_ros.image.pose import PosedPuppet, PoseEstimator
+from flowing_puppet_ros.image.pose import PoseEstimator
+from flowing_puppet_ros.image.pose_answer import PosedPuppet
 from flowing_puppet_ros.image.pose_evidence import GivenPerson
 from flowing_puppet_ros.image.pose_settings import PoseSettings
 from flowing_puppet_ros.model.ds import DeformableStructures
