@@ -17,7 +17,7 @@ from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.initial import sampled_bodies, turned_around
 from flowing_puppet_ros.body.judgement import Judgement, judged
-from flowing_puppet_ros.body.limbs import LimbSearch, limb_groups
+from flowing_puppet_ros.body.limbs import SINGLE_LIMBS, LimbSearch, limb_groups
 from flowing_puppet_ros.body.particles import Particles, particles_of
 from flowing_puppet_ros.body.points import part_points
 from flowing_puppet_ros.body.proposals import Proposer, WalkNoise
@@ -47,7 +47,7 @@ class FitterSettings(Settings):
     local_particles: int = setting(20, "particles a part when the pose is roughly known", low=4, high=1000)
     local_iterations: int = setting(16, "rounds of the search when the pose is roughly known", low=0, high=10000)
     lm_steps: int = setting(4, "Levenberg-Marquardt steps a new particle", low=0, high=50)
-    refine_iterations: int = setting(25, "Gauss-Newton steps of the finish", low=0, high=200)
+    refine_iterations: int = setting(15, "Gauss-Newton steps of the finish", low=0, high=200)
     cloud_points: int = setting(10000, "points that a cloud is thinned to", low=200, high=200000)
     joint_strength: float = setting(0.02, "pull of an initial joint against the whole cloud's", low=0.0, high=100.0)
     clip_factor: float = setting(2.0, "limb radii around the initial joints' axes that a cloud is clipped to, 0: none",
@@ -148,7 +148,7 @@ class BodyFinder:
         for _ in range(LIMB_ROUNDS):
             if not body.judgement.doubtful or body.cost > HOPELESS:
                 break
-            states = [body.state, *self._limbs_moved(body.state, cloud, grid, rng)[:LIMBS_FINISHED]]
+            states = [body.state, *self._limbs_moved(body.state, cloud, grid, rng)]
             candidates = ordered(lambda state: self.candidate(state, cloud), states, self._threads)
             closest = min(candidates, key=lambda candidate: candidate.cost)
             if closest.cost > CLOSER * body.cost:
@@ -157,7 +157,7 @@ class BodyFinder:
         return body
 
     def _limbs_moved(self, body: BodyState, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> list[BodyState]:
-        """Bodies with some of the limbs searched anew, the closest to the cloud first."""
+        """The closest of the bodies with some of the limbs searched anew, and those with one limb as it usually is."""
         groups = limb_groups(self._model.tree)
         found = ordered(
             lambda pair: self.limbs.run(body, pair[0], cloud, grid, pair[1]),
@@ -165,7 +165,8 @@ class BodyFinder:
             self._threads,
         )
         bodies = [state for state in found if state is not None]
-        return sorted(bodies, key=lambda s: two_way_distance(self._model.vertices(s), self._model.faces, cloud))
+        bodies.sort(key=lambda state: two_way_distance(self._model.vertices(state), self._model.faces, cloud))
+        return bodies[:LIMBS_FINISHED] + [self.limbs.usual(body, limb) for limb in groups[:SINGLE_LIMBS]]
 
 
 def part_of(progress: Progress, low: float, high: float) -> Progress:

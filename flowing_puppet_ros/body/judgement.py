@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
-from flowing_puppet_ros.body.energy import TOO_CLOSE
 from flowing_puppet_ros.body.geometry import vertex_normals
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -18,6 +17,9 @@ UNCOVERED = 0.04  # metres
 # A body with more of the cloud uncovered, or a part less on the cloud, has a limb in a wrong place, or may have.
 MUCH_UNCOVERED, LITTLE_ON_CLOUD = 0.005, 0.3
 LEAST_SEEN = 0.1
+# Metres between the centres of two neighbours that lie in each other: more than the search forbids (Eq. 51 has 0.05),
+# because limbs that vanish stop just beyond it; less than in a knee or an elbow that is bent as far as it goes.
+FOLDED = 0.07
 # What a folded limb costs in metres of distance: limbs vanish into limbs where they would otherwise be in the air.
 FOLDED_COST = 0.003
 
@@ -31,7 +33,7 @@ class Judgement:
         seen: (16,) whether at least a tenth of the part's surface is seen.
         explained: 0 to 1, how much of the cloud lies on the body.
         uncovered: share of the cloud's points that are farther than 4 cm from the body.
-        folded: joints at which the parts on both sides lie in each other (their centres less than 5 cm apart, Eq. 51).
+        folded: joints at which the parts on both sides lie in each other (centres less than 7 cm apart).
         distance: mean over both ways of the distances between body and cloud, metres.
     """
 
@@ -86,6 +88,6 @@ def judged(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> Judgeme
         count >= LEAST_SEEN * size,
         float(((WIDTH**2 / (WIDTH**2 + back**2)) ** 2).mean()),
         float((back > UNCOVERED).mean()),
-        int(np.sum(np.array(apart) < TOO_CLOSE)),
+        int(np.sum(np.array(apart) < FOLDED)),
         two_way_distance(vertices, model.faces, cloud),
     )

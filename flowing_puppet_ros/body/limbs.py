@@ -3,7 +3,7 @@
 
 The energy asks whether the body lies on the cloud, not whether the cloud is covered, so that two limbs may share the
 cloud of one. A limb that only sees the points which nothing else explains cannot; and of the many places that
-particles find for it the one is taken that covers them best.
+particles find for it the one is taken that covers them best. Where nothing is left, a limb hangs as it usually does.
 """
 
 from __future__ import annotations
@@ -18,9 +18,11 @@ from flowing_puppet_ros.body.proposals import Proposer
 from flowing_puppet_ros.body.schedule import limb_stages
 from flowing_puppet_ros.body.search import Search
 from flowing_puppet_ros.evidence.cloud import CloudGrid
+from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.model.tree import PartTree
 
+SINGLE_LIMBS = 4
 ARM = ("shoulder", "upper_arm", "lower_arm", "hand")
 LEG = ("upper_leg", "lower_leg", "foot")
 # Metres from the rest of the body at which a cloud point is left to the limb.
@@ -33,7 +35,7 @@ HANGINGS, PARTICLES, ITERATIONS = 120, 30, 14
 
 
 def limb_groups(tree: PartTree) -> tuple[tuple[int, ...], ...]:
-    """The parts of each leg and arm, from the trunk outwards, of both legs, of both arms and of all limbs."""
+    """Parts from the trunk outwards: of each of the `SINGLE_LIMBS` legs and arms, both legs, both arms, all limbs."""
     left_leg, right_leg, left_arm, right_arm = (
         tuple(tree.index(f"{side}_{name}") for name in names) for names in (LEG, ARM) for side in ("left", "right")
     )
@@ -80,6 +82,27 @@ class LimbSearch:
         ends = [part for part in limbs if not self._model.tree.children(part)]
         bodies = [found.state, *(mode for end in ends for mode in self._search.modes(found, end))]
         return min(bodies, key=lambda state: _gap(self._model.vertices(state)[own], points, cloud))
+
+    def usual(self, body: BodyState, limbs: tuple[int, ...]) -> BodyState:
+        """The body with limbs at the mean of their Gaussians (Eq. 49): where they hang when the cloud hides them."""
+        model = self._model
+        state = BodyState(body.center.copy(), body.rotation.copy(), body.pose.copy(), body.shape)
+        for part in limbs:
+            parent, interface, mean = (
+                model.tree.parents[part],
+                model.interfaces[part - 1],
+                model.pairwise[part - 1].mean,
+            )
+            own = mean[3 + model.pose_count(parent) :]
+            state.pose[part, : len(own)] = own
+            rotation = state.rotation[parent] @ so3.exp(mean[:3])
+            above = model.part_mesh(
+                parent, state.center[parent], state.rotation[parent], state.pose[parent], state.shape[parent]
+            )
+            local = model.local_vertices(part, state.pose[part], state.shape[part])[interface.child_index]
+            state.rotation[part] = rotation
+            state.center[part] = above[interface.parent_index].mean(axis=0) - rotation @ local.mean(axis=0)
+        return state
 
     def _hung(self, body: BodyState, limbs: tuple[int, ...], rng: np.random.Generator) -> list[Particles]:
         """The body's parts, and the limbs' also hanging on it in many ways."""
