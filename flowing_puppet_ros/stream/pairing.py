@@ -52,12 +52,17 @@ class Pairing:
     items an input wait. What finds no partner is counted in `counters`: `unpaired` (its partners came and were too
     far or used up), `dropped` (more than `depth` waited), `disordered` (stamp not after the one before on the same
     input), `restarts` (stamp more than BACKWARD_JUMP_NS back: everything later than it is forgotten).
+
+    With `patience` sets of at least two items are made without the inputs that have no item near enough (counted in
+    `incomplete`): as soon as that is sure, or when more than `patience` items of the leading input wait. The first
+    input that has anything leads when all before it have nothing.
     """
 
-    def __init__(self, names: tuple[str, ...], slop_ns: int = 0, depth: int = 60) -> None:
-        """Pair the inputs `names`, of which the first leads."""
+    def __init__(self, names: tuple[str, ...], slop_ns: int = 0, depth: int = 60, patience: int = 0) -> None:
+        """Pair the inputs `names`, of which the first leads; no `patience`: every set is complete."""
         self._queues = {name: _Queue() for name in names}
         self._leader = names[0]
+        self._patience = patience
         self._slop = slop_ns
         self._depth = depth
         self.counters: Counter[str] = Counter()
@@ -94,21 +99,33 @@ class Pairing:
 
     def _complete(self, final: bool) -> list[dict[str, tuple[int, Any]]]:
         sets: list[dict[str, tuple[int, Any]]] = []
-        leader = self._queues[self._leader]
-        while leader.stamps:
+        while (leader := self._leading(final)) is not None:
             stamp = leader.stamps[0]
+            impatient = 0 < self._patience < len(leader.stamps)
             indices: dict[str, int] = {}
             for name, queue in self._queues.items():
-                index = queue.nearest(stamp, final)
+                index = queue.nearest(stamp, final or impatient)
                 if index is None:
                     return sets
-                indices[name] = index
-            if any(not self._queues[name].near(index, stamp, self._slop) for name, index in indices.items()):
+                if queue.near(index, stamp, self._slop):
+                    indices[name] = index
+            if len(indices) < (min(2, len(self._queues)) if self._patience else len(self._queues)):
                 leader.drop(1)
                 self.counters["unpaired"] += 1
                 continue
-            sets.append({name: (q.stamps[indices[name]], q.items[indices[name]]) for name, q in self._queues.items()})
-            for name, queue in self._queues.items():
-                self.counters["unpaired"] += indices[name]
-                queue.drop(indices[name] + 1)
+            if len(indices) < len(self._queues):
+                self.counters["incomplete"] += 1
+            sets.append({name: (self._queues[name].stamps[at], self._queues[name].items[at])
+                         for name, at in indices.items()})  # fmt: skip
+            for name, index in indices.items():
+                self.counters["unpaired"] += index
+                self._queues[name].drop(index + 1)
         return sets
+
+    def _leading(self, final: bool) -> _Queue | None:
+        """The input whose first item the next set is made around, None while there is nothing to do."""
+        first = self._queues[self._leader]
+        if first.stamps or not self._patience:
+            return first if first.stamps else None
+        least = 1 if final else self._patience + 1
+        return next((queue for queue in self._queues.values() if len(queue.stamps) >= least), None)

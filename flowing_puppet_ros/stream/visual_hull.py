@@ -41,6 +41,8 @@ class VisualHullSettings(HullBuilderSettings):
     cameras: str = setting("", "names of the cameras, separated by commas")
     frame: str = setting("", "frame of the hull; empty for the topmost frame of the cameras on /tf_static")
     slop: float = setting(0.008, "largest difference of stamps within one set of images", unit="s", low=0.0, high=1.0)
+    patience: int = setting(10, "newer images of a camera that may wait for another that is late or dead, 0: for ever",
+                            low=0, high=50)  # fmt: skip
     every: int = setting(6, "sets with a person from one hull to the next; all give silhouettes", low=1, high=9999)
 
 
@@ -69,7 +71,7 @@ class VisualHullComponent(Component):
         self._frames = FrameTree()
         self._infos: dict[str, Any] = {}
         self._of_camera = {name: Pairing(_OF_CAMERA) for name in self._names}
-        self._sets = Pairing(self._names, round(settings.slop * 1e9))
+        self._sets = Pairing(self._names, round(settings.slop * 1e9), patience=settings.patience)
         self._last_stamp: int | None = None
         self._seen = 0
         self._frame = ""
@@ -112,26 +114,21 @@ class VisualHullComponent(Component):
                 self.counters[f"{reason} {level}"] = count
 
     def _use(self, complete: dict[str, tuple[int, Any]]) -> Output:
-        stamp = complete[self._names[0]][0]
+        stamp = next(iter(complete.values()))[0]
         if self._last_stamp is not None and stamp < self._last_stamp:
             self._builder.reset()
             self.counters["restarts"] += 1
             self._seen = 0
         self._last_stamp = stamp
         self.counters["sets"] += 1
-        try:
-            cameras = self._cameras()
-            views = self._views(complete, cameras)
-            if len(views) < MIN_VIEWS:
-                return []
-            self._seen += 1
-            carve = self._seen % self._settings.every == 0
-            if not carve and "silhouettes" not in self._wanted:
-                return []
-            person = self._builder.cut({name: view.hull_view for name, view in views.items()})
-        except InputError as error:
-            self._unusable(error)
+        views = self._views(complete, self._cameras(complete))
+        if len(views) < MIN_VIEWS:
             return []
+        self._seen += 1
+        carve = self._seen % self._settings.every == 0
+        if not carve and "silhouettes" not in self._wanted:
+            return []
+        person = self._builder.cut({name: view.hull_view for name, view in views.items()})
         header = make_header(self.factory, stamp, self._frame)
         names = next(iter(views.values())).joint_names
         joints = make_joints(self.factory, names, person.joints, person.confidence)
@@ -141,37 +138,49 @@ class VisualHullComponent(Component):
         outputs = self._silhouettes(header, body, person, headers)
         return outputs + self._hull(header, body, person) if carve else outputs
 
-    def _cameras(self) -> dict[str, Camera]:
-        """The calibrated cameras; InputError names what is missing."""
-        for name in self._names:
-            info = self._infos.get(name)
-            if info is None:
-                raise InputError(f"no camera_info came yet on {name}/camera_info")
-            frame = info.header.frame_id
-            if name == self._names[0]:
-                # Looked up for every set: /tf_static may come after the first images.
-                self._frame = self._settings.frame or self._frames.root(frame.lstrip("/"))
-            world = self._frames.pose(self._frame, frame)
-            if world is None:
-                raise InputError(f"/tf_static does not connect the frame {frame!r} of {name} with {self._frame!r}")
-            translation, rotation = world
-            size = info.width, info.height
+    def _cameras(self, complete: dict[str, tuple[int, Any]]) -> dict[str, Camera]:
+        """The calibrated cameras of a set; those that lack something are said and left out."""
+        cameras: dict[str, Camera] = {}
+        for name in complete:
             try:
-                camera = Camera.from_info(info.k, info.d, *size, rotation, translation, info.distortion_model)
+                cameras[name] = self._camera(name, first=not cameras)
             except InputError as error:
-                raise InputError(f"{name}: {error}") from error
-            self._builder.set_camera(name, camera)
-        return self._builder.cameras
+                self._unusable(error)
+                continue
+            self._builder.set_camera(name, cameras[name])
+        return cameras
+
+    def _camera(self, name: str, first: bool) -> Camera:
+        """A calibrated camera in the common frame, which the first one gives; InputError says what is missing."""
+        info = self._infos.get(name)
+        if info is None:
+            raise InputError(f"no camera_info came yet on {name}/camera_info")
+        frame = info.header.frame_id
+        if first:
+            # Looked up for every set: /tf_static may come after the first images.
+            self._frame = self._settings.frame or self._frames.root(frame.lstrip("/"))
+        world = self._frames.pose(self._frame, frame)
+        if world is None:
+            raise InputError(f"/tf_static does not connect the frame {frame!r} of {name} with {self._frame!r}")
+        translation, rotation = world
+        size = info.width, info.height
+        try:
+            return Camera.from_info(info.k, info.d, *size, rotation, translation, info.distortion_model)
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from error
 
     def _views(self, complete: dict[str, tuple[int, Any]], cameras: dict[str, Camera]) -> dict[str, PersonView]:
-        """Observe the same person in every camera that sees one."""
-        people = {name: list(item["puppets"].puppets) for name, (_, item) in complete.items()}
+        """Observe the same person in every camera that sees one; images that cannot be used are said and left out."""
+        people = {name: list(complete[name][1]["puppets"].puppets) for name in cameras}
         chosen = same_person(cameras, people, self._settings)
         views = {}
         for name, puppet in chosen.items():
             item = complete[name][1]
-            image, labels = decode_image(item["image"]), decode_labels(item["part_labels"])
-            views[name] = view_of(self._builder, name, image, labels, puppet)
+            try:
+                image, labels = decode_image(item["image"]), decode_labels(item["part_labels"])
+                views[name] = view_of(self._builder, name, image, labels, puppet)
+            except InputError as error:
+                self._unusable(error)
         return views
 
     def _silhouettes(self, header: Any, body: Any, person: PersonSet, headers: dict[str, Any]) -> Output:

@@ -11,7 +11,8 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowSettings
-from flowing_puppet_ros.stream.component import COMPRESSED_IMAGE, PUPPETS, Component
+from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent, BodyFitterSettings
+from flowing_puppet_ros.stream.component import CAMERA_INFO, COMPRESSED_IMAGE, PUPPETS, Component
 from flowing_puppet_ros.stream.images import decode_flow, decode_image, make_image
 from flowing_puppet_ros.stream.messages import make_header, stamp_ns
 from flowing_puppet_ros.stream.optical_flow import OpticalFlowComponent
@@ -245,3 +246,39 @@ def test_frames_that_come_after_the_first_images_place_the_hull(recorded: dict[s
     assert drive(component, [item for item in stream if item[0] != "/tf_static"]) == []
     component.reset()
     assert {message.header.frame_id for _, message in drive(component, stream)} == {"world"}
+
+
+def test_silhouettes_go_on_without_a_camera_that_is_dead_or_not_calibrated(recorded: dict[str, list[Any]]) -> None:
+    stream = hull_stream(recorded)
+    for spoilt in ("dead", "uncalibrated"):
+        component = VisualHullComponent(VisualHullSettings(cameras="cam3,cam1,cam2"), FACTORY)
+        component.wants("silhouettes", True)
+        third = [(port.replace("cam2", "cam3"), message) for port, message in stream if port.startswith("cam2")]
+        info = FACTORY.make(CAMERA_INFO, header=third[0][1].header, width=192, height=240)
+        third[0] = ("cam3/camera_info", info)
+        made = drive(component, stream + (third if spoilt == "uncalibrated" else []))
+        assert [port for port, _ in made] == ["silhouettes"] * 2
+        assert all([each.camera for each in message.silhouettes] == ["cam1", "cam2"] for _, message in made)
+        warnings = component.drain_warnings()
+        expected = ["cam3: the camera_info is uncalibrated (k is all zero); publish a calibrated camera_info"]
+        assert warnings == (expected if spoilt == "uncalibrated" else [])
+
+
+def test_silhouettes_are_made_only_when_somebody_listens(recorded: dict[str, list[Any]]) -> None:
+    component = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2"), FACTORY)
+    assert drive(component, hull_stream(recorded)) == []
+    assert component.counters["sets"] == 2
+
+
+def test_silhouettes_that_cannot_be_used_are_one_sentence(recorded: dict[str, list[Any]]) -> None:
+    hull = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2"), FACTORY)
+    hull.wants("silhouettes", True)
+    first, second = (message for _, message in drive(hull, hull_stream(recorded)))
+    fitter = BodyFitterComponent(BodyFitterSettings(outline_steps=2), FACTORY)
+    first.silhouettes[1].info.width = 100
+    made = dict(fitter.handle("silhouettes", first))
+    assert made["bodies"].bodies == [] and made["bodies"].header == first.header
+    assert fitter.drain_warnings() == ["cam2: the mask is 192 x 240, its camera_info says 100 x 240"]
+    made = dict(fitter.handle("silhouettes", second))
+    assert [body.id for body in made["bodies"].bodies] == ["b1"]
+    assert (fitter.counters["bodies"], fitter.counters["unusable"]) == (1, 1)

@@ -97,3 +97,47 @@ def test_reset_forgets_what_waits() -> None:
     pairing.add("a", 5, "old")
     pairing.reset()
     assert pairing.add("b", 5, "new") == []
+
+
+def feed(pairing: Pairing, streams: dict[str, list[int]]) -> list[dict[str, int]]:
+    """Add the stamps of all inputs in their order, and return the sets' stamps."""
+    entries = sorted((stamp, name) for name, stream in streams.items() for stamp in stream)
+    made = [each for stamp, name in entries for each in pairing.add(name, stamp, None)]
+    return [{name: stamp for name, (stamp, _) in each.items()} for each in made + pairing.flush()]
+
+
+def test_with_patience_sets_go_on_without_an_input_that_died() -> None:
+    whole, short = list(range(0, 100, 10)), [0, 10, 20]
+    pairing = Pairing(("a", "b", "c"), SLOP, patience=2)
+    sets = feed(pairing, {"a": whole, "b": whole, "c": short})
+    assert sets == [{"a": t, "b": t, "c": t} if t <= 20 else {"a": t, "b": t} for t in whole]
+    assert pairing.counters["incomplete"] == 7
+    sets = feed(Pairing(("a", "b", "c"), SLOP, patience=2), {"a": short, "b": whole, "c": whole})
+    assert sets == [{"a": t, "b": t, "c": t} if t <= 20 else {"b": t, "c": t} for t in whole]
+    assert len(feed(Pairing(("a", "b", "c"), SLOP), {"a": whole, "b": whole, "c": short})) == 3
+
+
+def test_with_patience_a_lone_item_is_no_set_and_a_late_one_is_waited_for() -> None:
+    pairing = Pairing(("a", "b", "c"), SLOP, patience=3)
+    assert feed(pairing, {"a": [0, 10, 20, 30, 40, 50]}) == []
+    assert pairing.counters["unpaired"] == 6
+    pairing = Pairing(("a", "b", "c"), SLOP, patience=3)
+    for stamp in (0, 10, 20):
+        assert pairing.add("a", stamp, None) == pairing.add("b", stamp, None) == []
+    assert [set(each) for each in pairing.add("c", 0, None)] == [{"a", "b", "c"}]
+
+
+@settings(max_examples=100, deadline=None)
+@given(stamps, st.integers(2, 3), st.randoms(use_true_random=False))
+def test_patience_changes_nothing_when_nothing_is_missing(stream: list[int], count: int, random: Any) -> None:
+    names = tuple("abc"[:count])
+    found = []
+    for patience in (0, 30):
+        pairing, sets = Pairing(names, patience=patience), []
+        left = {name: list(stream) for name in names}
+        while any(left.values()):
+            name = random.choice([name for name in names if left[name]])
+            sets += pairing.add(name, left[name].pop(0), name)
+        found.append(sets + pairing.flush())
+    assert found[0] == found[1]
+    assert len(found[0]) == len(stream)
