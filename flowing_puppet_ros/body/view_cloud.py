@@ -38,7 +38,7 @@ class ViewCloud(Cloud):
             InputError: when part of the cloud lies behind the sensor.
         """
         forward = points.mean(axis=0) - viewpoint
-        if ((points - viewpoint) @ forward < NEAREST * np.linalg.norm(forward)).any():
+        if ((points - viewpoint) @ forward <= NEAREST * np.linalg.norm(forward)).any():
             raise InputError(
                 f"the sensor at {np.round(viewpoint, 2).tolist()} m stands within the cloud and cannot have seen one"
                 " side of it; check the frame or fit it as a whole cloud"
