@@ -30,7 +30,7 @@ _WIDTH = 4.0  # CIE units a bin
 _SMOOTHING = 1.0  # bins
 _RARE = 2e-3  # probability added to every bin: colours rarer than this tell nothing
 _FEWEST = 20  # pixels; fewer make no histogram
-_FACE = 0.6  # of the head's size: without hair, neck and background
+_FACE = 0.6  # of the head's size
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,8 +72,14 @@ class SkinColour:
         People and lights differ, so the face of the image tells more about its hands than other people's skin does.
         """
         general = self.log_ratio[colours.bins]
-        face = None if head is None else colours.inside(head.mean(axis=0) + _FACE * (head - head.mean(axis=0)))
+        face = None if head is None else colours.inside(face_of(head))
         return RegionMap.of(general if face is None else 0.5 * (general + colours.log_ratio(face)))
+
+
+def face_of(head: Array) -> Array:
+    """The middle (K,2) of a head's contour (K,2), which neither hair nor neck nor background reaches."""
+    middle = head.mean(axis=0)
+    return np.asarray(middle + _FACE * (head - middle))
 
 
 def torso_map(colours: ColourImage, torso: Array, head: Array) -> RegionMap:

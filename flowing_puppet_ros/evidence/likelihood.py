@@ -30,7 +30,7 @@ TERMS_OF = {
     "torso": TERMS[:1],
     "head": TERMS[:3],
     "upper_arm": ("contour", "skin", "skin_around", "torso", "torso_around"),
-    "lower_arm": TERMS,
+    "lower_arm": ("contour", "skin", "skin_around", "hand"),
 }
 """Which terms each kind of part has; legs have none until contours of legs are learned."""
 

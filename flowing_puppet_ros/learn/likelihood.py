@@ -13,10 +13,11 @@ from sklearn.linear_model import LogisticRegression
 from sklearn.svm import LinearSVC
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evidence.colour import BINS, ColourImage, SkinColour, histogram_of, log_ratio
+from flowing_puppet_ros.evidence.colour import BINS, ColourImage, SkinColour, face_of, histogram_of, log_ratio
 from flowing_puppet_ros.evidence.contour import PLACES, ContourFilter, ContourLikelihood, describe, kind_of, on_right
 from flowing_puppet_ros.evidence.likelihood import TERMS_OF, PartLikelihood
 from flowing_puppet_ros.evidence.outline import mirrored_order
+from flowing_puppet_ros.learn.annotations import source_of
 from flowing_puppet_ros.learn.likelihood_samples import Moves, Posed, wrong_contours
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_render import render_labels
@@ -28,7 +29,6 @@ Array = np.ndarray[Any, Any]
 FEWEST = 20
 """Right examples that each kind of part needs at least."""
 
-_FACE = 0.6  # of the head's size: without hair, neck and background
 _TOLERANCE, _ITERATIONS = 1e-3, 4000
 
 
@@ -70,7 +70,7 @@ def learn(
 ) -> Learned:
     """Learn skin, the filters, their calibration and the weights of the terms from posed people.
 
-    Calibration and weights come from two folds of different files, so that no filter judges its own examples.
+    Calibration and weights come from two folds of different source videos, so that no filter judges its own examples.
     InputError when a kind of part has too few examples.
     """
     skin = SkinColour(learn_skin(people))
@@ -84,7 +84,7 @@ def learn(
         if min(np.sum(examples.fold == 0), np.sum(examples.fold == 1)) < FEWEST:
             raise InputError(
                 f"the annotations show {counts[kind]} {kind.replace('_', ' ')}s; learning needs at least {FEWEST} "
-                "in each half of the files"
+                "in each half of the videos"
             )
         filters[kind], terms[kind] = _fit_kind(examples, settings)
     return Learned(PartLikelihood(len(model.tree), ContourLikelihood(filters), skin, terms), counts)
@@ -94,9 +94,8 @@ def learn_skin(people: Sequence[Posed]) -> NDArray[np.float64]:
     """Log ratio (BINS^2,) of colours in the faces against those beside the people; every image counts the same."""
     face_sum, beside_sum = np.zeros(BINS * BINS), np.zeros(BINS * BINS)
     for posed in people:
-        colours, head = ColourImage.of(posed.image), posed.puppet.contours[1]
-        face = colours.inside(head.mean(axis=0) + _FACE * (head - head.mean(axis=0)))
-        contours = posed.puppet.contours
+        colours, contours = ColourImage.of(posed.image), posed.puppet.contours
+        face = colours.inside(face_of(contours[1]))
         beside = colours.bins[render_labels(contours, range(len(contours)), colours.bins.shape) == 0]
         if face is not None and len(beside):
             face_sum += face
@@ -115,21 +114,24 @@ def _gather(
     rng: np.random.Generator,
 ) -> _Examples:
     """Describe every part of a kind that shows; those without a side also as seen in a mirror."""
-    halves = {file: index % 2 for index, file in enumerate(sorted({posed.file for posed in people}))}
+    halves = {source: index % 2 for index, source in enumerate(sorted({source_of(posed.file) for posed in people}))}
     rows: list[tuple[Array, Array, Array, int]] = []
     for posed in people:
-        for part, name in enumerate(model.tree.names):
-            if kind_of(name) != kind or not posed.shows(model, part):
-                continue
+        shown = [
+            part for part, name in enumerate(model.tree.names) if kind_of(name) == kind and posed.shows(model, part)
+        ]
+        if not shown:
+            continue
+        scene = blank.scene(posed.image).with_torso(*posed.puppet.contours[:2])
+        for part in shown:
+            name, scale = model.tree.names[part], np.full(1 + wrong, posed.puppet.scale)
             moved = wrong_contours(model, posed.puppet, part, wrong, Moves(far=0.25), rng)
             contours = np.concatenate([posed.puppet.contours[part][None], moved])
-            scale = np.full(len(contours), posed.puppet.scale)
-            scene = blank.scene(posed.image).with_torso(*posed.puppet.contours[:2])
             colours = scene.terms(part, contours, scale)[:, 1:]
             right = on_right(name, contours)
             for ordered in [right] if mirrored_name(name) != name else [right, mirrored_order(right)]:
                 described = describe(scene.features, ordered, PLACES[kind], scale)
-                rows.append((*described, colours, halves[posed.file]))
+                rows.append((*described, colours, halves[source_of(posed.file)]))
     if not rows:
         raise InputError(f"the annotations show no {kind.replace('_', ' ')}, so its likelihood cannot be learned")
     found, visible, colour_terms, fold = zip(*rows, strict=True)

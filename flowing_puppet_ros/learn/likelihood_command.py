@@ -89,7 +89,7 @@ left and right limbs share a filter, whose points run the other way round.
   frame and no joint is in this file, only filters, weights and one histogram of colours.
 - Right contours are those of the neutral puppet on the joints; for each {settings.wrong} wrong ones: turned, moved and
   stretched, a quarter of them anywhere near the person. Calibration and weights are of examples whose filter had not
-  seen their file.
+  seen their source video.
 - Differences from the thesis: descriptors are Fourier coefficients of orientation histograms, which turn exactly; cells
   are of fixed size on the body; a* and b* also for skin; colour terms also against a band around the part; the weights
   of the terms are learned by logistic regression, not by grid search.
