@@ -5,9 +5,14 @@ from __future__ import annotations
 
 import argparse
 
-from flowing_puppet_ros.cli import evaluate_bodies, evaluate_correspondence
+from flowing_puppet_ros.cli import evaluate_bag, evaluate_bodies, evaluate_correspondence, evaluate_joints
 
-KINDS = {"bodies": evaluate_bodies, "correspondence": evaluate_correspondence}
+KINDS = {
+    "joints": evaluate_joints,
+    "bodies": evaluate_bodies,
+    "correspondence": evaluate_correspondence,
+    "bag": evaluate_bag,
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +14,7 @@ from flowing_puppet_ros.body.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bodies import KINDS, BodyScore, drawn_scans, scored_fit, summary
 from flowing_puppet_ros.evaluate.synthetic_bodies import BodySource
-from flowing_puppet_ros.evaluate.tables import text_table, write_csv, write_json
+from flowing_puppet_ros.evaluate.tables import json_text, text_table, write_csv, write_json
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import make_out_folder
 
@@ -54,5 +53,5 @@ def run(arguments: argparse.Namespace) -> int:
         rows = [asdict(score) for score in scores]
         write_csv(arguments.out / f"bodies_{arguments.kind}.csv", rows)
         write_json(arguments.out / f"bodies_{arguments.kind}.json", {"summary": figures, "bodies": rows})
-    print(json.dumps(figures) if arguments.json else text_table([{"kind": arguments.kind} | figures]))
+    print(json_text(figures) if arguments.json else text_table([{"kind": arguments.kind} | figures]))
     return 0

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from flowing_puppet_ros.evaluate.correspondence import (
     scan_pairs,
     summary,
 )
-from flowing_puppet_ros.evaluate.tables import text_table, write_csv, write_json
+from flowing_puppet_ros.evaluate.tables import json_text, text_table, write_csv, write_json
 from flowing_puppet_ros.settings import make_out_folder
 from flowing_puppet_ros.view.page import page, paragraph, table
 from flowing_puppet_ros.view.plots import Series, line_plot
@@ -59,7 +58,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         _write(arguments.out, groups, figures)
     rows = [{"kind": name} | row for name, row in figures.items()]
-    print(json.dumps(figures) if arguments.json else text_table(rows))
+    print(json_text(figures) if arguments.json else text_table(rows))
     return 0
 
 
