@@ -5,13 +5,20 @@ from __future__ import annotations
 
 import argparse
 
-from flowing_puppet_ros.cli import evaluate_bag, evaluate_bodies, evaluate_correspondence, evaluate_joints
+from flowing_puppet_ros.cli import (
+    evaluate_bag,
+    evaluate_bodies,
+    evaluate_correspondence,
+    evaluate_joints,
+    evaluate_likelihood,
+)
 
 KINDS = {
     "joints": evaluate_joints,
     "bodies": evaluate_bodies,
     "correspondence": evaluate_correspondence,
     "bag": evaluate_bag,
+    "likelihood": evaluate_likelihood,
 }
 
 

@@ -2,15 +2,14 @@
 """`flowing-puppet bench`: that every part measures what it says, not how fast this machine is."""
 
 import json
+from typing import Any
 
 import pytest
 
-from flowing_puppet_ros.body.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.cli.bench import PARTS
 from flowing_puppet_ros.evaluate import bench
-
-QUICK = FitterSettings(particles=4, iterations=1, local_iterations=0, refine_iterations=1, restarts=0, lm_steps=0)
 
 
 @pytest.fixture(autouse=True)
@@ -43,11 +42,19 @@ def test_growth_changes_one_size_at_a_time(capsys: pytest.CaptureFixture[str]) -
     assert all(row["search_seconds"] > 0 for row in rows)
 
 
-def test_tracking_is_measured_without_the_first_search() -> None:
+def test_tracking_is_measured_without_the_first_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+
+    def fit(fitter: BodyFitter, points: Any, normals: Any, *, viewpoint: Any, **_: Any) -> BodyFit:
+        searched.append(viewpoint is None)
+        return fitter.result(made._body, fitter.cloud(points, normals, viewpoint))
+
+    monkeypatch.setattr(BodyFitter, "fit", fit)
     made = bench.Bench()
-    made.__dict__["_fitter"] = BodyFitter(made._model, QUICK)
     rows = made.tracking()
     assert [row["sides"] for row in rows] == ["all", "one"]
+    assert [row["searched"] for row in rows] == [1, 1]
+    assert searched == [True, False]
     assert all(row["milliseconds_a_frame"] > 0 for row in rows)
 
 
