@@ -57,6 +57,7 @@ class ImageFeatures:
     @classmethod
     def of(cls, image: NDArray[np.uint8]) -> ImageFeatures:
         """Features of an RGB (H,W,3) or grey (H,W) uint8 image; InputError for anything else."""
+        cv2.setNumThreads(1)  # results may depend on the number of threads otherwise
         return cls(as_rgb(image))
 
     def levels_of(self, cell: Array) -> NDArray[np.intp]:

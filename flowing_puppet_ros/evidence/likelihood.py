@@ -74,9 +74,8 @@ class PartLikelihood:
 
     def scene(self, image: NDArray[np.uint8]) -> Scene:
         """Make ready to ask about an RGB (H,W,3) or grey (H,W) uint8 image in which no torso is known yet."""
-        colours = ColourImage.of(image)
-        names = part_tree(self.parts).names
-        return Scene(self, names, ImageFeatures.of(image), colours, self.skin.map(colours), None, None)
+        features, colours = ImageFeatures.of(image), ColourImage.of(image)
+        return Scene(self, part_tree(self.parts).names, features, colours, self.skin.map(colours), None, None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
