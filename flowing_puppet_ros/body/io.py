@@ -12,6 +12,7 @@ import numpy as np
 
 from flowing_puppet_ros.body.geometry import vertex_normals
 from flowing_puppet_ros.body.mesh_text import read_obj, read_off
+from flowing_puppet_ros.body.ply import read_ply
 from flowing_puppet_ros.errors import InputError
 
 SUFFIXES = (".ply", ".obj", ".off", ".stl", ".pcd", ".xyz", ".npy", ".npz")
@@ -76,6 +77,11 @@ def read_scan(path: Path) -> Scan:
     elif suffix in (".obj", ".off"):
         vertices, faces = (read_obj if suffix == ".obj" else read_off)(path)
         scan = Scan(vertices, faces if len(faces) else None)
+    elif suffix == ".ply":
+        vertices, normals, faces = read_ply(path)
+        scan = (
+            Scan(vertices, faces) if len(faces) else Scan(vertices, None, None if normals is None else _unit(normals))
+        )
     elif suffix == ".xyz":
         scan = _read_text(path)
     else:
