@@ -28,6 +28,7 @@ HARD_EVERY = {"whole": 2, "single": 4, "lidar": 0}
 KINDS = tuple(HARD_EVERY)
 DEPTH_DISTANCE, DEPTH_HEIGHT = (2.0, 4.0), (0.8, 1.8)  # metres
 LIDAR_DISTANCE, LIDAR_HEIGHT = (4.5, 7.5), (1.6, 1.9)  # metres: 300 to 800 points on a person
+BAD = 0.04  # metres: mean vertex error of a body with a limb in a wrong place
 SIGHT = 0.005  # metres: a vertex this much behind the first hit of its ray is still seen
 
 
@@ -42,7 +43,7 @@ class BodyScore:
         visible_error: over those that the sensor saw; of a whole scan all.
         joint_error: over all joints.
         flipped: whether the body is nearer to the truth with left and right swapped.
-        two_way_distance, confidence: as the fit says.
+        two_way_distance, confidence, reliable: as the fit says.
         seconds: processor time of the fit.
     """
 
@@ -54,6 +55,7 @@ class BodyScore:
     flipped: bool
     two_way_distance: float
     confidence: float
+    reliable: bool
     seconds: float
 
 
@@ -96,6 +98,7 @@ def scored_fit(
         flipped=is_flipped(fit.vertices, truth, fitter.model),
         two_way_distance=fit.two_way_distance,
         confidence=fit.confidence,
+        reliable=fit.reliable,
         seconds=seconds,
     )
 
@@ -116,7 +119,10 @@ def seen_vertices(scene: Scene, vertices: np.ndarray, viewpoint: np.ndarray | No
 
 
 def summary(scores: Sequence[BodyScore]) -> dict[str, float]:
-    """Figures over many fits; distances in centimetres, of single-sided clouds also on the visible side."""
+    """Figures over many fits; distances in centimetres.
+
+    `unreliable` counts the fits that say so of themselves, `bad` those that are wrong by more than 4 cm on average.
+    """
     vertex = 100 * np.array([score.vertex_error for score in scores])
     return {
         "bodies": len(scores),
@@ -127,6 +133,9 @@ def summary(scores: Sequence[BodyScore]) -> dict[str, float]:
         "joints_mean_cm": 100 * float(np.mean([score.joint_error for score in scores])),
         "two_way_mean_cm": 100 * float(np.mean([score.two_way_distance for score in scores])),
         "flipped": sum(score.flipped for score in scores),
+        "unreliable": sum(not score.reliable for score in scores),
+        "bad": sum(score.vertex_error > BAD for score in scores),
+        "bad_unreliable": sum(score.vertex_error > BAD and not score.reliable for score in scores),
         "confidence_lowest": min(score.confidence for score in scores),
         "seconds_mean": float(np.mean([score.seconds for score in scores])),
         "seconds_worst": max(score.seconds for score in scores),

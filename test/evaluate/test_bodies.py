@@ -43,6 +43,7 @@ class _Oracle:
             joints=self.model.joints(self._vertices),
             two_way_distance=0.01,
             confidence=0.9,
+            reliable=False,
         )
 
 
@@ -67,7 +68,8 @@ def test_scores_are_the_distance_to_the_truth(source: BodySource, model: Stitche
     assert turned.flipped
     figures = summary([exact, moved, turned])
     assert figures["vertex_median_cm"] == pytest.approx(5)
-    assert (figures["bodies"], figures["flipped"]) == (3, 1)
+    assert (figures["bodies"], figures["flipped"], figures["unreliable"]) == (3, 1, 3)
+    assert figures["bad"] == figures["bad_unreliable"] == 2
 
 
 @LEARN
