@@ -26,7 +26,7 @@ from flowing_puppet_ros.image.distance import signed_distance
 Floats = NDArray[np.float64]
 
 _SMOOTHING = 1.0  # pixels; turns the outline's pixel steps into directions
-_OUTLINE_STEP = 2  # every so many outline pixels count
+_OUTLINE_STEP = 4  # every so many outline pixels count
 _TURN_COST = 8.0  # pixels that a match may be farther away when its direction is one radian better
 _MIN_COSINE = 0.3  # between the outline's and the rim's direction
 
@@ -139,11 +139,7 @@ def _outline_to_rim(
     drawn each on its own.
     """
     camera = outline.camera
-    ray = vertices - camera.centre
-    facing = (normals * ray).sum(axis=1)
-    across = np.flatnonzero((facing[edges[:, 0]] < 0) != (facing[edges[:, 1]] < 0))
-    first, second = edges[across].T
-    share = facing[first] / (facing[first] - facing[second])
+    first, second, share = _crossed(vertices, normals, camera.centre, edges)
     rim = vertices[first] + share[:, None] * (vertices[second] - vertices[first])
     normal = normals[first] + share[:, None] * (normals[second] - normals[first])
     pixels, depth = camera.project(rim)
@@ -167,6 +163,24 @@ def _outline_to_rim(
 
 
 @njit(cache=True)
+def _crossed(vertices, normals, eye, edges):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """The ends of the edges (E,2) that the rim crosses, seen from `eye`, and where between them, 0 to 1."""
+    facing = np.empty(len(vertices))
+    for v in range(len(vertices)):
+        facing[v] = 0.0
+        for k in range(3):
+            facing[v] += normals[v, k] * (vertices[v, k] - eye[k])
+    count = 0
+    first, second, share = np.empty(len(edges), np.int64), np.empty(len(edges), np.int64), np.empty(len(edges))
+    for edge in range(len(edges)):
+        a, b = edges[edge, 0], edges[edge, 1]
+        if (facing[a] < 0) != (facing[b] < 0):
+            first[count], second[count], share[count] = a, b, facing[a] / (facing[a] - facing[b])
+            count += 1
+    return first[:count], second[:count], share[:count]
+
+
+@njit(cache=True)
 def _nearest(points, directions, rim, rim_directions, turn_cost, min_cosine):  # type: ignore[no-untyped-def]  # pragma: no cover
     """For every outline point the index of the nearest rim point (NaN ones apart); -1 where the directions disagree."""
     nearest = np.full(len(points), -1)
@@ -174,8 +188,11 @@ def _nearest(points, directions, rim, rim_directions, turn_cost, min_cosine):  #
         best, at = np.inf, -1
         for j in range(len(rim)):
             x, y = rim[j, 0] - points[i, 0], rim[j, 1] - points[i, 1]
+            cost = x * x + y * y
+            if not cost < best:
+                continue
             u, v = rim_directions[j, 0] - directions[i, 0], rim_directions[j, 1] - directions[i, 1]
-            cost = x * x + y * y + turn_cost * (u * u + v * v)
+            cost += turn_cost * (u * u + v * v)
             if cost < best:
                 best, at = cost, j
         if at >= 0:
