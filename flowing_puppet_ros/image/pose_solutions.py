@@ -21,10 +21,10 @@ APART = 0.15
 NEAR = 0.1
 """Metres within which other particles agree with a joint."""
 
-EVENNESS = 8.0
+EVENNESS = 15.0
 """Cost difference at which a hypothesis counts 1/e of the best one when diverse ones are chosen."""
 
-DOUBT = 6.0
+DOUBT = 15.0
 """Cost difference at which a particle counts 1/e of the best one in a joint's confidence."""
 
 _FORBIDDEN = 1e9

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find the pose of the people in single images: joints, part outlines, depth order, and other hypotheses of the arms.
+
+The package's own detector says where people are, or the keypoints of --init do. Frames of --init are counted from 0 in
+the order of the images.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.likelihood import PartLikelihood
+from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
+from flowing_puppet_ros.image.detector_person import PersonDetection
+from flowing_puppet_ros.image.pose import PoseEstimator
+from flowing_puppet_ros.image.pose_answer import PosedPuppet
+from flowing_puppet_ros.image.pose_settings import PoseSettings
+from flowing_puppet_ros.image.tracks import DECIMALS, puppet_entry, read_keypoints, write_tracks
+from flowing_puppet_ros.image.video import FOLDER_FPS, IMAGE_SUFFIXES, open_frames
+from flowing_puppet_ros.model.ds import DeformableStructures
+from flowing_puppet_ros.model.ds_multiview import MultiViewStructures
+from flowing_puppet_ros.model.tree import PartTree
+
+GENDERS = ("neutral", "female", "male")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of this verb."""
+    parser.add_argument("images", nargs="+", type=Path, help="image files, or folders of images")
+    parser.add_argument("--out", required=True, type=Path, help="poses.json to write")
+    parser.add_argument("--init", type=Path, help="keypoints.json: people of each image, instead of the detector")
+    parser.add_argument(
+        "--model", default="neutral", choices=(*GENDERS, "auto"), help="body; auto: the likeliest [neutral]"
+    )
+    parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
+    parser.add_argument("--json", action="store_true", help="print one JSON object an image")
+    PoseSettings.add_arguments(parser)
+    DetectorSettings.add_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Pose the people of every image; 1 when an image could not be read, after all others are done."""
+    files = list(_files(arguments.images))
+    init = None if arguments.init is None else read_keypoints(arguments.init)
+    if arguments.out.resolve() in {file.resolve() for file in files} | {Path(arguments.init or "").resolve()}:
+        raise InputError(f"{arguments.out} is an input itself: name another output")
+    if init is not None and min(index for index, people in init.items() if people) >= len(files):
+        raise InputError(f"{arguments.init} has no keypoints for any of the {len(files)} images; frames count from 0")
+    genders = GENDERS if arguments.model == "auto" else (arguments.model,)
+    models = [DeformableStructures.load(gender) for gender in genders]
+    sides = [MultiViewStructures.load(gender) for gender in genders]
+    # The search knows upper bodies without hands of their own; those are drawn where the lower arms end.
+    drawn = [MultiViewStructures.load(gender, arguments.parts) for gender in genders] if arguments.parts > 10 else []
+    detector = _Configured(PartDetector.load(), DetectorSettings.from_arguments(arguments)) if init is None else None
+    settings = PoseSettings.from_arguments(arguments)
+    estimator = PoseEstimator(models, detector, PartLikelihood.load(), settings, sides, drawn)
+    shown = drawn[0].views[0] if drawn else models[0]
+    frames = []
+    for index, file in enumerate(tqdm(files, unit="image", disable=None)):
+        people = None if init is None else init.get(index, [])
+        began = time.monotonic()
+        try:
+            (frame,) = open_frames(file)
+            posed = estimator.estimate(frame.image, people)
+        except InputError as error:
+            if len(files) == 1:
+                raise
+            print(f"flowing-puppet pose: {error}", file=sys.stderr)
+            continue
+        puppets = [pose_entry(one, shown.tree) for one in posed]
+        stamp = round(index * 1e9 / FOLDER_FPS)
+        frames.append({"index": index, "path": str(file), "stamp_ns": stamp, "puppets": puppets})
+        _tell(arguments, file, posed, time.monotonic() - began)
+    if not frames:
+        raise InputError("none of the images can be used")
+    write_tracks(arguments.out, shown.joint_names, FOLDER_FPS, frames)
+    return 1 if len(frames) < len(files) else 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Configured:
+    """The detector with the settings of the command line."""
+
+    detector: PartDetector
+    settings: DetectorSettings
+
+    def detect(self, image: np.ndarray[Any, Any]) -> list[PersonDetection]:
+        return self.detector.detect(image, self.settings)
+
+
+def _files(paths: list[Path]) -> Iterator[Path]:
+    """The image files that the arguments name, folders in natural order."""
+    for path in paths:
+        source = open_frames(path) if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES else None
+        if source is None:
+            told = "is no image" if path.is_file() else "does not exist"
+            raise InputError(f"{path} {told}; give image files or folders of images, and videos to `track`")
+        yield from source.files
+
+
+def pose_entry(posed: PosedPuppet, tree: PartTree) -> dict[str, Any]:
+    """The JSON object of one person: a puppet as in tracks.json, its model, and the solutions with their energies."""
+    solutions = [
+        {
+            "energy": round(one.energy, 4),
+            "scale": round(one.scale, DECIMALS),
+            "joints": np.round(one.joints, DECIMALS).tolist(),
+        }
+        for one in posed.solutions
+    ]
+    genders = {name: round(value, 4) for name, value in posed.gender_probability.items()}
+    extra = {"model": posed.model, "gender_probability": genders, "solutions": solutions}
+    return puppet_entry(posed, tree) | extra
+
+
+def _tell(arguments: argparse.Namespace, file: Path, posed: list[PosedPuppet], seconds: float) -> None:
+    if not arguments.json:
+        print(f"{file}: {len(posed)} {'person' if len(posed) == 1 else 'people'}, {seconds:.2f} s")
+        return
+    people = [{"id": one.id, "scale": round(one.scale, DECIMALS), "energy": round(one.energy, 4)} for one in posed]
+    print(json.dumps({"input": str(file), "out": str(arguments.out), "puppets": people, "seconds": round(seconds, 3)}))
