@@ -11,9 +11,11 @@ from flowing_puppet_ros.cli import (
     evaluate_correspondence,
     evaluate_joints,
     evaluate_likelihood,
+    evaluate_pcp,
 )
 
 KINDS = {
+    "pcp": evaluate_pcp,
     "joints": evaluate_joints,
     "bodies": evaluate_bodies,
     "correspondence": evaluate_correspondence,
