@@ -32,8 +32,8 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
 
 Progress = Callable[[float], None]
-# Steps of the finish of a hypothesis, rounds of limb hypotheses, and how many of a round are finished.
-HYPOTHESIS_STEPS, LIMB_ROUNDS, LIMBS_FINISHED = 12, 3, 3
+# Steps of the finish of a hypothesis, and how many limbs that were searched anew are finished in a round.
+HYPOTHESIS_STEPS, LIMBS_FINISHED = 12, 3
 # A limb hypothesis must be this much closer than the body that it came from, and none helps a body so many metres off.
 CLOSER, HOPELESS = 0.98, 0.06
 
@@ -54,6 +54,7 @@ class FitterSettings(Settings):
                                  low=0.0, high=20.0)  # fmt: skip
     restarts: int = setting(1, "searches from new starts while no body comes close to the cloud", low=0, high=20)
     restart_distance: float = setting(0.02, "two-way distance at which a body is close", unit="m", low=0.0, high=1.0)
+    limb_rounds: int = setting(3, "rounds in which limbs that seem misplaced are searched anew", low=0, high=20)
     surface_finish: bool = setting(True, "let the surface leave the model's where a whole cloud is dense")
     threads: int = setting(2, "threads, at most the cores there are; the result does not depend on it",
                            low=1, high=64)  # fmt: skip
@@ -145,7 +146,7 @@ class BodyFinder:
 
     def mended(self, body: Candidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> Candidate:
         """The body with limbs moved to where they lie closer, while one seems to be in a wrong place."""
-        for _ in range(LIMB_ROUNDS):
+        for _ in range(self._settings.limb_rounds):
             if not body.judgement.doubtful or body.cost > HOPELESS:
                 break
             states = [body.state, *self._limbs_moved(body.state, cloud, grid, rng)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A man made of capsules, whose surface and joints owe nothing to the learned body model."""
+"""A man and a dog made of capsules, whose surfaces and joints owe nothing to the learned body model."""
 
 import numpy as np
 
@@ -48,7 +48,25 @@ def cloud_of(joints: dict[str, np.ndarray], count: int = 6000, seed: int = 0) ->
     for sign in (1.0, -1.0):
         low, high = np.array([0.0, 0.06 * sign, 0.0]), np.array([0.0, 0.08 * sign, 0.4])
         capsules.append((low, high, 0.1, 0.11))
-    rng = np.random.default_rng(seed)
+    return _surface(capsules, count, np.random.default_rng(seed))
+
+
+def dog() -> tuple[np.ndarray, np.ndarray]:
+    """Outer surface points (4000, 3) and normals of a dog 1.2 m long."""
+    capsules = [
+        (np.array([-0.35, 0, 0]), np.array([0.35, 0, 0.02]), 0.14, 0.16),
+        (np.array([0.4, 0, 0.1]), np.array([0.55, 0, 0.3]), 0.08, 0.08),
+        (np.array([0.55, 0, 0.3]), np.array([0.75, 0, 0.26]), 0.09, 0.05),
+        (np.array([-0.45, 0, 0.05]), np.array([-0.7, 0, 0.25]), 0.03, 0.02),
+    ]
+    legs = [np.array([x, y, -0.1]) for x in (-0.3, 0.3) for y in (-0.1, 0.1)]
+    capsules += [(leg, leg - [0, 0, 0.4], 0.05, 0.04) for leg in legs]
+    return _surface(capsules, 4000, np.random.default_rng(0))
+
+
+def _surface(
+    capsules: list[tuple[np.ndarray, np.ndarray, float, float]], count: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     points, normals = [], []
     sizes = np.array([(np.linalg.norm(b - a) + ra + rb) * (ra + rb) for a, b, ra, rb in capsules])
     for size, (a, b, ra, rb) in zip(sizes, capsules, strict=True):

@@ -53,6 +53,9 @@ def test_a_hand_in_the_air_is_seen_both_ways(model: StitchedPuppet, body: BodySt
     assert judgement.uncovered == pytest.approx((gap > 0.04).mean())
     assert judgement.explained == pytest.approx(((WIDTH**2 / (WIDTH**2 + gap**2)) ** 2).mean())
     assert judgement.doubtful and not judgement.reliable
+    lessened = (1 + judgement.part_confidence[hand] / 0.3) / 2
+    mean = np.sqrt(judgement.part_confidence.mean() * judgement.explained)
+    assert judgement.confidence == pytest.approx(mean * lessened)
 
 
 def test_a_leg_on_the_other_one_leaves_its_cloud_uncovered(
@@ -74,7 +77,7 @@ def test_an_arm_in_an_arm_is_a_fold_that_costs(model: StitchedPuppet, body: Body
     judgement = judged(model, model.vertices(moved(body, (lower,), away)), cloud)
     assert judgement.folded == 1
     assert judgement.cost > judgement.distance
-    assert judgement.doubtful
+    assert judgement.doubtful and not judgement.reliable
 
 
 def test_parts_that_the_sensor_cannot_see_are_not_held_against_the_body(

@@ -23,7 +23,7 @@ def model() -> StitchedPuppet:
 
 @pytest.fixture(scope="module")
 def finder(model: StitchedPuppet) -> BodyFinder:
-    return BodyFinder(model, FitterSettings())
+    return BodyFinder(model, FitterSettings(limb_rounds=2))
 
 
 @pytest.fixture(scope="module")
