@@ -63,7 +63,7 @@ def _histograms(
         row = int(at_y)
         low_y = at_y - np.float32(row)
         for x in range(1, min(columns * cell, width - 1)):
-            best, bin_ = np.float32(-1.0), 0
+            best, bin_ = np.float32(-1.0), np.int64(0)
             for c in range(channels):
                 dx = np.int64(pixels[y, x + 1, c]) - np.int64(pixels[y, x - 1, c]) + 255
                 dy = np.int64(pixels[y + 1, x, c]) - np.int64(pixels[y - 1, x, c]) + 255

@@ -41,8 +41,10 @@ class PartTree:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Beliefs:
-    """What the passes leave, all (L, H, W): `up` unary scores with the messages of the children, `message` (P, T, H, W)
-    of each part to its parent's types, and `down` the messages from the parents (None before the downward pass).
+    """What the passes leave.
+
+    `up` (L, H, W) are the unary scores with the messages of the children, `message` (P, T, H, W) is that of each part
+    to its parent's types, `down` (L, H, W) that from the parents, None before the downward pass.
     """
 
     up: Floats
@@ -110,7 +112,10 @@ def score_of(tree: PartTree, unary: Floats, placement: Integers) -> float:
 
 @njit(cache=True)
 def transform(scores: Floats, anchor: Floats, spring: Floats, out: Floats) -> None:
-    """out[y, x] = max over (v, u) of scores[v, u] - sx (u - x - ax)^2 - sy (v - y - ay)^2; arrays (H, W), a and s (2,)."""
+    """Set out[y, x] to the maximum over (v, u) of scores[v, u] - sx (u - x - ax)^2 - sy (v - y - ay)^2.
+
+    `scores` and `out` (H, W); `anchor` a and `spring` s (2,), along x and y.
+    """
     height, width = scores.shape
     longest = max(height, width)
     line, result = np.empty(longest, np.float32), np.empty(longest, np.float32)

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A person whom the detector found: joints, sticks, other poses that are nearly as good, and scores of any place."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.image.detector_parts import CELLS_PER_SCALE, PARTS, PartFilters, Window
+from flowing_puppet_ros.image.detector_tree import Beliefs, best_placement, downward
+from flowing_puppet_ros.image.keypoints import Keypoints
+from flowing_puppet_ros.image.sticks import sticks_of
+
+type Floats = NDArray[np.float32]
+type Doubles = NDArray[np.float64]
+
+JOINTS = tuple(name for name in PARTS if not name.endswith("arm"))
+ARM = ("shoulder", "upper_arm", "elbow", "forearm", "wrist")
+APART = 3.0  # cells between the wrists of two modes of an arm
+CERTAIN_MARGIN = 2.0  # a joint is certain when any other place (beyond NEAR cells) costs more
+NEAR = 3.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundPose:
+    """The best placement (P, 3) in a window, the upward beliefs, and the measures (4,) of how sure it is."""
+
+    window: Window
+    beliefs: Beliefs
+    placement: NDArray[np.int64]
+    measures: Doubles
+
+
+@dataclass(frozen=True, eq=False)
+class PersonDetection:
+    """One person; all positions in px of the image that was given to the detector, left and right the person's.
+
+    `confidence` is the calibrated probability that somebody was found in the right place and size.
+    """
+
+    filters: PartFilters
+    pose: FoundPose
+    confidence: float
+    factor: float
+    """Size of the image that was looked at, in units of the given one."""
+
+    @property
+    def scale(self) -> float:
+        """S: the shoulder width in px, of somebody seen from the side what it would be from the front."""
+        return CELLS_PER_SCALE * self.pose.window.cell / self.factor
+
+    @property
+    def neck(self) -> Doubles:
+        """Where the neck is, (2,)."""
+        neck: Doubles = self._points(self.pose.placement[:1, 1:].astype(np.float64))[0]
+        return neck
+
+    @cached_property
+    def keypoints(self) -> Keypoints:
+        """The best pose: neck, face, belly, hips, shoulders, elbows, wrists; they may lie outside of the image.
+
+        A joint's confidence is the person's, less where another place would do nearly as well.
+        """
+        return self._keypoints(self._refined(self.pose.placement))
+
+    @property
+    def sticks(self) -> Doubles:
+        """Sticks (6, 2, 2) in the order of `sticks.STICKS`."""
+        return sticks_of(self.keypoints.names, self.keypoints.xy)
+
+    def joint_score(self, joint: str, xy: Doubles) -> Doubles:
+        """Score (K,) of the best pose that has a joint at each of the places xy (K, 2), less that of the best pose.
+
+        In units of the margin: one part clearly misplaced costs about 1. Outside of the window the border's score.
+        """
+        score = self._maps[PARTS.index(joint)]
+        cells = self.pose.window.cells_of((np.asarray(xy, np.float64) + 0.5) * self.factor - 0.5)
+        limited = np.clip(np.nan_to_num(cells), 0, np.array(score.shape[::-1]) - 1).astype(np.float32)
+        at = np.ascontiguousarray(limited.reshape(-1, 1, 2))
+        looked_up = cv2.remap(score, at, None, cv2.INTER_LINEAR) if len(at) else at[..., 0]
+        return np.asarray(looked_up, np.float64).reshape(-1)
+
+    def modes(self, count: int) -> list[tuple[Keypoints, float]]:
+        """Up to `count` poses that differ in the arms, best first, with their scores less that of the best pose.
+
+        An arm's alternatives are the peaks of its wrist's max-marginals, each with the best arm for it; the arms are
+        combined as if they did not depend on each other.
+        """
+        arms = [self._arm_modes(side, count) for side in ("right", "left")]
+        pairs = sorted(
+            ((a + b, i, j) for i, (a, _) in enumerate(arms[0]) for j, (b, _) in enumerate(arms[1])), reverse=True
+        )
+        found = []
+        for score, i, j in pairs[:count]:
+            placement = self.pose.placement.copy()
+            for side, mode in (("right", arms[0][i][1]), ("left", arms[1][j][1])):
+                rows = _arm_rows(side)
+                placement[rows] = mode[rows]
+            found.append((self._keypoints(self._refined(placement)), score))
+        return found
+
+    def arms(self, side: str, count: int) -> Doubles:
+        """Elbow and wrist (K, 2, 2) px of up to `count` poses of the arm of a side, best first."""
+        rows = [PARTS.index(f"{side}_{joint}") for joint in ("elbow", "wrist")]
+        return np.array([self._points(self._refined(mode))[rows] for _, mode in self._arm_modes(side, count)])
+
+    @cached_property
+    def _both_ways(self) -> Beliefs:
+        """Beliefs with the downward pass."""
+        return downward(self.filters.tree, self.pose.beliefs)
+
+    @cached_property
+    def _maps(self) -> Floats:
+        """Max-marginals (P, H, W) of all types, less the best pose's score."""
+        beliefs, first = self._both_ways, self.filters.tree.first
+        assert beliefs.down is not None
+        total = beliefs.up + beliefs.down
+        maps = np.stack([total[first[part] : first[part + 1]].max(axis=0) for part in range(len(PARTS))])
+        return np.ascontiguousarray(maps - maps[0].max())
+
+    def _arm_modes(self, side: str, count: int) -> list[tuple[float, NDArray[np.int64]]]:
+        """Peaks of one wrist's map with the best placement (P, 3) for each; the first is that of the best pose."""
+        tree, beliefs = self.filters.tree, self._both_ways
+        assert beliefs.down is not None
+        wrist = PARTS.index(f"{side}_wrist")
+        left = self._maps[wrist].copy()
+        y, x = np.indices(left.shape)
+        modes = [(0.0, self.pose.placement)]
+        column, row = self.pose.placement[wrist, 1:]
+        while len(modes) < count:
+            left[np.hypot(x - column, y - row) < APART] = -np.inf
+            row, column = np.unravel_index(int(left.argmax()), left.shape)
+            score = float(left[row, column])
+            if not np.isfinite(score):
+                break
+            layers = slice(tree.first[wrist], tree.first[wrist + 1])
+            layer = tree.first[wrist] + int((beliefs.up + beliefs.down)[layers, row, column].argmax())
+            modes.append((score, best_placement(tree, beliefs, (wrist, layer, int(column), int(row)))))
+        return modes
+
+    def _refined(self, placement: NDArray[np.int64]) -> Doubles:
+        """Grid coordinates (P, 2) of a placement, moved to the top of the parabola through the neighbours' scores."""
+        cells = placement[:, 1:].astype(np.float64)
+        beliefs = self._both_ways
+        assert beliefs.down is not None
+        height, width = beliefs.up.shape[1:]
+        for part, (layer, x, y) in enumerate(placement):
+            if 0 < x < width - 1 and 0 < y < height - 1:
+                near = (
+                    beliefs.up[layer, y - 1 : y + 2, x - 1 : x + 2] + beliefs.down[layer, y - 1 : y + 2, x - 1 : x + 2]
+                )
+                cells[part] += _peak(near[1]), _peak(near[:, 1])
+        return cells
+
+    def _points(self, cells: Doubles) -> Doubles:
+        """Grid coordinates (P, 2) in px of the given image."""
+        return (self.pose.window.points_of(cells) + 0.5) / self.factor - 0.5
+
+    def _keypoints(self, cells: Doubles) -> Keypoints:
+        points = self._points(cells)
+        chosen = [PARTS.index(name) for name in JOINTS]
+        confidence = [self.confidence * self._certainty(part, cells[part]) for part in chosen]
+        return Keypoints(JOINTS, points[chosen], np.array(confidence))
+
+    def _certainty(self, part: int, at: Doubles) -> float:
+        """How much worse (0 to 1) the best pose with this part elsewhere is; a half where it is better."""
+        score = self._maps[part]
+        y, x = np.indices(score.shape)
+        far = np.hypot(x - at[0], y - at[1]) > NEAR
+        margin = -float(score[far].max())
+        return float(np.clip(0.5 + 0.5 * margin / CERTAIN_MARGIN, 0.5, 1.0))
+
+
+def _arm_rows(side: str) -> list[int]:
+    return [PARTS.index(f"{side}_{part}") for part in ARM]
+
+
+def _peak(values: Floats) -> float:
+    """Top of the parabola through three values, from the middle one, at most half a step away."""
+    low, middle, high = (float(value) for value in values)
+    bend = low - 2 * middle + high
+    return float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5)) if bend < 0 else 0.0

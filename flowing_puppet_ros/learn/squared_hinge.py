@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Linear support vector machine with squared hinge loss, by Newton's method in the primal.
+
+O. Chapelle: Training a Support Vector Machine in the Primal, Neural Computation 19, 2007. Exact, without a random
+order, and with matrix products alone: thousands of dimensions and tens of thousands of samples take seconds.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+type Array = np.ndarray[Any, Any]
+
+MOST_STEPS = 15
+
+
+def train(features: Array, positive: Array, weight: Array, ridge: float, start: Array | None = None) -> Array:
+    """Minimise ridge |w|^2 + sum of weight * max(0, 1 - y (x w + b))^2 over w (D,) and b; returns (D + 1,), b last.
+
+    `features` (N, D) float32, `positive` (N,) bool (y is 1 or -1), `weight` (N,). `start` (D + 1,) is a guess.
+    """
+    count, dimensions = features.shape
+    sign = np.where(positive, 1.0, -1.0).astype(np.float32)
+    solution = np.zeros(dimensions + 1, np.float32) if start is None else start.astype(np.float32)
+    active = np.zeros(count, dtype=bool)
+    for step in range(MOST_STEPS):
+        margin = sign * (features @ solution[:-1] + solution[-1])
+        wrong = margin < 1 if step or start is not None else np.ones(count, dtype=bool)
+        if step and np.array_equal(wrong, active):
+            break
+        active = wrong
+        solution = _least_squares(features[active], sign[active], weight[active].astype(np.float32), ridge)
+    return solution
+
+
+def _least_squares(features: Array, target: Array, weight: Array, ridge: float) -> Array:
+    """Minimise ridge |w|^2 + sum of weight * (target - x w - b)^2; returns (D + 1,), b last."""
+    count, dimensions = features.shape
+    if count < dimensions:
+        # The same minimum through the samples' products with each other, of which there are fewer.
+        kernel = features @ features.T
+        kernel[np.arange(count), np.arange(count)] += ridge / weight
+        factor = cho_factor(kernel, lower=True, overwrite_a=True)
+        solved = cho_solve(factor, np.column_stack([target, np.ones(count, np.float32)]))
+        bias = solved[:, 0].sum() / solved[:, 1].sum()
+        return np.append(features.T @ (solved[:, 0] - bias * solved[:, 1]), bias).astype(np.float32)
+    weighted = features * weight[:, None]
+    normal = np.empty((dimensions + 1, dimensions + 1), np.float32)
+    normal[:-1, :-1] = features.T @ weighted
+    normal[-1, :-1] = normal[:-1, -1] = weighted.sum(axis=0)
+    normal[-1, -1] = weight.sum()
+    normal[np.arange(dimensions), np.arange(dimensions)] += ridge
+    right = np.append(weighted.T @ target, weight @ target)
+    solution: Array = cho_solve(cho_factor(normal, lower=True, overwrite_a=True), right.astype(np.float32))
+    return solution
