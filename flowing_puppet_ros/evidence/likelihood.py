@@ -37,9 +37,13 @@ TERMS_OF = {
 BAND = 0.04
 """Width, in metres, of the band around a part that its colours are set against."""
 
-HAND = 0.05
-"""Radius of a hand in metres."""
+HAND, AROUND = 0.03, 0.12
+"""Standard deviations, in metres, of the spots in which hands are looked for, and of their surroundings."""
 
+REACH = 0.85
+"""Farthest that a hand is from the middle of the head, in metres."""
+
+_COARSEST = 4.0  # px: standard deviation beyond which a map is blurred at lower resolution
 _HAND_SHARE = 5  # of the lower arm's points, from the finger tips back on either side, one in so many is the hand's
 
 
@@ -123,17 +127,28 @@ class Scene:
         return np.stack([columns[term] for term in wanted], axis=1)
 
     def hand_map(self, scale: float) -> NDArray[np.float64]:
-        """Where hands may be (H,W), summing to 1: skin in spots of a hand's size, but not on the head when it is known.
+        """Where hands may be (H,W), summing to 1: spots of a hand's size that are skin, more than what is around.
 
-        `scale` in px/m. Even where nothing looks like skin.
+        `scale` in px/m. When the head is known, only around it within REACH and not on it. Even where no skin is seen.
         """
-        size = max(HAND * scale, 0.5)
-        spots = np.asarray(cv2.GaussianBlur(self.skin.values, (0, 0), size, borderType=cv2.BORDER_REPLICATE))
-        likely = np.maximum(np.exp(spots.reshape(self.colours.bins.shape)) - 1.0, 0.0)
+        spots, around = (_smooth(self.skin.values, size * scale) for size in (HAND, AROUND))
+        likely = np.maximum(np.exp(2.0 * spots - around) - 1.0, 0.0)
+        height, width = likely.shape
         if self.head is not None and np.isfinite(self.head).all():
-            likely[render_labels([self.head], [0], self.colours.bins.shape) > 0] = 0.0
+            x, y = self.head.mean(axis=0)
+            likely[np.hypot(np.arange(width) - x, np.arange(height)[:, None] - y) > REACH * scale] = 0.0
+            likely[render_labels([self.head], [0], likely.shape) > 0] = 0.0
         total = likely.sum()
-        return likely / total if total > 0.0 else np.full(likely.shape, 1.0 / likely.size)
+        return np.asarray(likely / total if total > 0.0 else np.full(likely.shape, 1.0 / likely.size))
+
+
+def _smooth(values: Array, deviation: float) -> NDArray[np.float64]:
+    """Gaussian blur of a map (H,W); the larger the standard deviation in px, the coarser the map that is blurred."""
+    shrink = max(1.0, deviation / _COARSEST)
+    size = [max(1, round(side / shrink)) for side in values.shape[::-1]]
+    small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), max(deviation / shrink, 0.5), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.resize(small, values.shape[::-1], interpolation=cv2.INTER_LINEAR)).reshape(values.shape)
 
 
 def hand_of(contours: Array) -> Array:

@@ -164,6 +164,15 @@ def test_hand_map_finds_bare_forearms_and_not_the_face(scene: Scene, puppet: Pup
     assert weight[1] < 0.1 * weight[4]
 
 
+def test_hand_map_of_an_enlarged_picture_is_the_enlarged_map(
+    likelihood: PartLikelihood, scene: Scene, puppet: PuppetShape, image: np.ndarray
+) -> None:
+    large = likelihood.scene(cv2.resize(image, None, fx=5, fy=5, interpolation=cv2.INTER_NEAREST))
+    hands = large.with_torso(*(5 * contour + 2 for contour in puppet.contours[:2])).hand_map(650.0)
+    smaller = cv2.resize(hands, SIZE, interpolation=cv2.INTER_AREA)
+    assert np.corrcoef(smaller.ravel(), scene.hand_map(130.0).ravel())[0, 1] > 0.97
+
+
 def test_the_hand_is_the_far_end_of_the_lower_arm(model: DeformableStructures) -> None:
     for name in ("right_lower_arm", "left_lower_arm"):
         shape = model.shapes[model.tree.index(name)]
