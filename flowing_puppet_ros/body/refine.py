@@ -26,7 +26,7 @@ MAX_TURN = 0.5
 # Joints are believed this many times more widely than closest points are.
 JOINT_WIDTH = 2.5
 # Cloud points that look for a vertex in every step; more make the steps slower and not better.
-MATCHED = 5000
+MATCHED = 3000
 
 # What else draws the body's vertices (V, 3), given the width in metres of the robust kernel at this step.
 SurfaceTerm = Callable[[np.ndarray, float], Quadratic]

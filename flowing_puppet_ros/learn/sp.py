@@ -62,7 +62,8 @@ def learn(gender: str, settings: LearnSettings, mocap: Path | None, progress: Pr
     people = [body.rest(body.sample_phenotype(rng)) for _ in range(settings.shapes)]
     shape_space, rest_center = _shape_space(people, template, topology, area, settings.shape_count)
     progress(f"{settings.poses} poses")
-    posed = pose_parts(body, template, topology, poses.sample(rng, settings.poses), area)
+    hands = np.random.default_rng([settings.seed, 1])
+    posed = pose_parts(body, template, topology, poses.sample(rng, settings.poses), area, hands)
     progress("pose deformations of the parts")
     spaces, signs = pose_spaces(posed, template, topology, area)
     pairwise, low, high = learn_pairwise(posed, spaces, signs)

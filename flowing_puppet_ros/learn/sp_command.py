@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from flowing_puppet_ros.learn.anny import GENDERS
 from flowing_puppet_ros.learn.sp import Learned, LearnSettings, learn
 from flowing_puppet_ros.learn.sp_pose import TREE
+from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import make_out_folder
 
 
@@ -64,6 +65,28 @@ def model_card(gender: str, settings: LearnSettings, mocap: bool, learned: Learn
         shape_residual=1000 * learned.shape_space.residual,
         rows="\n".join(rows),
         joints=joints,
+        samples=sample_report(StitchedPuppet.from_arrays(gender, learned.arrays)),
+    )
+
+
+def sample_report(model: StitchedPuppet, count: int = 200) -> str:
+    """What `count` random bodies of a model look like: statures, volumes, and the gaps left where parts meet."""
+    rng = np.random.default_rng(0)
+    statures, volumes, gaps = [], [], []
+    for _ in range(count):
+        standing = model.vertices(model.sample(rng, pose_scale=0.0))
+        statures.append(np.ptp(standing[:, 2]))
+        a, b, c = standing[model.faces].transpose(1, 0, 2)
+        volumes.append((a * np.cross(b, c)).sum() / 6 * 1000)
+        parts = model.parts(model.sample(rng))
+        pairs = zip(model.interfaces, model.tree.edges, strict=True)
+        apart = [parts[i][own.parent_index] - parts[j][own.child_index] for own, (i, j) in pairs]
+        gaps.append(np.linalg.norm(np.concatenate(apart), axis=1).mean() * 1000)
+    tall, large = (np.percentile(values, [5, 50, 95]) for values in (statures, volumes))
+    return (
+        f"{count} random bodies of the model (5th, 50th and 95th percentile): stature {tall[0]:.2f}, {tall[1]:.2f} and"
+        f" {tall[2]:.2f} m, volume {large[0]:.0f}, {large[1]:.0f} and {large[2]:.0f} litres;\nposed ones have gaps of"
+        f" {np.mean(gaps):.1f} mm between the copies of a border vertex (the worst of them {np.max(gaps):.1f} mm)."
     )
 
 
@@ -79,11 +102,12 @@ exactly symmetric; A-pose; x forward, y to the person's left, z up, metres.
   minimal clothing, no hair. It stands in for the SCAPE model of the thesis.
 - Poses: {poses}. The motion capture is from mocap.cs.cmu.edu, created with
   funding from NSF EIA-0196217; only statistics of it are in this file.
+- Hands: from flat to a fist, every finger with three joints of its own (the finger bones of MakeHuman's default rig).
 - Differences from the thesis: {settings.shape_count} shape coefficients instead of 4, 8 pose coefficients instead of 5
-  for shoulders and upper arms, vertices weighted by their area and part borders by 4 more, left and right learned
-  together.
-- Limits: the poses are those of Anny's linear blend skinning, without muscle bulging; fingers bend as one; faces have
-  no expression; people in thick clothes, children and missing limbs are outside of what was learned.
+  for shoulders and upper arms and 12 for hands, vertices weighted by their area and part borders by 4 more, left and
+  right learned together.
+- Limits: the poses are those of Anny's linear blend skinning, without muscle bulging; faces have no expression; people
+  in thick clothes, children and missing limbs are outside of what was learned.
 - Licence: Apache-2.0, as the package.
 
 Intrinsic shape: {settings.shape_count} components keep {shape_share:.1f} % of the variance; what is left over is
@@ -96,4 +120,6 @@ Pose deformations, by part (border vertices count 4 times):
 {rows}
 
 Joints, mean distance in mm from Anny's on bodies that were not used to learn them: {joints}.
+
+{samples}
 """

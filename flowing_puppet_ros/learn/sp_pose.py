@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.learn.anny import AnnyBody
+from flowing_puppet_ros.learn.anny import AnnyBody, RestBody
+from flowing_puppet_ros.learn.fingers import Fingers
 from flowing_puppet_ros.learn.pca import MIRROR, Space, mirrored_space, principal_space
 from flowing_puppet_ros.learn.template import Template
 from flowing_puppet_ros.model import rotation
@@ -19,7 +20,8 @@ from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
 Array = np.ndarray[Any, Any]
 
 TREE = PartTree.from_parents(SP_PARENTS)
-POSE_COUNTS = {"torso": 12, "shoulder": 8, "upper_arm": 8}  # by the name without its side; all other parts have 5
+# By the name without its side; all other parts have OTHER_POSE_COUNT.
+POSE_COUNTS = {"torso": 12, "shoulder": 8, "upper_arm": 8, "hand": 12}
 OTHER_POSE_COUNT = 5
 LIMIT_TAIL, LIMIT_MARGIN = 0.001, np.radians(5.0)  # share of training poses beyond a joint limit; what is added to it
 BORDER = 4.0  # how much more than the others the vertices that parts share count in the pose deformations
@@ -42,19 +44,33 @@ def local_mirror(template: Template, topology: PartTopology, part: int) -> Array
     )
 
 
-def pose_parts(body: AnnyBody, template: Template, topology: PartTopology, rotations: Array, area: Array) -> PartPoses:
-    """Pose the average body by bone rotations (n,B,3,3) and take every part back to its own frame by Procrustes."""
-    rest = body.rest(body.mean_phenotype())
+def pose_parts(
+    body: AnnyBody,
+    template: Template,
+    topology: PartTopology,
+    rotations: Array,
+    area: Array,
+    hands: np.random.Generator,
+) -> PartPoses:
+    """Pose the average body by bone rotations (n,B,3,3) and take every part back to its own frame by Procrustes.
+
+    The fingers close at random, mostly instead of by the rotations. A hand's frame is that of its palm.
+    """
+    rest, fingers = body.rest(body.mean_phenotype()), Fingers(body)
     own = [rest.vertices[template.anny_vertex[ids]] for ids in topology.part_vertices]
     own = [points - points.mean(axis=0) for points in own]
+    still = 1.0 - fingers.share[template.anny_vertex]
     turned = np.empty((len(rotations), len(TREE), 3, 3))
     deformations = [np.empty((len(rotations), *points.shape), np.float32) for points in own]
+    rotations = rotations.copy()
+    angles = fingers.close(hands, rotations)
     for start in range(0, len(rotations), BATCH):
         rows = slice(start, start + BATCH)
-        meshes = body.pose(rest, rotations[rows], template.anny_vertex)[0]
+        closed = RestBody(fingers.bodies(angles[rows]), rest.joints)
+        meshes = body.pose(closed, rotations[rows], template.anny_vertex)[0]
         for i, ids in enumerate(topology.part_vertices):
             moved = meshes[:, ids]
-            turned[rows, i], shift = rotation.procrustes(own[i], moved, area[ids])
+            turned[rows, i], shift = rotation.procrustes(own[i], moved, area[ids] * still[ids])
             deformations[i][rows] = (moved - shift[:, None]) @ turned[rows, i] - own[i]
     return PartPoses(turned, tuple(deformations))
 
