@@ -26,7 +26,7 @@ LOWEST = (0.5, 1.2)
 """Metres above the floor at which a person's lowest point usually lies, and where it cannot."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ExtractionSettings(Settings):
     """Settings of `extract_people`."""
 

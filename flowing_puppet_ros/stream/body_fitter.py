@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.people import ExtractionSettings
 from flowing_puppet_ros.body.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.body.tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.errors import InputError
@@ -20,6 +21,7 @@ from flowing_puppet_ros.stream.clouds import decode_cloud, make_cloud
 from flowing_puppet_ros.stream.component import BODIES, POINT_CLOUD, SILHOUETTES, TRANSFORMS, Component, Output, Port
 from flowing_puppet_ros.stream.messages import MessageFactory, make_transform, stamp_ns
 from flowing_puppet_ros.stream.people import Joint, joints_of, make_bodies, make_body
+from flowing_puppet_ros.stream.scenes import ScenePeople
 from flowing_puppet_ros.stream.shapes import make_deletions, make_mesh_marker, make_part_poses, make_topology
 from flowing_puppet_ros.stream.silhouettes import SilhouetteBodies
 from flowing_puppet_ros.stream.waiting import Line, Shelf
@@ -35,7 +37,7 @@ Progress = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings, BodyTrackerSettings):
+class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings, BodyTrackerSettings, ExtractionSettings):
     """Settings of the fits, and of what the component reads and waits for."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
@@ -43,6 +45,8 @@ class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings, BodyTrackerSe
     view: str = setting("full", "cloud from all sides, or from one sensor at the frame's origin",
                         choices=("full", "single"))  # fmt: skip
     track: bool = setting(False, "follow one person through the clouds that come without initial joints")
+    scene: bool = setting(False, "find the people among floor, walls and furniture in clouds that come without initial"
+                                 " joints")  # fmt: skip
     wait: int = setting(1, "newer clouds that may come before a cloud goes on without its initial joints",
                         low=0, high=50)  # fmt: skip
 
@@ -77,7 +81,8 @@ class BodyFitterComponent(Component):
         self._settings = settings
         self._model = StitchedPuppet.load(settings.model)
         self._fitter = BodyFitter(self._model, settings)
-        self._tracker = BodyTracker(self._fitter, settings)
+        self._trackers: dict[str, BodyTracker] = {}
+        self._people = ScenePeople(settings)
         self._silhouettes = SilhouetteBodies(self._model, settings)
         self._line = Line()
         self._initial = Shelf()
@@ -87,7 +92,8 @@ class BodyFitterComponent(Component):
     def reset(self) -> None:
         """Forget what waits, whom the silhouettes showed and who was tracked."""
         self._silhouettes.reset()
-        self._tracker.reset()
+        self._trackers.clear()
+        self._people.reset()
         self._line.clear()
         self._initial.clear()
 
@@ -98,31 +104,45 @@ class BodyFitterComponent(Component):
     def fit(
         self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None, track: bool = False
     ) -> tuple[Any, list[tuple[str, BodyFit]]]:
-        """Fit the bodies in a PointCloud2 message, one for each body in `initial` (a BodyArray) or else one.
+        """Fit the bodies in a PointCloud2 message: those in `initial` (a BodyArray), else those of the scene, else one.
 
-        With `track` the one without `initial` goes on from the last cloud's. Returns the BodyArray message and
-        (id, fit) of each of its bodies, in the cloud's frame. InputError in one sentence when the cloud cannot be used.
+        With `track` the ones without `initial` go on from the last cloud's. Returns the BodyArray message and (id, fit)
+        of each of its bodies, in the cloud's frame. InputError in one sentence when the cloud cannot be used.
         """
         turn = _UPRIGHT[self._settings.up]
         points, normals = decode_cloud(cloud)
-        upright = points @ turn.T
-        turned = None if normals is None else normals @ turn.T
+        points, normals = points @ turn.T, None if normals is None else normals @ turn.T
         viewpoint = np.zeros(3) if self._settings.view == "single" else None
-        starts: list[tuple[str, dict[str, Joint] | None]] = [("b1", None)]
+        fits: list[tuple[str, BodyFit]] = []
         if initial is not None and initial.bodies:
-            starts = [(body.id or f"b{k + 1}", joints_of(body)) for k, body in enumerate(initial.bodies)]
-        fits = []
-        for identity, joints in starts:
-            if track and joints is None:
-                fit = self._tracker.step(upright, turned, stamp_ns(cloud), viewpoint, seed)
-            else:
-                given = None if joints is None else _turned_joints(joints, turn)
+            for number, body in enumerate(initial.bodies, start=1):
+                joints = _turned_joints(joints_of(body), turn)
                 fit = self._fitter.fit(
-                    upright, turned, initial=given, viewpoint=viewpoint, seed=seed, progress=progress
+                    points, normals, initial=joints, viewpoint=viewpoint, seed=seed, progress=progress
                 )
-            fits.append((identity, _turned_back(fit, turn)))
+                fits.append((body.id or f"b{number}", fit))
+        else:
+            for identity, part, part_normals in self._parts(points, normals, viewpoint):
+                if track:
+                    tracker = self._trackers.setdefault(identity, BodyTracker(self._fitter, self._settings))
+                    fit = tracker.step(part, part_normals, stamp_ns(cloud), viewpoint, seed)
+                else:
+                    fit = self._fitter.fit(part, part_normals, viewpoint=viewpoint, seed=seed, progress=progress)
+                fits.append((identity, fit))
+        fits = [(identity, _turned_back(fit, turn)) for identity, fit in fits]
         bodies = [make_body(self.factory, identity, self._model, fit) for identity, fit in fits]
         return make_bodies(self.factory, cloud.header, bodies), fits
+
+    def _parts(
+        self, points: NDArray[np.float64], normals: NDArray[np.float64] | None, viewpoint: NDArray[np.float64] | None
+    ) -> list[tuple[str, NDArray[np.float64], NDArray[np.float64] | None]]:
+        """Return (id, points, normals) of every person in a cloud; people who are not seen any more are not tracked."""
+        if not self._settings.scene:
+            return [("b1", points, normals)]
+        found = self._people.find(points, normals, viewpoint)
+        seen = {identity for identity, _ in found}
+        self._trackers = {identity: tracker for identity, tracker in self._trackers.items() if identity in seen}
+        return [(identity, person.points, person.normals) for identity, person in found]
 
     def seed_of(self, stamp: int) -> int:
         """Return the seed of the fit to the cloud of a stamp (nanoseconds)."""
