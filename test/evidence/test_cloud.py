@@ -3,8 +3,9 @@
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.evidence.cloud import CloudGrid, look_up
+from flowing_puppet_ros.evidence.cloud import CloudGrid, ExactCloud, look_up
 
 CENTRE = np.array([1.0, 2.0, -0.5])
 
@@ -77,3 +78,15 @@ def test_wide_clouds_get_larger_cells() -> None:
     grid = CloudGrid.build(points, np.eye(3)[:2])
     assert grid.nearest.size < 3_000_000
     assert closest(grid, points)[0].tolist() == [0, 1]
+
+
+def test_the_exact_cloud_takes_the_nearest_of_all_points(sphere: CloudGrid) -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-0.4, 0.4, (3, 40, 3)) + CENTRE
+    normals = rng.normal(size=(3, 40, 3))
+    normals /= np.linalg.norm(normals, axis=2, keepdims=True)
+    cost, mismatch = ExactCloud(sphere.points, sphere.normals, cKDTree(sphere.points)).data_cost(points, normals)
+    gaps = np.linalg.norm(points[:, :, None] - sphere.points, axis=3)
+    np.testing.assert_allclose(cost, ((gaps.min(axis=2) ** 2 + 0.001) ** 0.45).mean(axis=1))
+    angle = np.arccos(np.clip((normals * sphere.normals[gaps.argmin(axis=2)]).sum(axis=2), -1, 1))
+    np.testing.assert_allclose(mismatch, (angle > 0.75 * np.pi).mean(axis=1))
