@@ -38,16 +38,17 @@ class BodyTrackerSettings(Settings):
     track_lost_ratio: float = setting(1.3, "two-way distance, against the best since the last search, of a lost track",
                                       low=1.0, high=10.0)  # fmt: skip
     track_lost_distance: float = setting(0.001, "distance that must be added to that", unit="m", low=0.0, high=1.0)
-    track_longest_gap: float = setting(0.5, "gap between clouds after which a body is searched for again", unit="s",
+    track_longest_gap: float = setting(0.5, "gap between clouds after which a motion does not go on", unit="s",
                                        low=0.01, high=60.0)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Seen:
-    """A fit and the time of its cloud, nanoseconds."""
+    """A fit, the time of its cloud in nanoseconds, and the mean (3,) of the cloud's points, metres."""
 
     fit: BodyFit
     stamp: int
+    middle: np.ndarray
 
 
 class BodyTracker:
@@ -92,14 +93,14 @@ class BodyTracker:
         points, normals = checked_cloud(points, normals)
         if viewpoint is None:
             points, normals = thinned(points, normals, self._settings.track_points)
-        if self._last is not None and not 0 < stamp - self._last.stamp <= 1e9 * self._settings.track_longest_gap:
+        if self._last is not None and stamp <= self._last.stamp:
             self.reset()
         with threadpool_limits(limits=1):
             cloud = self._fitter.cloud(points, normals, viewpoint)
-            fit = None if self._last is None else self._tracked(self._predicted(self._last, stamp), cloud)
+            fit = None if self._last is None else self._tracked(self._predicted(self._last, cloud, stamp), cloud)
             if fit is None or self._is_lost(fit):
                 fit = self._searched(fit, cloud, seed)
-        self._before, self._last = self._last, _Seen(fit, stamp)
+        self._before, self._last = self._last, _Seen(fit, stamp, cloud.points.mean(axis=0))
         self._best = min(self._best, fit.two_way_distance)
         self._frames += 1
         return fit
@@ -127,9 +128,14 @@ class BodyTracker:
         self._best = fit.two_way_distance
         return fit
 
-    def _predicted(self, last: _Seen, stamp: int) -> BodyState:
-        """The last body, moved on by its last motion in proportion to the time."""
+    def _predicted(self, last: _Seen, cloud: Cloud, stamp: int) -> BodyState:
+        """The last body, moved on by its last motion in proportion to the time.
+
+        After a long gap, which a search leaves in a live stream too, it moves as the middle of the cloud did.
+        """
         state = last.fit.state
+        if stamp - last.stamp > 1e9 * self._settings.track_longest_gap:
+            return replace(state, center=state.center + cloud.points.mean(axis=0) - last.middle)
         if self._before is None:
             return state
         share = min((stamp - last.stamp) / (last.stamp - self._before.stamp), MOST_STRETCH)
