@@ -23,7 +23,7 @@ CELL_METRES = 0.03
 LEVELS = 3
 """Levels of the pyramid; cells of the next are twice as wide."""
 
-PLACES = {"torso": 40, "head": 20, "upper_arm": 14, "lower_arm": 20, "upper_leg": 26, "lower_leg": 26}
+PLACES = {"torso": 40, "head": 20, "upper_arm": 14, "lower_arm": 20}
 """Places along the contour of each kind of part; with three descriptors each, as many as in the thesis."""
 
 
