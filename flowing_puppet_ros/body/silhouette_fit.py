@@ -41,7 +41,7 @@ _WEIGHTS = RefineWeights(pose=1e-7, pairwise=1e-7, shape=2e-6, sigma_start=0.08,
 class SilhouetteFitterSettings(Settings):
     """Settings of `SilhouetteFitter`."""
 
-    outline_steps: int = setting(10, "Gauss-Newton steps on silhouettes", low=1, high=200)
+    outline_steps: int = setting(8, "Gauss-Newton steps on silhouettes", low=1, high=200)
     outline_joints: float = setting(0.02, "pull of an initial joint against all silhouettes'", low=0.0, high=100.0)
     least_overlap: float = setting(
         0.78,
