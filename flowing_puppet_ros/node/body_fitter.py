@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds in, fitted bodies out; the action fit_body fits one cloud on request."""
+"""Point clouds or silhouettes in, fitted bodies out; the action fit_body fits one cloud on request."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images, part labels and puppets of calibrated cameras in, visual hull and triangulated joints out."""
+"""Images, part labels and puppets of calibrated cameras in; silhouettes, joints and visual hull out."""
 
 from __future__ import annotations
 
