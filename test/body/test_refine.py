@@ -3,9 +3,10 @@
 
 import numpy as np
 
-from flowing_puppet_ros.body.correspondence import Quadratic
+from flowing_puppet_ros.body.correspondence import Cloud, Quadratic, two_way_distance
 from flowing_puppet_ros.body.energy import JointTargets
-from flowing_puppet_ros.body.refine import Refiner, RefineWeights
+from flowing_puppet_ros.body.geometry import vertex_normals
+from flowing_puppet_ros.body.refine import LOOSE, Refiner, RefineWeights
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 
@@ -34,3 +35,17 @@ def test_without_evidence_the_shape_is_the_expected_one() -> None:
     weights = RefineWeights(iterations=6, shape_center=expected)
     body = Refiner(model).run(model.rest_state(), None, JointTargets.none(model), weights)
     np.testing.assert_allclose(body.shape, np.tile(expected, (len(model.tree), 1)), atol=0.2)
+
+
+def test_loose_parts_follow_a_foreign_surface_more_closely() -> None:
+    model = StitchedPuppet.load("neutral")
+    start = model.sample(np.random.default_rng(5), pose_scale=0.5)
+    vertices = model.vertices(start)
+    waves = 0.015 * np.sin(vertices @ [9.0, 7.0, 15.0])[:, None]
+    truth = vertices + waves * vertex_normals(vertices, model.faces)
+    cloud = Cloud.of(truth, vertex_normals(truth, model.faces))
+    refiner, none = Refiner(model), JointTargets.none(model)
+    firm = refiner.run(start, cloud, none, RefineWeights(sigma_start=0.05, sigma_end=0.05, iterations=6))
+    loose = refiner.run(firm, cloud, none, LOOSE)
+    apart = [two_way_distance(model.vertices(body), model.faces, cloud) for body in (start, firm, loose)]
+    assert apart[2] < apart[1] - 0.0001 < apart[0]
