@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.frames import axis_of, upright
 from flowing_puppet_ros.body.people import ExtractionSettings
 from flowing_puppet_ros.body.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.body.tracker import BodyTracker, BodyTrackerSettings
@@ -26,13 +27,6 @@ from flowing_puppet_ros.stream.shapes import make_deletions, make_mesh_marker, m
 from flowing_puppet_ros.stream.silhouettes import SilhouetteBodies
 from flowing_puppet_ros.stream.waiting import Line, Shelf
 
-# Rotation of the cloud's frame to one whose z axis points up, by the axis of the cloud's frame that does.
-_UPRIGHT = {
-    "z": np.eye(3),
-    "y": np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]),
-    "-y": np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
-}
-
 Progress = Callable[[float], None]
 
 
@@ -41,7 +35,7 @@ class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings, BodyTrackerSe
     """Settings of the fits, and of what the component reads and waits for."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
-    up: str = setting("z", "axis of the cloud's frame that points up (-y in optical frames)", choices=tuple(_UPRIGHT))
+    up: str = setting("z", "axis of the cloud's frame that points up (-y in optical frames)", choices=("z", "y", "-y"))
     view: str = setting("full", "cloud from all sides, or from one sensor at the frame's origin",
                         choices=("full", "single"))  # fmt: skip
     track: bool = setting(False, "follow one person through the clouds that come without initial joints")
@@ -109,7 +103,7 @@ class BodyFitterComponent(Component):
         With `track` the ones without `initial` go on from the last cloud's. Returns the BodyArray message and (id, fit)
         of each of its bodies, in the cloud's frame. InputError in one sentence when the cloud cannot be used.
         """
-        turn = _UPRIGHT[self._settings.up]
+        turn = upright(axis_of(self._settings.up))
         points, normals = decode_cloud(cloud)
         points, normals = points @ turn.T, None if normals is None else normals @ turn.T
         viewpoint = np.zeros(3) if self._settings.view == "single" else None
