@@ -16,7 +16,7 @@ from flowing_puppet_ros.body.bank import BodyBank
 from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.initial import sampled_bodies, turned_around
-from flowing_puppet_ros.body.judgement import Judgement, judged
+from flowing_puppet_ros.body.judgement import RELIABLY_UNCOVERED, Judgement, judged
 from flowing_puppet_ros.body.limbs import SINGLE_LIMBS, LimbSearch, limb_groups
 from flowing_puppet_ros.body.particles import Particles, particles_of
 from flowing_puppet_ros.body.points import part_points
@@ -34,6 +34,8 @@ from flowing_puppet_ros.settings import Settings, setting
 Progress = Callable[[float], None]
 # Steps of the finish of a hypothesis, and how many limbs that were searched anew are finished in a round.
 HYPOTHESIS_STEPS, LIMBS_FINISHED = 12, 3
+# Confidence of a part below which its limb may hang hidden.
+LIMB_OFF = 0.6
 # A limb hypothesis must be this much closer than the body that it came from, and none helps a body so many metres off.
 CLOSER, HOPELESS = 0.98, 0.06
 
@@ -149,7 +151,7 @@ class BodyFinder:
         for _ in range(self._settings.limb_rounds):
             if not body.judgement.doubtful or body.cost > HOPELESS:
                 break
-            states = [body.state, *self._limbs_moved(body.state, cloud, grid, rng)]
+            states = [body.state, *self._limbs_moved(body, cloud, grid, rng)]
             candidates = ordered(lambda state: self.candidate(state, cloud), states, self._threads)
             closest = min(candidates, key=lambda candidate: candidate.cost)
             if closest.cost > CLOSER * body.cost:
@@ -157,17 +159,24 @@ class BodyFinder:
             body = closest
         return body
 
-    def _limbs_moved(self, body: BodyState, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> list[BodyState]:
-        """The closest of the bodies with some of the limbs searched anew, and those with one limb as it usually is."""
+    def _limbs_moved(self, body: Candidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> list[BodyState]:
+        """The closest of the bodies with limbs searched anew, and those with a limb that is off as it usually hangs.
+
+        Several limbs at once are searched when much of the cloud is uncovered.
+        """
         groups = limb_groups(self._model.tree)
+        limbs = groups[:SINGLE_LIMBS]
+        if body.judgement.uncovered <= RELIABLY_UNCOVERED:
+            groups = limbs
         found = ordered(
-            lambda pair: self.limbs.run(body, pair[0], cloud, grid, pair[1]),
+            lambda pair: self.limbs.run(body.state, pair[0], cloud, grid, pair[1]),
             list(zip(groups, rng.spawn(len(groups)), strict=True)),
             self._threads,
         )
         bodies = [state for state in found if state is not None]
         bodies.sort(key=lambda state: two_way_distance(self._model.vertices(state), self._model.faces, cloud))
-        return bodies[:LIMBS_FINISHED] + [self.limbs.usual(body, limb) for limb in groups[:SINGLE_LIMBS]]
+        off = [limb for limb in limbs if body.judgement.part_confidence[list(limb)].min() < LIMB_OFF]
+        return bodies[:LIMBS_FINISHED] + [self.limbs.usual(body.state, limb) for limb in off]
 
 
 def part_of(progress: Progress, low: float, high: float) -> Progress:
