@@ -97,6 +97,16 @@ class Matches:
             )  # fmt: skip
         return Quadratic(matrix, vector)
 
+    def nearest(self, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far vertices (V, 3) and cloud are apart where opposite normals count as 6 cm more.
+
+        Returns:
+            Distances (V,) to the cloud, and for every looking cloud point its nearest vertex and the distance to it.
+        """
+        placed = _placed(vertices, vertex_normals(vertices, faces))
+        back, vertex = cKDTree(placed).query(self._placed[self._looking])
+        return self._tree.query(placed)[0], vertex, back
+
 
 def _placed(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     return np.hstack([points, TURN_LENGTH * normals])

@@ -11,11 +11,14 @@ from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.body.clip import near_limbs
 from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
+from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.finder import BodyFinder, FitterSettings, Progress, part_of
+from flowing_puppet_ros.body.hands import with_hands
 from flowing_puppet_ros.body.initial import body_from_joints, joint_targets
 from flowing_puppet_ros.body.judgement import judged
 from flowing_puppet_ros.body.nonrigid import FinishWeights, SurfaceFinish
 from flowing_puppet_ros.body.normals import estimated_normals, thinned
+from flowing_puppet_ros.body.refine import LOOSE
 from flowing_puppet_ros.body.view_cloud import VIEW_POINTS, ViewCloud
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud import CloudGrid, ExactCloud
@@ -96,6 +99,9 @@ class BodyFitter:
                 cloud = self.cloud(points, normals, viewpoint)
                 state = self._finder.find(cloud, rng, progress or _silent)
                 (progress or _silent)(1.0)
+                if not self._follows_surface(cloud):
+                    return self.result(state, cloud)
+                state = with_hands(self.model, self._finder.refiner, state, cloud)
                 return self._with_own_surface(self.result(state, cloud), cloud)
             return self._fit_from_joints(points, normals, initial, viewpoint, rng, progress or _silent)
 
@@ -156,11 +162,14 @@ class BodyFitter:
         progress(1.0)
         return self.result(body, cloud)
 
+    def _follows_surface(self, cloud: Cloud) -> bool:
+        """Whether a cloud is dense and whole enough for hands and vertices of their own."""
+        return self.settings.surface_finish and cloud.viewpoint is None and len(cloud.points) >= DENSE_CLOUD
+
     def _with_own_surface(self, fit: BodyFit, cloud: Cloud) -> BodyFit:
         """The fit with vertices that follow a dense whole cloud closer than the model can."""
-        if not self.settings.surface_finish or cloud.viewpoint is not None or len(cloud.points) < DENSE_CLOUD:
-            return fit
-        vertices = self._surface_finish.run(fit.vertices, cloud)
+        loose = self._finder.refiner.run(fit.state, cloud, JointTargets.none(self.model), LOOSE)
+        vertices = self._surface_finish.run(self.model.vertices(loose), cloud)
         distance = two_way_distance(vertices, self.model.faces, cloud)
         return replace(fit, vertices=vertices, two_way_distance=distance)
 
