@@ -13,6 +13,7 @@ import numpy as np
 from flowing_puppet_ros.evaluate.pcp import PosedSticks, Tally
 from flowing_puppet_ros.image.keypoints import joints_from_keypoints
 from flowing_puppet_ros.image.pose import Detector, PoseEstimator
+from flowing_puppet_ros.image.pose_answer import PosedPuppet
 from flowing_puppet_ros.image.pose_evidence import Found, Likelihood
 from flowing_puppet_ros.image.pose_settings import PoseSettings
 from flowing_puppet_ros.image.sticks import sticks_of
@@ -75,13 +76,7 @@ def measure_methods(
         tallies[DETECTOR].add(people, truths)
         for name, estimator in estimators.items():
             began = time.process_time()
-            posed = [
-                PosedSticks(
-                    sticks_of(model.joint_names, one.joints),
-                    np.stack([sticks_of(model.joint_names, solution.joints) for solution in one.solutions]),
-                )
-                for one in estimator.estimate(image)
-            ]
+            posed = [_posed(one, model) for one in estimator.estimate(image)]
             seconds[name] += time.process_time() - began
             tallies[name].add(posed, truths)
         count += 1
@@ -90,6 +85,11 @@ def measure_methods(
         name: tally.figures() | {"seconds an image": round(seconds[name] / max(count, 1), 3)}
         for name, tally in tallies.items()
     }
+
+
+def _posed(posed: PosedPuppet, model: DeformableStructures) -> PosedSticks:
+    solutions = [sticks_of(model.joint_names, solution.joints) for solution in posed.solutions]
+    return PosedSticks(sticks_of(model.joint_names, posed.joints), np.stack(solutions))
 
 
 def _detected(found: Found, model: DeformableStructures) -> PosedSticks:

@@ -17,12 +17,12 @@ from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
-from flowing_puppet_ros.image.pose_answer import PosedPuppet, Seen, answer, completed
+from flowing_puppet_ros.image.pose_answer import Outcome, PosedPuppet, Seen, completed
 from flowing_puppet_ros.image.pose_evidence import Found, GivenPerson, Likelihood, Window
 from flowing_puppet_ros.image.pose_parts import Particles, limited, particles_of
 from flowing_puppet_ros.image.pose_search import Person, PoseSearch
 from flowing_puppet_ros.image.pose_settings import PoseSettings
-from flowing_puppet_ros.image.pose_solutions import Solution, joint_confidence, searched_parts, solutions_of
+from flowing_puppet_ros.image.pose_solutions import joint_confidence, searched_parts, solutions_of
 from flowing_puppet_ros.image.tracker import letters
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_multiview import VIEW_HEADINGS, VIEW_NAMES, MultiViewStructures
@@ -138,22 +138,26 @@ class PoseEstimator:
         judged, result = search.run(start, person, rng)
         solutions = solutions_of(model, search, judged, person, self._settings.solutions)
         sure = joint_confidence(model, search, judged, result, person, solutions[0].joints)
-        probability = self._genders(solutions[0], (sure > 0).astype(float), person, seen)
+        outcome = Outcome(solutions, sure, person, seen, (image.shape[1], image.shape[0]), factor)
+        return self._answer(outcome, letters(self._settings.seed) + str(index + 1))
+
+    def _answer(self, outcome: Outcome, identity: str) -> PosedPuppet:
+        """The puppet of the most probable gender."""
+        seen = outcome.seen
+        probability = self._genders(outcome)
         chosen = int(probability.argmax())
         drawing = seen.models[chosen]
         if self._drawn:
-            drawing = self._drawn[chosen].views[len(VIEW_NAMES) // 2 if side is None else side]
+            drawing = self._drawn[chosen].views[len(VIEW_NAMES) // 2 if seen.side is None else seen.side]
         genders = {one.gender: float(value) for one, value in zip(seen.models, probability, strict=True)}
-        identity = letters(self._settings.seed) + str(index + 1)
-        size = image.shape[1], image.shape[0]
-        return answer(identity, drawing, solutions, sure, person, seen, genders, size, factor)
+        return outcome.drawn(identity, drawing, genders)
 
-    def _genders(self, best: Solution, known: Array, person: Person, seen: Seen) -> Array:
+    def _genders(self, outcome: Outcome) -> Array:
         """Probability of each model, by the energy of its puppet on the best pose."""
+        seen, person = outcome.seen, outcome.person
         energies = np.zeros(len(seen.models))
         for row, model in enumerate(seen.models if len(seen.models) > 1 else ()):
-            shape = completed(model, best.joints, known, best.scale, seen.view)
-            particles = particles_of([shape], model.bone, person.mirror)
+            particles = particles_of([outcome.puppet(model, outcome.solutions[0])], model.bone, person.mirror)
             energies[row] = self._search(model, seen.parts).energy(particles, person)
         weight = np.exp(energies.min() - energies)
         return np.asarray(weight / weight.sum())

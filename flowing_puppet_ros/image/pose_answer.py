@@ -61,60 +61,51 @@ class Seen:
     parts: tuple[int, ...]
 
 
-def answer(
-    identity: str,
-    model: DeformableStructures,
-    solutions: list[Solution],
-    sure: Array,
-    person: Person,
-    seen: Seen,
-    genders: dict[str, float],
-    size: tuple[int, int],
-    factor: float,
-) -> PosedPuppet:
-    """The puppet that `model` draws for the first of some solutions.
+@dataclass(frozen=True, slots=True, eq=False)
+class Outcome:
+    """What a search found.
 
-    Args:
-        identity: the person's id.
-        model: what draws; it may have more parts than the search had.
-        solutions: poses in pixels of the image that was searched, the best first.
-        sure: confidence (J,) of the joints, 0 where nothing was searched.
-        person: who was searched.
-        seen: from where.
-        genders: probability of each model.
-        size: width and height of the image that was searched.
-        factor: its size in units of the given image, in whose pixels the answer is.
+    `solutions` are in pixels of the image that was searched, the best first; `sure` (J,) is the confidence of the
+    joints, 0 where nothing was searched; `size` (width, height) that of the image and `factor` its size in units of the
+    given image, in whose pixels the answer is.
     """
-    best = solutions[0]
-    known = (sure > 0).astype(float)
-    shape = completed(model, best.joints, known, best.scale, seen.view)
-    extra = len(model.joint_names) - len(sure)
-    inside = ((shape.joints >= -0.5) & (shape.joints <= np.array(size) - 0.5)).all(axis=1)
-    confidence = np.where(known > 0, sure, GUESSED)
-    confidence = np.append(confidence, np.full(extra, GUESSED)) * person.found.confidence
-    depth = tuple(int(rank) for rank in np.argsort(depth_order(model, seen.view, seen.heading)))
-    placed = _rescaled(shape, factor)
-    others = tuple(
-        replace(
-            one,
-            joints=_unshrunk(completed(model, one.joints, known, one.scale, seen.view).joints, factor),
-            scale=one.scale / factor,
+
+    solutions: list[Solution]
+    sure: Array
+    person: Person
+    seen: Seen
+    size: tuple[int, int]
+    factor: float
+
+    def drawn(self, identity: str, model: DeformableStructures, genders: dict[str, float]) -> PosedPuppet:
+        """The puppet that `model`, which may have more parts than the search had, draws for the best solution."""
+        best = self.solutions[0]
+        shape = self.puppet(model, best)
+        depth = np.argsort(depth_order(model, self.seen.view, self.seen.heading))
+        placed = _rescaled(shape, self.factor)
+        others = tuple(
+            replace(
+                one,
+                joints=_unshrunk(self.puppet(model, one).joints, self.factor),
+                scale=one.scale / self.factor,
+            )
+            for one in self.solutions
         )
-        for one in solutions
-    )
-    return PosedPuppet(
-        identity,
-        model.name,
-        placed.joints,
-        np.clip(confidence * np.where(inside, 1.0, OUTSIDE), 0.0, 1.0),
-        placed.scale,
-        seen.view,
-        best.energy,
-        placed.contours,
-        depth,
-        others,
-        genders,
-    )
+        return PosedPuppet(
+            identity, model.name, placed.joints, self._confidence(shape.joints), placed.scale, self.seen.view,
+            best.energy, placed.contours, tuple(int(rank) for rank in depth), others, genders,
+        )  # fmt: skip
+
+    def puppet(self, model: DeformableStructures, solution: Solution) -> PuppetShape:
+        """The likely puppet of a model on the joints of a solution, in pixels of the image that was searched."""
+        return completed(model, solution.joints, (self.sure > 0).astype(float), solution.scale, self.seen.view)
+
+    def _confidence(self, joints: Array) -> Array:
+        """Confidence of the joints (J,2) of the model that draws, in [0, 1]."""
+        confidence = np.full(len(joints), GUESSED)
+        confidence[: len(self.sure)] = np.where(self.sure > 0, self.sure, GUESSED)
+        inside = ((joints >= -0.5) & (joints <= np.array(self.size) - 0.5)).all(axis=1)
+        return np.clip(confidence * self.person.found.confidence * np.where(inside, 1.0, OUTSIDE), 0.0, 1.0)
 
 
 def completed(model: DeformableStructures, joints: Array, confidence: Array, scale: float, view: View) -> PuppetShape:

@@ -51,21 +51,27 @@ def fit_views(sets: Sequence[TrainingSet], components: int) -> dict[str, Array]:
             else:
                 rows[-1].append(len(pairs))
                 pairs.append(fit_pair(training, turned, z, *edge))
-    statistics = [joint_statistics(training) for training in sets]
-    priors = [prior for prior, _, _ in statistics]
     arrays = _shape_arrays(tree.names, shapes) | {
         "torso_mean": np.stack([mean for mean, _ in torsos]),
         "torso_factor": np.stack([factor for _, factor in torsos]),
         "pair_of_view": np.array(rows),
         "pair_mean": np.stack([pair.mean for pair in pairs]),
         "pair_covariance": packed(np.stack([pair.covariance for pair in pairs])),
-        "joint_mean": np.stack([prior.mean for prior in priors]),
-        "joint_covariance": packed(np.stack([prior.covariance for prior in priors])),
-        "length_pairs": statistics[0][1],
-        "log_length": np.stack([length for _, _, length in statistics]),
         "prior": np.array([len(one.joints) for one in sets]) / len(everyone.joints),
     }
+    arrays |= _joint_arrays(sets)
     return {key: np.asarray(value, np.float32) for key, value in arrays.items()}
+
+
+def _joint_arrays(sets: Sequence[TrainingSet]) -> dict[str, Array]:
+    """The statistics of the joints in every view."""
+    priors, pairs, lengths = zip(*(joint_statistics(training) for training in sets), strict=True)
+    return {
+        "joint_mean": np.stack([prior.mean for prior in priors]),
+        "joint_covariance": packed(np.stack([prior.covariance for prior in priors])),
+        "length_pairs": pairs[0],
+        "log_length": np.stack(lengths),
+    }
 
 
 def _shape_arrays(names: Sequence[str], shapes: Sequence[PartShape]) -> dict[str, Array]:
