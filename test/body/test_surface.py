@@ -58,6 +58,16 @@ def test_normals_choose_the_right_side_of_a_thin_plate() -> None:
     assert closest_on_mesh(query, -down, vertices, faces).face[0] == 1
 
 
+def test_of_two_near_faces_the_parallel_one_is_taken() -> None:
+    ledge = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    wall = [[0.3, -1, -0.999], [0.3, 1, -0.999], [0.3, 0, 1.001]]
+    vertices, faces = np.array(ledge + wall, dtype=float), np.array([[0, 1, 2], [3, 4, 5]])
+    point, up, across = np.array([[0.297, 0.2, 0.0035]]), np.array([[0.0, 0.0, 2.0]]), np.array([[2.0, 0.0, 0.0]])
+    assert closest_on_mesh(point, None, vertices, faces).face[0] == 1
+    assert closest_on_mesh(point, up, vertices, faces).face[0] == 0
+    assert closest_on_mesh(point, across, vertices, faces).face[0] == 1
+
+
 def test_correspondence_follows_a_rigid_motion() -> None:
     vertices, faces = sphere()
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
