@@ -16,8 +16,9 @@ VIEW_POINTS = 4000
 """More points than that of one side add time and no accuracy."""
 NEAREST = 0.05
 """Metres before the sensor."""
-BEFORE = 0.01
-"""Metres before the seen surface up to which a vertex is left alone: noise."""
+BEFORE, NOISES, NOISE_NEIGHBOURS = 0.01, 2.5, 6
+"""Metres, and multiples of the noise, before the seen surface up to which a vertex is left alone. Noise that counted on
+one side only would push the body away from the sensor."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,9 +27,11 @@ class ViewCloud(Cloud):
 
     Attributes:
         view: the cloud as its sensor saw it.
+        before: metres before the seen surface up to which a vertex is left alone.
     """
 
     view: OneSidedView
+    before: float
 
     @classmethod
     def seen_from(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> ViewCloud:
@@ -43,7 +46,11 @@ class ViewCloud(Cloud):
                 f"the sensor at {np.round(viewpoint, 2).tolist()} m stands within the cloud and cannot have seen one"
                 " side of it; check the frame or fit it as a whole cloud"
             )
-        return cls(points, normals, cKDTree(points), viewpoint, OneSidedView.build(points, viewpoint))
+        tree = cKDTree(points)
+        near = points[tree.query(points, k=min(NOISE_NEIGHBOURS, len(points)))[1]]
+        noise = float(np.median(np.abs(((near - points[:, None]) * normals[:, None]).sum(axis=2)[:, 1:])))
+        view = OneSidedView.build(points, viewpoint)
+        return cls(points, normals, tree, viewpoint, view, max(BEFORE, NOISES * noise))
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Which vertices (V,) face the sensor and are not hidden by what it saw."""
@@ -62,7 +69,7 @@ class ViewCloud(Cloud):
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         across = beside - (beside * ray).sum(axis=1, keepdims=True) * ray
         inside = ~beside.any(axis=1)
-        depth = np.where(inside, np.minimum(behind + BEFORE, 0.0), 0.0)
+        depth = np.where(inside, np.minimum(behind + self.before, 0.0), 0.0)
         weight = _geman_mcclure((across**2).sum(axis=1), sigma) * ~inside / len(vertices)
         weight_along = _geman_mcclure(depth**2, sigma) * (depth < 0) / len(vertices)
         outer = ray[:, :, None] * ray[:, None, :]
