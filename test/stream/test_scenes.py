@@ -52,7 +52,7 @@ def test_ids_follow_people_who_move_leave_and_come(person: np.ndarray, floor: np
 def test_the_component_fits_everybody_or_nobody(person: np.ndarray, floor: np.ndarray) -> None:
     quick = BodyFitterSettings(
         scene=True, particles=4, iterations=1, local_particles=4, local_iterations=0, restarts=0, lm_steps=1,
-        refine_iterations=3, cloud_points=1000, surface_finish=False,
+        refine_iterations=3, cloud_points=1000, surface_finish=False, limb_rounds=0,
     )  # fmt: skip
     factory = BagMessageFactory()
     component = BodyFitterComponent(quick, factory)
