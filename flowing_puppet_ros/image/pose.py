@@ -101,7 +101,8 @@ class PoseEstimator:
     def _found(self, image: Array, keypoints: Sequence[Keypoints] | None, factor: float) -> Sequence[Found]:
         if keypoints is None:
             assert self._detector is not None
-            return self._detector.detect(np.ascontiguousarray(image))
+            found = self._detector.detect(np.ascontiguousarray(image))
+            return [one for turn, one in enumerate(found) if turn == 0 or one.confidence >= self._settings.others]
         model = self._front[0]
         width = np.ptp(model.mean_joints()[[model.joint_names.index(f"{s}_shoulder") for s in ("left", "right")], 0])
         people: list[Found] = []

@@ -257,3 +257,16 @@ def test_ten_people_and_half_people(joints: np.ndarray) -> None:
     )
     assert [person.id for person in people] == [f"a{k}" for k in range(1, 12)]
     assert all(np.isfinite(person.joints).all() for person in people)
+
+
+def test_doubtful_people_are_left_out_beside_a_sure_one(joints: np.ndarray) -> None:
+    sure, doubtful = (Guess(keypoints(joints), confidence) for confidence in (0.9, 0.3))
+    quick = PoseSettings(particles=12, iterations=1)
+    for people, settings, count in (
+        ((sure, doubtful), quick, 1),
+        ((doubtful,), quick, 1),
+        ((sure, sure), quick, 2),
+        ((sure, doubtful), replace(quick, others=0.2), 2),
+    ):
+        found = PoseEstimator([MODEL], GuessingDetector(people), None, settings).estimate(painted(joints))
+        assert len(found) == count
