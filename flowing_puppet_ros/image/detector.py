@@ -19,8 +19,9 @@ from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.detector_forest import Forest
-from flowing_puppet_ros.image.detector_parts import PARTS, PartFilters, window_at
+from flowing_puppet_ros.image.detector_parts import PARTS, PartFilters, Window, window_at
 from flowing_puppet_ros.image.detector_person import FoundPose, PersonDetection
+from flowing_puppet_ros.image.detector_rank import Ranking, agreed_scale, best_places
 from flowing_puppet_ros.image.detector_root import Candidate, RootFilters, resize
 from flowing_puppet_ros.image.detector_search import choose, propose
 from flowing_puppet_ros.image.detector_tree import PartTree, best_placement, upward
@@ -31,8 +32,6 @@ type Doubles = NDArray[np.float64]
 
 WEIGHTS = "upper"
 LEAST_SIDE = 8  # px; nothing is found in a smaller image
-TELLING = [PARTS.index(name) for name in ("neck", "face", "right_shoulder", "left_shoulder")]
-SAME_PLACE = 0.5  # units of S between necks of which only the better is kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +44,7 @@ class DetectorSettings(Settings):
     largest_side: int = setting(720, "images are shrunk to this longer side", unit="px", low=64, high=4096)
     places: int = setting(12, "places where a pose is sought", low=1, high=80)
     most_people: int = setting(8, "people to report", low=1, high=80)
-    least_confidence: float = setting(0.1, "probability below which nobody is reported", low=0.0, high=1.0)
+    least_confidence: float = setting(0.03, "probability below which nobody is reported", low=0.0, high=1.0)
 
 
 DEFAULTS = DetectorSettings()
@@ -53,16 +52,12 @@ DEFAULTS = DetectorSettings()
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartDetector:
-    """Learned filters and trees and the calibration of their scores.
-
-    `weight` (9,) and `bias` give the log-odds of a person from the measures of a pose.
-    """
+    """Learned filters and trees, and how to rank the poses that they find."""
 
     root: RootFilters
     forest: Forest
     parts: PartFilters
-    weight: Doubles
-    bias: float
+    ranking: Ranking
 
     @classmethod
     def load(cls, name: str = WEIGHTS) -> Self:
@@ -77,8 +72,8 @@ class PartDetector:
         forest = Forest(arrays["tree_features"], arrays["tree_thresholds"], single["tree_leaves"])
         parents, first = (np.asarray(arrays[name], np.int64) for name in ("parents", "first"))
         tree = PartTree(parents, first, single["anchor"], single["spring"], single["type_bias"])
-        weight = np.asarray(arrays["weight"], np.float64)
-        return cls(root, forest, PartFilters(single["part_filters"], tree), weight, float(arrays["bias"]))
+        rank = Ranking(*(np.asarray(arrays[name], np.float64) for name in ("rank_weight", "rank_scale", "rank_odds")))
+        return cls(root, forest, PartFilters(single["part_filters"], tree), rank)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays for an .npz file; filters in half precision."""
@@ -96,8 +91,9 @@ class PartDetector:
             "anchor": tree.anchor,
             "spring": tree.spring,
             "type_bias": tree.bias,
-            "weight": self.weight,
-            "bias": np.array(self.bias),
+            "rank_weight": self.ranking.weight,
+            "rank_scale": self.ranking.scale,
+            "rank_odds": self.ranking.odds,
         }
 
     def detect(self, image: NDArray[np.uint8], settings: DetectorSettings = DEFAULTS) -> list[PersonDetection]:
@@ -113,15 +109,24 @@ class PartDetector:
         smallest = max(settings.smallest * factor, max(small.shape[:2]) / 20 if settings.smallest == 0 else 8.0)
         # Several BLAS threads would sum in another order, and people who run many nodes have no cores to spare.
         with threadpool_limits(1):
-            poses = self.look(small, smallest, settings.places)
-        ranked = sorted(poses, key=lambda pose: -self.log_odds(pose))
+            return self._people(small, smallest, factor, settings)
+
+    def _people(
+        self, image: NDArray[np.uint8], smallest: float, factor: float, settings: DetectorSettings
+    ) -> list[PersonDetection]:
+        """The people in an image that is `factor` times as large as the given one."""
+        poses = self.look(image, smallest, settings.places)
+        scores = self.ranking.scores(poses)
         people: list[PersonDetection] = []
-        for pose in ranked:
-            person = PersonDetection(self.parts, pose, 1 / (1 + float(np.exp(-self.log_odds(pose)))), factor)
-            if person.confidence < settings.least_confidence or len(people) == settings.most_people:
+        for index in best_places(poses, scores)[: settings.most_people]:
+            confidence = self.ranking.probability(float(scores[index]))
+            if confidence < settings.least_confidence:
                 break
-            if not any(_same(person, other) for other in people):
-                people.append(person)
+            pose = poses[index]
+            scale = self.ranking.corrected_scale(pose, agreed_scale(poses, scores, index))
+            places = dict(zip(PARTS, pose.points, strict=True))
+            again = self.pose_in(window_at(image, tuple(places["neck"]), tuple(places["face"]), scale), pose.measures)
+            people.append(PersonDetection(self.parts, again, confidence, factor))
         return people
 
     def look(self, image: NDArray[np.uint8], smallest: float, places: int) -> list[FoundPose]:
@@ -132,18 +137,16 @@ class PartDetector:
     def pose_at(self, image: NDArray[np.uint8], candidate: Candidate, look: float) -> FoundPose:
         """The best pose around a candidate to which the trees gave the score `look`."""
         window = window_at(image, candidate.neck, candidate.face, candidate.scale)
-        unary = self.parts.unary(window)
-        beliefs = upward(self.parts.tree, unary)
-        placement = best_placement(self.parts.tree, beliefs)
-        layer, x, y = placement.T
         relative = np.log(candidate.scale / max(image.shape[:2]))
-        total = float(beliefs.up[tuple(placement[0, [0, 2, 1]])])
-        measures = [candidate.score, look, relative, total, window.outside, *unary[layer, y, x][TELLING]]
-        return FoundPose(window, beliefs, placement, np.array(measures, np.float64))
+        pose = self.pose_in(window, np.zeros(0))
+        layer, x, y = pose.placement[0]
+        measures = np.array([candidate.score, look, relative, pose.beliefs.up[layer, y, x], window.outside])
+        return FoundPose(window, pose.beliefs, pose.placement, measures)
 
-    def log_odds(self, pose: FoundPose) -> float:
-        """Log-odds that a pose is that of a person."""
-        return float(self.weight @ pose.measures) + self.bias
+    def pose_in(self, window: Window, measures: Doubles) -> FoundPose:
+        """The best pose in a window, with measures that are known already."""
+        beliefs = upward(self.parts.tree, self.parts.unary(window))
+        return FoundPose(window, beliefs, best_placement(self.parts.tree, beliefs), measures)
 
 
 def checked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -153,9 +156,3 @@ def checked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     if image.ndim != 2 and not (image.ndim == 3 and image.shape[2] == 3):
         raise InputError(f"an image to look for people in is (H, W) or (H, W, 3), this one is {image.shape}")
     return image
-
-
-def _same(a: PersonDetection, b: PersonDetection) -> bool:
-    """Whether two detections are of one person."""
-    distance = float(np.linalg.norm(a.neck - b.neck))
-    return distance < SAME_PLACE * max(a.scale, b.scale)

@@ -27,12 +27,22 @@ NEAR = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundPose:
-    """The best placement (P, 3) in a window, the upward beliefs, and the measures (4,) of how sure it is."""
+    """The best placement (P, 3) in a window, the upward beliefs, and the measures (5,) of how sure it is."""
 
     window: Window
     beliefs: Beliefs
     placement: NDArray[np.int64]
     measures: Doubles
+
+    @property
+    def scale(self) -> float:
+        """S of the window, px of the image that was looked at."""
+        return CELLS_PER_SCALE * self.window.cell
+
+    @property
+    def points(self) -> Doubles:
+        """The parts (P, 2) px of the image that was looked at."""
+        return self.window.points_of(self.placement[:, 1:].astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +61,7 @@ class PersonDetection:
     @property
     def scale(self) -> float:
         """S: the shoulder width in px, of somebody seen from the side what it would be from the front."""
-        return CELLS_PER_SCALE * self.pose.window.cell / self.factor
+        return self.pose.scale / self.factor
 
     @property
     def neck(self) -> Doubles:

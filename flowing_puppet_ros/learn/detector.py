@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,19 +12,18 @@ import numpy as np
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.detector import PartDetector
-from flowing_puppet_ros.image.detector_parts import PARTS
-from flowing_puppet_ros.learn.calibration import logistic
+from flowing_puppet_ros.image.detector_rank import Ranking
 from flowing_puppet_ros.learn.detector_data import Example
 from flowing_puppet_ros.learn.detector_forest import learn_forest
 from flowing_puppet_ros.learn.detector_parts import learn_parts
+from flowing_puppet_ros.learn.detector_ranking import learn_ranking
 from flowing_puppet_ros.learn.detector_root import learn_root
 from flowing_puppet_ros.settings import Settings, setting
 
 type Array = np.ndarray[Any, Any]
 
-MEASURES = 9
-FOUND_NECK, FOUND_SCALE = 0.5, 1.25  # units of S and ratio: a pose this close to the person has found them
 PLACES = 12
+RANKED = 60  # held-out people, about, that the ranking is learned on
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,28 +60,15 @@ def learn(examples: Sequence[Example], settings: LearnDetectorSettings, report: 
     root = learn_root(kept, settings.seed, report)
     forest = learn_forest(kept, root, settings.trees, settings.seed + 1, report)
     parts = learn_parts(kept, settings.steps, settings.seed + 2, report)
-    weight, bias, found = calibrate(PartDetector(root, forest, parts, np.zeros(MEASURES), 0.0), others)
-    return Learned(PartDetector(root, forest, parts, weight, bias), len(kept), len(others), found)
+    detector = PartDetector(root, forest, parts, Ranking(np.zeros(5), np.zeros(4), np.zeros(2)))
+    ranking, found = rank(detector, others)
+    return Learned(PartDetector(root, forest, parts, ranking), len(kept), len(others), found)
 
 
-def calibrate(detector: PartDetector, examples: Sequence[Example]) -> tuple[Array, float, float]:
-    """Weights (9,) and bias of the log-odds, and the share of people whom the surest pose then finds."""
-    measures, right, image = [], [], []
-    for index, example in enumerate(examples):
+def rank(detector: PartDetector, examples: Sequence[Example]) -> tuple[Ranking, float]:
+    """Learn the ranking on about RANKED of the examples; also the share of them whom the best poses find."""
+    poses = []
+    for example in examples[:: math.ceil(len(examples) / RANKED)]:
         smallest = max(8.0, max(example.image.shape[:2]) / 20)
-        for pose in detector.look(example.image, smallest, PLACES):
-            neck = pose.window.points_of(pose.placement[PARTS.index("neck"), 1:].astype(np.float64))
-            ratio = 10 * pose.window.cell / example.scale
-            near = np.linalg.norm(neck - example.joint("neck")) < FOUND_NECK * example.scale
-            measures.append(pose.measures)
-            right.append(bool(near) and 1 / FOUND_SCALE < ratio < FOUND_SCALE)
-            image.append(index)
-    if not any(right) or all(right):
-        raise InputError(
-            f"of {len(right)} places in the held-out images {sum(right)} show an annotated person; annotate more images"
-        )
-    values, truth, of_image = np.array(measures), np.array(right), np.array(image)
-    weight, bias = logistic(values, truth)
-    odds = values @ weight + bias
-    best = [truth[of_image == i][odds[of_image == i].argmax()] for i in np.unique(of_image)]
-    return weight, bias, float(np.sum(best)) / len(examples)
+        poses.append((example, detector.look(example.image, smallest, PLACES)))
+    return learn_ranking(poses)

@@ -41,6 +41,7 @@ BIAS_RATE, TYPE_RATE = 3.0, 20.0  # times RATE
 BATCH = 8
 LOSS_CELLS = 4.0  # an error of so many cells costs as much as any larger one
 NEGATIVE_SHARE = 0.3
+BACKGROUND = 40  # patches of an example for the covariance
 PLACE_JITTER, FACE_JITTER, SCALE_JITTER = 0.08, 0.06, 0.1  # as large as errors of the head-and-shoulders filters
 
 
@@ -92,9 +93,8 @@ def learn_parts(examples: Sequence[Example], steps: int, seed: int, report: Call
     """Learn types, springs and filters from the examples in `steps` steps of BATCH windows."""
     rng = np.random.default_rng(seed)
     types = PartTypes.learn(examples, rng)
-    start = [show(example, types, rng) for example in examples]
-    model = _Machine(types, start, rng)
-    report(f"parts: {types.tree.first[-1]} filters from {len(start)} people")
+    model = _Machine(types, [show(example, types, rng) for example in examples], rng)
+    report(f"parts: {types.tree.first[-1]} filters from {len(examples)} people")
     order = np.concatenate([rng.permutation(len(examples)) for _ in range(steps * BATCH // len(examples) + 1)])
     loss = 0.0
     for step in range(steps):
@@ -114,19 +114,20 @@ class _Machine:
 
     def __init__(self, types: PartTypes, shown: Sequence[Shown], rng: np.random.Generator) -> None:
         """Start with whitened means of the patches around the parts of the examples shown."""
-        patches = [_patches(one.window) for one in shown]
-        background = np.concatenate([p[rng.integers(0, ROWS, 40), rng.integers(0, COLUMNS, 40)] for p in patches])
-        self.mean = background.mean(axis=0)
-        centred = background - self.mean
-        covariance = centred.T @ centred / len(centred) + RIDGE * np.eye(centred.shape[1])
-        self.whiten = cho_factor(covariance)
         layers = int(types.tree.first[-1])
-        sums, counts = np.zeros((layers, len(self.mean))), np.zeros(layers)
-        for one, around in zip(shown, patches, strict=True):
+        size = FILTER * FILTER * shown[0].window.features.shape[2]
+        sums, counts, background = np.zeros((layers, size)), np.zeros(layers), []
+        for one in shown:
+            around = _patches(one.window)
+            background.append(around[rng.integers(0, ROWS, BACKGROUND), rng.integers(0, COLUMNS, BACKGROUND)])
             for layer, x, y in one.truth[one.seen]:
-                sums[layer] += around[y, x]
+                sums[layer] += around[y, x].ravel()
                 counts[layer] += 1
-        means = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None] - self.mean, 0.0)
+        behind = np.concatenate(background).reshape(-1, size)
+        mean = behind.mean(axis=0)
+        centred = behind - mean
+        self.whiten = cho_factor(centred.T @ centred / len(centred) + RIDGE * np.eye(size))
+        means = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None] - mean, 0.0)
         self.weights = (START * cho_solve(self.whiten, means.T).T).astype(np.float32)
         self.tree = types.tree
         self.bias = types.tree.bias.astype(np.float64).copy()
@@ -209,9 +210,9 @@ class _Machine:
 
 
 def _patches(window: Window) -> Array:
-    """All patches (ROWS, COLUMNS, 25 * D) that the filters see."""
+    """All patches (ROWS, COLUMNS, 5, 5, D) that the filters see, a view of the padded features."""
     views = np.lib.stride_tricks.sliding_window_view(pad_window(window.features), (FILTER, FILTER), axis=(0, 1))
-    return views.transpose(0, 1, 3, 4, 2).reshape(ROWS, COLUMNS, -1)
+    return views.transpose(0, 1, 3, 4, 2)
 
 
 def _losses(one: Shown, tree: PartTree) -> Array:

@@ -94,8 +94,8 @@ def _random_negatives(example: Example, rng: np.random.Generator) -> Array:
     found = []
     for _ in range(2):
         at = level(example.image, example.scale * STEP ** rng.integers(LEVELS_AROUND.start, LEVELS_AROUND.stop))
-        rows: Array = rng.integers(0, max(1, at.features.shape[0] - ROWS + 1), NEGATIVES // 2)
-        columns: Array = rng.integers(0, max(1, at.features.shape[1] - COLUMNS + 1), NEGATIVES // 2)
+        rows = rng.integers(0, max(1, at.features.shape[0] - ROWS + 1), NEGATIVES // 2)
+        columns = rng.integers(0, max(1, at.features.shape[1] - COLUMNS + 1), NEGATIVES // 2)
         near = _near_person(example, at, rows, columns)
         found += [_window(at, int(r), int(c)) for r, c in zip(rows[~near], columns[~near], strict=True)]
     return np.array(found, np.float32).reshape(-1, ROWS * COLUMNS * 32)
@@ -109,8 +109,8 @@ def _hard_negatives(example: Example, root: RootFilters, rng: np.random.Generato
         scores = (respond(at.features, root.filters) + root.bias).max(axis=2)
         if not scores.size:
             continue
-        rows, columns = np.indices(scores.shape)
-        scores[_near_person(example, at, rows, columns)] = -np.inf
+        grid = np.indices(scores.shape)
+        scores[_near_person(example, at, grid[0], grid[1])] = -np.inf
         for _ in range(NEGATIVES // 2):
             row, column = np.unravel_index(scores.argmax(), scores.shape)
             if scores[row, column] < -1:
