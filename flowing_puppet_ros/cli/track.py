@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Track people in a video, a folder of frames or a bag: joints, part outlines and depth order in every frame.
 
-People start at the keypoints of --init, are carried by optical flow, and are pulled back wherever keypoints are given
-again. A bag brings its own detections. At the end joints are smoothed along the flow, over the whole input, unless
---live is given.
+The keypoints of --init or of a bag say where people are, otherwise the detector of this package; optical flow carries
+them on. At the end the hypotheses of the arms are joined and the joints smoothed along the flow, over the whole input,
+unless --live is given.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,19 +20,26 @@ from typing import Any
 from tqdm import tqdm
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import FlowSettings
+from flowing_puppet_ros.image.arm_path import PathSettings
+from flowing_puppet_ros.image.arms import Sight
 from flowing_puppet_ros.image.clip import Clip
+from flowing_puppet_ros.image.detector import PartDetector
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.tracks import puppet_entry, read_keypoints, write_tracks
 from flowing_puppet_ros.image.video import Frame, open_frames
+from flowing_puppet_ros.image.video_tracker import DetectionSettings, VideoTracker
 from flowing_puppet_ros.model.ds import DeformableStructures
 
 BAG_SUFFIXES = frozenset({".mcap", ".db3"})
 
 type Detected = tuple[Frame, list[Keypoints] | None]
+type Stepped = tuple[TrackResult, dict[str, Sight] | None]
+type Stepper = Callable[[Frame, list[Keypoints] | None], Stepped]
 type Tracked = tuple[int, int, str, list[TrackedPuppet]]  # index, stamp, path of a frame, and its people
 
 
@@ -40,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this verb."""
     parser.add_argument("input", help="video file, folder of images, or bag (.mcap, .db3 or a rosbag2 folder)")
     parser.add_argument("--out", required=True, help="tracks.json to write")
-    parser.add_argument("--init", help="keypoints.json, people of one or more frames; needed unless a bag has them")
+    parser.add_argument("--init", help="keypoints.json, people of one or more frames, instead of the detector")
     parser.add_argument("--topic", default="", help="image topic of a bag [the first camera with detections]")
     parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated .mcap")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
@@ -49,6 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--live", action="store_true", help="use no frame after the one on show, as the nodes do")
     TrackerSettings.add_arguments(parser)
     FlowSettings.add_arguments(parser)
+    DetectionSettings.add_arguments(parser)
+    PathSettings.add_arguments(parser)
     SmoothingSettings.add_arguments(parser)
 
 
@@ -56,19 +65,29 @@ def run(arguments: argparse.Namespace) -> int:
     """Track through the whole input and write the tracks."""
     model = DeformableStructures.load(arguments.model, arguments.parts)
     settings = TrackerSettings.from_arguments(arguments), FlowSettings.from_arguments(arguments)
-    smoothing = SmoothingSettings.from_arguments(arguments)
+    clip = Clip(model, SmoothingSettings.from_arguments(arguments), PathSettings.from_arguments(arguments))
     tracker = FlowingPuppetTracker(model, *settings)
-    detected, fps, count = _open(arguments)
+    source = _open(arguments)
     tally = _Tally()
-    steps = _tracked(tracker, tqdm(detected, total=count or None, unit="frame", disable=None))
-    people = _live(steps) if arguments.live else _whole(steps, Clip(model, smoothing))
+    shown = tqdm(source.frames, total=source.count or None, unit="frame", disable=None)
+    steps = _tracked(_stepper(arguments, tracker, source.given), shown)
+    people = _live(steps) if arguments.live else _whole(steps, clip)
     began = time.monotonic()
-    write_tracks(arguments.out, model.joint_names, fps, tally.counted(_entries(people, model)))
+    write_tracks(arguments.out, model.joint_names, source.fps, tally.counted(_entries(people, model)))
     if not tally.frames:
         Path(arguments.out).unlink(missing_ok=True)
         raise InputError(f"{arguments.input} has no image that can be used")
     _summarise(arguments, tally, time.monotonic() - began)
     return 0
+
+
+def _stepper(arguments: argparse.Namespace, tracker: FlowingPuppetTracker, given: bool) -> Stepper:
+    """What steps the tracker: with the keypoints that are `given`, or with the detector."""
+    if given:
+        return lambda frame, detections: (tracker.step(frame.image, frame.stamp_ns, detections), None)
+    likelihood, settings = PartLikelihood.load(arguments.parts), DetectionSettings.from_arguments(arguments)
+    video = VideoTracker(tracker, PartDetector.load(), likelihood, settings)
+    return lambda frame, detections: video.step(frame.image, frame.stamp_ns)
 
 
 @dataclass
@@ -87,12 +106,12 @@ class _Tally:
             yield entry
 
 
-def _tracked(tracker: FlowingPuppetTracker, detected: Iterable[Detected]) -> Iterator[tuple[Frame, TrackResult]]:
+def _tracked(step: Stepper, detected: Iterable[Detected]) -> Iterator[tuple[Frame, Stepped]]:
     """Step through the frames; one that cannot be used is warned of and left out."""
     last = ""
     for frame, detections in detected:
         try:
-            result = tracker.step(frame.image, frame.stamp_ns, detections)
+            result, sights = step(frame, detections)
         except InputError as error:
             _warn(f"frame {frame.index}: {error}")
             continue
@@ -100,18 +119,18 @@ def _tracked(tracker: FlowingPuppetTracker, detected: Iterable[Detected]) -> Ite
             if warning != last:
                 _warn(f"frame {frame.index}: {warning}")
             last = warning
-        yield frame, result
+        yield frame, (result, sights)
 
 
-def _live(steps: Iterable[tuple[Frame, TrackResult]]) -> Iterator[Tracked]:
-    for frame, result in steps:
+def _live(steps: Iterable[tuple[Frame, Stepped]]) -> Iterator[Tracked]:
+    for frame, (result, _) in steps:
         yield frame.index, frame.stamp_ns, frame.path, result.puppets
 
 
-def _whole(steps: Iterable[tuple[Frame, TrackResult]], clip: Clip) -> Iterator[Tracked]:
+def _whole(steps: Iterable[tuple[Frame, Stepped]], clip: Clip) -> Iterator[Tracked]:
     seen = []
-    for frame, result in steps:
-        clip.add(result)
+    for frame, (result, sights) in steps:
+        clip.add(result, sights)
         seen.append((frame.index, frame.stamp_ns, frame.path))
     for (index, stamp_ns, path), puppets in zip(seen, clip.people(), strict=True):
         yield index, stamp_ns, path, puppets
@@ -128,8 +147,18 @@ def _warn(sentence: str) -> None:
     print(f"flowing-puppet track: {sentence}", file=sys.stderr)
 
 
-def _open(arguments: argparse.Namespace) -> tuple[Iterable[Detected], float, int]:
-    """The input's frames with the keypoints given for them, its frame rate and its number of frames (0 unknown)."""
+@dataclass(frozen=True)
+class _Source:
+    """Frames with the keypoints `given` for them (or none at all), their rate and number (0 unknown)."""
+
+    frames: Iterable[Detected]
+    fps: float
+    count: int
+    given: bool
+
+
+def _open(arguments: argparse.Namespace) -> _Source:
+    """The input's frames with the keypoints that it or --init has."""
     path, init, out = Path(arguments.input), arguments.init, Path(arguments.out)
     if out.resolve() in {Path(name).resolve() for name in (path, init) if name}:
         raise InputError(f"{out} is an input itself: name another output")
@@ -139,17 +168,15 @@ def _open(arguments: argparse.Namespace) -> tuple[Iterable[Detected], float, int
         from flowing_puppet_ros.bag.frames import open_bag_frames
 
         bag = open_bag_frames(path, arguments.topic, arguments.salvage, _warn)
-        if keypoints is None and not bag.detections:
-            raise InputError(f"{path} has no detections beside {bag.topic}; give keypoints of one image with --init")
         if keypoints is None:
-            return bag, bag.fps, bag.count
+            return _Source(bag, bag.fps, bag.count, bool(bag.detections))
         _check_reach(keypoints, bag.count, arguments)
-        return ((frame, keypoints.get(frame.index)) for frame, _ in bag), bag.fps, bag.count
+        return _Source(((frame, keypoints.get(frame.index)) for frame, _ in bag), bag.fps, bag.count, True)
     source = open_frames(path)
     if keypoints is None:
-        raise InputError(f"{path} says nothing about where people are; give keypoints of one frame with --init")
+        return _Source(((frame, None) for frame in source), source.fps, source.count, False)
     _check_reach(keypoints, source.count, arguments)
-    return ((frame, keypoints.get(frame.index)) for frame in source), source.fps, source.count
+    return _Source(((frame, keypoints.get(frame.index)) for frame in source), source.fps, source.count, True)
 
 
 def _check_reach(keypoints: dict[int, list[Keypoints]], count: int, arguments: argparse.Namespace) -> None:

@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """A whole clip at once: the tracker runs through it, then every person's joints are smoothed along the flow.
 
+Where a detector offers several hypotheses of the arms, the path that the flow agrees with is taken first.
+
 The images are seen once; what is kept of an image is some hundred numbers a person, however large the image is.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flowing_puppet_ros.image.arm_path import PathSettings
+from flowing_puppet_ros.image.arms import ENDS, SIDES, ArmHistory, Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings, joint_motion, smoothed
 from flowing_puppet_ros.image.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds import DeformableStructures
@@ -37,11 +41,13 @@ class Clip:
 
     model: DeformableStructures
     settings: SmoothingSettings
+    path: PathSettings = field(default_factory=PathSettings)
     images: int = 0
     _tracks: dict[str, list[_Moment]] = field(default_factory=lambda: defaultdict(list))
+    _arms: dict[str, ArmHistory] = field(default_factory=dict)
 
-    def add(self, result: TrackResult) -> None:
-        """Take the result of the next image."""
+    def add(self, result: TrackResult, sights: Mapping[str, Sight] | None = None) -> None:
+        """Take the result of the next image, and the `sights` of all its people where a detector has hypotheses."""
         for puppet in result.puppets:
             track = self._tracks[puppet.id]
             count = len(puppet.joints)
@@ -49,6 +55,9 @@ class Clip:
             if result.flow is not None and track and track[-1].image == self.images - 1:
                 before, after = _place(track[-1].puppet), _place(puppet)
                 motion, trust = joint_motion(result.flow, result.grid, before, after)
+            if sights is not None:
+                history = self._arms.setdefault(puppet.id, ArmHistory(self.path))
+                history.add(sights[puppet.id], result.flow if track else None, result.grid)
             energy = self.model.energy(puppet.shape)
             bare = replace(puppet, contours=(), shape=replace(puppet.shape, contours=()))
             track.append(_Moment(self.images, bare, energy, motion, trust))
@@ -56,7 +65,7 @@ class Clip:
 
     def people(self) -> Iterator[list[TrackedPuppet]]:
         """The people of each image, in the order of the images."""
-        joints = {identity: self._smoothed(track) for identity, track in self._tracks.items()}
+        joints = {identity: self._smoothed(identity, track) for identity, track in self._tracks.items()}
         at = dict.fromkeys(self._tracks, 0)
         for image in range(self.images):
             found = []
@@ -67,22 +76,37 @@ class Clip:
                     at[identity] = k + 1
             yield found
 
-    def _smoothed(self, track: list[_Moment]) -> Floats:
+    def _smoothed(self, identity: str, track: list[_Moment]) -> Floats:
         """Joints (T, J, 2) of one person, whose images are consecutive."""
         start = np.array([moment.puppet.joints for moment in track])
+        scale = float(np.median([moment.puppet.scale for moment in track]))
         unknown = np.full((start.shape[1], 3), np.nan)
         detected = np.array([unknown if m.puppet.detected is None else m.puppet.detected for m in track])
-        confidence = np.where(np.isfinite(detected).all(axis=2), detected[..., 2], 0.0)
         motion, trust = np.array([m.motion for m in track[1:]]), np.array([m.trust for m in track[1:]])
+        if identity in self._arms:
+            self._resolve_arms(self._arms[identity], detected, motion, scale)
+        confidence = np.where(np.isfinite(detected).all(axis=2), detected[..., 2], 0.0)
         if len(track) < 2 or not (confidence > 0).any():
             return start
         places = np.where(confidence[..., None] > 0, detected[..., :2], np.nan)
-        scale = float(np.median([moment.puppet.scale for moment in track]))
         joints = smoothed(places, confidence, motion, trust, start, scale, self.settings)
         # The body model has placed what nobody ever saw; along the flow alone it would drift.
         never = ~(confidence > 0).any(axis=0)
         joints[:, never] = start[:, never]
         return joints
+
+    def _resolve_arms(self, arms: ArmHistory, detected: Floats, motion: Floats, scale: float) -> None:
+        """Put the arms of the best path into the detected joints (T, J, 3) and their motion (T-1, J, 2)."""
+        mean = self.model.mean_joints()
+        ends = [self.model.joint_names.index(f"{side}_shoulder") for side in SIDES]
+        width = scale * float(np.linalg.norm(mean[ends[0]] - mean[ends[1]]))
+        for side, arm in arms.resolved(width).items():
+            for k, name in enumerate(ENDS):
+                joint = self.model.joint_names.index(f"{side}_{name}")
+                detected[:, joint, :2] = arm.places[:, k]
+                detected[:, joint, 2] = arm.sure
+                if len(motion):
+                    motion[:, joint] = arm.motion[:-1, k]
 
     def _puppet(self, moment: _Moment, joints: Floats) -> TrackedPuppet:
         puppet = moment.puppet

@@ -49,8 +49,8 @@ class Person:
 
     `mean` (J, 2), isotropic `variance` (J,) px^2, `quality` (J,) of the detections behind each joint, `doubted`
     (J, 2) last detected place that the gate refused (NaN none), `doubts` (J,) how often in a row it stood there,
-    `age` (J,) how many images ago a detection was last taken, and `detected` (J, 3) this image's detection as x, y and
-    confidence, or None.
+    `age` (J,) how many images ago a detection was last taken, `detected` (J, 3) this image's detection as x, y and
+    confidence, or None, and `detection` its index among the detections.
     """
 
     id: str
@@ -63,6 +63,7 @@ class Person:
     scale: float
     view: View
     detected: Floats | None = None
+    detection: int | None = None
     votes: float = 0.0
     unseen: int = 0
     missed: int = 0
@@ -85,8 +86,8 @@ class Person:
         nowhere = np.full((count, 2), np.nan)
         doubts, age = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
         detected = np.column_stack([joints, confidence])
-        state = identity, joints.copy(), variance, confidence.copy(), nowhere, doubts, age, scale, view, detected, votes
-        person = cls(*state)
+        state = identity, joints.copy(), variance, confidence.copy(), nowhere, doubts, age, scale, view
+        person = cls(*state, detected=detected, votes=votes)
         person.settle(model)
         return person
 

@@ -43,7 +43,7 @@ class TrackedPuppet:
     `joints` (J, 2) in the order of the model's joint_names, `confidence` (J,) in [0, 1], `scale` px/m, `view` front or
     back, `contours` one (K_i, 2) a part, `depth` (P,) paint order of each part, 0 farthest, `energy` the negative log
     of the body prior, the flow's misfit and the distance of the detection (up to a constant; lower is better),
-    `detected` (J, 3) what this image's detection says, x, y and confidence, or None.
+    `detected` (J, 3) what this image's detection says, x, y and confidence, or None, and `detection` its index.
     """
 
     id: str
@@ -57,6 +57,7 @@ class TrackedPuppet:
     depth: tuple[int, ...]
     shape: PuppetShape
     detected: Floats | None
+    detection: int | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,7 +176,7 @@ class FlowingPuppetTracker:
         for person in self.people:
             person.unseen += 1
             person.detection_energy = 0.0
-            person.detected = None
+            person.detected = person.detection = None
         if detections is None:
             return
         found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
@@ -186,11 +187,12 @@ class FlowingPuppetTracker:
                 person.fuse(*found[matched[index]], self.settings)
                 person.update_scale_and_view(self.model)
                 person.unseen = person.missed = 0
+                person.detection = matched[index]
         # The surest new person comes first: it gets the lower id, and a place when there is only one left.
         for index in sorted(free, key=lambda k: -found[k][1].sum()):
-            self._start(found[index], warnings)
+            self._start(index, found[index], warnings)
 
-    def _start(self, detection: Detection, warnings: list[str]) -> None:
+    def _start(self, index: int, detection: Detection, warnings: list[str]) -> None:
         joints, confidence = detection
         known = np.count_nonzero(np.isfinite(joints).all(axis=1))
         if known < self.settings.least_joints:
@@ -206,6 +208,7 @@ class FlowingPuppetTracker:
         except InputError as error:
             warnings.append(f"a detected person is left out: {error}")
             return
+        self.people[-1].detection = index
         self._started += 1
 
     def _lives(self, person: Person, size: tuple[int, int]) -> bool:
@@ -235,6 +238,7 @@ class FlowingPuppetTracker:
             depth,
             shape,
             person.detected,
+            person.detection,
         )
 
 

@@ -142,13 +142,20 @@ def test_bad_keypoints_are_one_sentence(
     assert "k.json" in line
 
 
-def test_missing_input_and_missing_keypoints(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_inputs_are_one_sentence(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["track", str(tmp_path / "none.mp4"), "--out", "o.json"]) == 2
     assert "none.mp4 does not exist" in capsys.readouterr().err
-    assert main(["track", str(frames), "--out", "o.json"]) == 2
-    assert "--init" in capsys.readouterr().err
     assert main(["track", str(frames), "--out", "o.json", "--init", str(tmp_path / "none.json")]) == 2
     assert "none.json cannot be read" in capsys.readouterr().err
+
+
+def test_without_keypoints_the_detector_looks(frames: Path, tmp_path: Path) -> None:
+    for name, flags in (("whole", []), ("live", ["--live", "--detect-every", "3"])):
+        assert main(["track", str(frames), "--out", str(tmp_path / name), *flags]) == 0
+        tracks = json.loads((tmp_path / name).read_text())
+        assert [frame["index"] for frame in tracks["frames"]] == list(range(6))
+        for puppet in (puppet for frame in tracks["frames"] for puppet in frame["puppets"]):
+            assert all(0 <= confidence <= 1 for _, _, confidence in puppet["joints"])
 
 
 def test_a_bag_brings_its_own_detections(tmp_path: Path) -> None:

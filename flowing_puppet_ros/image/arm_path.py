@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which of several hypotheses of an arm is true in each image of a clip: the path that the flow agrees with.
+
+A detector is often right in its second or third guess; over time the guesses that are right move with the optical flow,
+and the others jump. The path of least cost is found exactly (Viterbi, "Error bounds for convolutional codes", 1967).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.settings import Settings, setting
+
+type Floats = NDArray[np.float64]
+
+JOINT_SHARE = np.array([0.4, 1.0])  # of elbow and wrist in a step's cost: the wrist moves more and is known less
+
+
+@dataclass(frozen=True)
+class PathSettings(Settings):
+    """How the hypotheses of an arm are joined over time."""
+
+    modes: int = setting(8, "hypotheses of an arm that the detector gives", low=1, high=100)
+    detector_weight: float = setting(3.0, "weight of the detector's score of elbow and wrist", low=0.0, high=100.0)
+    evidence_weight: float = setting(0.6, "weight of contour and colour", low=0.0, high=100.0)
+    flow_strength: float = setting(4.0, "cost of a step that leaves the flow by a shoulder width", low=0.0, high=1e4)
+    longest_step: float = setting(0.6, "distance from the flow, in shoulder widths, beyond which a step costs no more",
+                                  low=0.01, high=100.0)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ArmHypotheses:
+    """K hypotheses of one arm in one image.
+
+    `places` (K, 2, 2) px of elbow and wrist, `score` (K,) in nats, higher is better, and `motion` (K, 2, 2) px, how far
+    the flow takes elbow and wrist to the next image.
+    """
+
+    places: Floats
+    score: Floats
+    motion: Floats
+
+
+def best_path(arms: Sequence[ArmHypotheses], width: float, settings: PathSettings) -> list[Floats]:
+    """Cost (K,) of the best path through each hypothesis, for each of the T images: max-marginals, lower is better.
+
+    The path of least cost goes through the least of each image. `width` is the shoulder width in pixels.
+    """
+    steps = [_step_costs(a, b, width, settings) for a, b in pairwise(arms)]
+    forward = [-arms[0].score]
+    for arm, step in zip(arms[1:], steps, strict=True):
+        forward.append((forward[-1][:, None] + step).min(axis=0) - arm.score)
+    backward = [np.zeros(len(arms[-1].score))]
+    for arm, step in zip(arms[:0:-1], steps[::-1], strict=True):
+        backward.append((step + backward[-1] - arm.score).min(axis=1))
+    return [there + back for there, back in zip(forward, backward[::-1], strict=True)]
+
+
+def _step_costs(before: ArmHypotheses, after: ArmHypotheses, width: float, settings: PathSettings) -> Floats:
+    """Costs (K, K') of the steps between the hypotheses of two images."""
+    expected = before.places + before.motion
+    distance = np.linalg.norm(expected[:, None] - after.places[None], axis=3) @ (JOINT_SHARE / JOINT_SHARE.sum())
+    return np.asarray(settings.flow_strength * np.minimum(distance / width, settings.longest_step))

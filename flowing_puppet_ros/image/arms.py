@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hypotheses of the arms of the people in a clip: the detector's, and their neighbours' in time carried by the flow.
+
+Each hypothesis is judged in its own image, by the detector's max-marginals and by contour and colour; which is true is
+decided at the end of the clip, by `arm_path`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.flow.estimate import FlowPair
+from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_path
+from flowing_puppet_ros.image.carry import Grid
+from flowing_puppet_ros.image.detector_person import PersonDetection
+from flowing_puppet_ros.image.pose_evidence import Window
+from flowing_puppet_ros.image.smoothing import joint_motion
+from flowing_puppet_ros.model.ds import DeformableStructures
+from flowing_puppet_ros.model.ds_shape import View
+
+type Floats = NDArray[np.float64]
+
+SIDES = ("right", "left")
+CARRIED = 3  # hypotheses of a neighbouring image that are carried into this one
+NEAR = 0.35  # shoulder widths within which hypotheses of the wrist agree
+DOUBT = 2.0  # nats, cost difference at which a path counts 1/e of the best
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """A person in one image.
+
+    `joints` (J, 2) px as tracked, the `detection` (None where it was missed), and the evidence around the person (None
+    outside of the image).
+    """
+
+    model: DeformableStructures
+    joints: Floats
+    scale: float
+    view: View
+    detection: PersonDetection | None
+    window: Window | None
+
+    def hypotheses(self, side: str, count: int) -> Floats:
+        """Elbow and wrist (K, 2, 2) px of the detector's modes of an arm; without it the tracked ones."""
+        if self.detection is not None:
+            return self.detection.arms(side, count)
+        return self.joints[None, [self.model.joint_names.index(f"{side}_{name}") for name in ENDS]]
+
+    def judged(self, side: str, places: Floats, settings: PathSettings) -> Floats:
+        """Score (K,) in nats of elbow and wrist at places (K, 2, 2) px."""
+        score = np.zeros(len(places))
+        if self.detection is not None:
+            elbow, wrist = (self.detection.joint_score(f"{side}_{name}", places[:, k]) for k, name in enumerate(ENDS))
+            score = settings.detector_weight * np.minimum(elbow, wrist)
+        if self.window is not None and settings.evidence_weight > 0:
+            score = score + settings.evidence_weight * self._evidence(self.window, side, places)
+        return score
+
+    def _evidence(self, window: Window, side: str, places: Floats) -> Floats:
+        rows = [self.model.joint_names.index(f"{side}_{name}") for name in ENDS]
+        parts = [self.model.tree.names.index(f"{side}_{name}") for name in ("upper_arm", "lower_arm")]
+        contours: list[list[Floats]] = [[], []]
+        for place in places:
+            joints = self.joints.copy()
+            joints[rows] = place
+            shape = self.model.puppet_from_joints(joints, self.scale, self.view)
+            for k, part in enumerate(parts):
+                contours[k].append(shape.contours[part])
+        scale = np.full(len(places), self.scale)
+        found = [window.log_likelihood(part, np.array(own), scale) for part, own in zip(parts, contours, strict=True)]
+        return np.asarray(found[0] + found[1])
+
+
+ENDS = ("elbow", "wrist")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ResolvedArm:
+    """Elbow and wrist over T images: `places` (T, 2, 2) px, `motion` (T, 2, 2) px to the next, `sure` (T,) 0 to 1."""
+
+    places: Floats
+    motion: Floats
+    sure: Floats
+
+
+@dataclass(slots=True, eq=False)
+class ArmHistory:
+    """Hypotheses of both arms of one person over consecutive images."""
+
+    settings: PathSettings
+    _arms: dict[str, list[ArmHypotheses]] = field(default_factory=lambda: {side: [] for side in SIDES})
+    _last: Sight | None = None
+
+    def add(self, sight: Sight, flow: FlowPair | None, grid: Grid) -> None:
+        """Take the next image; `flow` (forward, backward) leads to it from the one before, on the working grid."""
+        for side in SIDES:
+            arms = self._arms[side]
+            own = sight.hypotheses(side, self.settings.modes)
+            if arms and flow is not None and self._last is not None:
+                arms[-1] = self._extended(arms[-1], side, own, flow, grid)
+                own = np.concatenate([own, _best(arms[-1])])
+            score = sight.judged(side, own, self.settings)
+            arms.append(ArmHypotheses(own, score, np.zeros_like(own)))
+        self._last = sight
+
+    def _extended(self, before: ArmHypotheses, side: str, after: Floats, flow: FlowPair, grid: Grid) -> ArmHypotheses:
+        """The image before with the best of this image carried back into it, and everybody's motion."""
+        assert self._last is not None
+        motion = _motion(flow, grid, before.places)
+        source = after[:CARRIED]
+        back = source + _motion((flow[1], flow[0]), grid, source)
+        score = self._last.judged(side, back, self.settings)
+        return ArmHypotheses(
+            np.concatenate([before.places, back]),
+            np.concatenate([before.score, score]),
+            np.concatenate([motion, source - back]),
+        )
+
+    def resolved(self, width: float) -> dict[str, ResolvedArm]:
+        """The best path of each arm; `width` is the shoulder width in pixels."""
+        return {side: _resolved(arms, width, self.settings) for side, arms in self._arms.items() if arms}
+
+
+def _resolved(arms: Sequence[ArmHypotheses], width: float, settings: PathSettings) -> ResolvedArm:
+    places, motion, sure = [], [], []
+    for arm, cost in zip(arms, best_path(arms, width, settings), strict=True):
+        best = int(cost.argmin())
+        weight = np.exp((cost[best] - cost) / DOUBT)
+        near = np.linalg.norm(arm.places[:, 1] - arm.places[best, 1], axis=1) < NEAR * width
+        # Hypotheses in one place are one: of each place the best counts.
+        other = weight[~near].max(initial=0.0)
+        places.append(arm.places[best])
+        motion.append(arm.motion[best])
+        sure.append(1.0 / (1.0 + other))
+    return ResolvedArm(np.array(places), np.array(motion), np.array(sure))
+
+
+def _best(arm: ArmHypotheses) -> Floats:
+    """The best hypotheses (up to CARRIED, 2, 2) where the flow takes them."""
+    order = np.argsort(-arm.score, kind="stable")[:CARRIED]
+    return np.asarray(arm.places[order] + arm.motion[order])
+
+
+def _motion(flow: FlowPair, grid: Grid, places: Floats) -> Floats:
+    """How far the flow takes places (K, 2, 2)."""
+    flat = places.reshape(-1, 2)
+    first, _ = joint_motion((flow[0], -flow[0]), grid, flat, flat)
+    moved, trust = joint_motion(flow, grid, flat, flat + first)
+    return np.asarray(np.where((trust > 0)[:, None], moved, 0.0).reshape(places.shape))

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The flowing-puppet tracker with a detector of its own: who is where in a video that nobody has looked at before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from flowing_puppet_ros.image.arms import Sight
+from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
+from flowing_puppet_ros.image.detector_person import PersonDetection
+from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
+from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
+from flowing_puppet_ros.settings import Settings, setting
+
+
+@dataclass(frozen=True)
+class DetectionSettings(Settings):
+    """When the detector looks at an image of a video."""
+
+    detect_every: int = setting(1, "images from one run of the detector to the next", low=1, high=10000)
+    least_person: float = setting(0.3, "probability from which a detected person is tracked", low=0.0, high=1.0)
+
+
+@dataclass(slots=True, eq=False)
+class VideoTracker:
+    """Runs the detector on the images of a video and the tracker on what it finds."""
+
+    tracker: FlowingPuppetTracker
+    detector: PartDetector
+    likelihood: Likelihood
+    settings: DetectionSettings
+    images: int = 0
+
+    def step(self, image: NDArray[np.uint8], stamp_ns: int) -> tuple[TrackResult, dict[str, Sight]]:
+        """Take the next `image` (H, W, 3) RGB or (H, W) grey; the result, and how each of its people is seen in it."""
+        look = self.images % self.settings.detect_every == 0
+        self.images += 1
+        found = self._detect(image) if look else None
+        result = self.tracker.step(image, stamp_ns, None if found is None else [person.keypoints for person in found])
+        colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+        # Sums of several BLAS threads would differ in their last bits.
+        with threadpool_limits(1):
+            return result, {puppet.id: self._sight(puppet, colour, found or []) for puppet in result.puppets}
+
+    def _detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
+        people = self.tracker.settings.most_people
+        return self.detector.detect(
+            image, DetectorSettings(least_confidence=self.settings.least_person, most_people=min(people, 80))
+        )
+
+    def _sight(self, puppet: TrackedPuppet, image: NDArray[np.uint8], found: Sequence[PersonDetection]) -> Sight:
+        model = self.tracker.model
+        window = Window.around(self.likelihood, image, puppet.joints, puppet.scale)
+        if window is not None:
+            torso, head = (puppet.contours[model.tree.names.index(name)] for name in ("torso", "head"))
+            window = window.with_torso(torso, head)
+        detection = None if puppet.detection is None else found[puppet.detection]
+        return Sight(model, puppet.joints, puppet.scale, puppet.view, detection, window)
