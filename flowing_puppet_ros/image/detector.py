@@ -21,7 +21,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.detector_forest import Forest
 from flowing_puppet_ros.image.detector_parts import PARTS, PartFilters, Window, window_at
 from flowing_puppet_ros.image.detector_person import FoundPose, PersonDetection
-from flowing_puppet_ros.image.detector_rank import Ranking, agreed_scale, best_places
+from flowing_puppet_ros.image.detector_rank import SAME_PLACE, Ranking, agreed_scale, apart, best_places
 from flowing_puppet_ros.image.detector_root import Candidate, RootFilters, resize
 from flowing_puppet_ros.image.detector_search import choose, propose
 from flowing_puppet_ros.image.detector_tree import PartTree, best_placement, upward
@@ -31,7 +31,7 @@ from flowing_puppet_ros.settings import Settings, setting
 type Doubles = NDArray[np.float64]
 
 WEIGHTS = "upper"
-LEAST_SIDE = 8  # px; nothing is found in a smaller image
+LEAST_SIDE = 24  # px; nothing is found in a smaller image
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,15 +118,17 @@ class PartDetector:
         poses = self.look(image, smallest, settings.places)
         scores = self.ranking.scores(poses)
         people: list[PersonDetection] = []
-        for index in best_places(poses, scores)[: settings.most_people]:
+        for index in best_places(poses, scores):
             confidence = self.ranking.probability(float(scores[index]))
-            if confidence < settings.least_confidence:
+            if confidence < settings.least_confidence or len(people) == settings.most_people:
                 break
             pose = poses[index]
             scale = self.ranking.corrected_scale(pose, agreed_scale(poses, scores, index))
             places = dict(zip(PARTS, pose.points, strict=True))
             again = self.pose_in(window_at(image, tuple(places["neck"]), tuple(places["face"]), scale), pose.measures)
-            people.append(PersonDetection(self.parts, again, confidence, factor))
+            # At another scale the neck may have moved onto that of a person who is known already.
+            if all(apart(again, other.pose) >= SAME_PLACE for other in people):
+                people.append(PersonDetection(self.parts, again, confidence, factor))
         return people
 
     def look(self, image: NDArray[np.uint8], smallest: float, places: int) -> list[FoundPose]:

@@ -47,14 +47,14 @@ def best_places(poses: Sequence[FoundPose], scores: Doubles) -> list[int]:
     """Indices of the best poses, each the best around its place, best first."""
     kept: list[int] = []
     for index in np.argsort(-scores, kind="stable").tolist():
-        if all(_apart(poses[index], poses[other]) >= SAME_PLACE for other in kept):
+        if all(apart(poses[index], poses[other]) >= SAME_PLACE for other in kept):
             kept.append(index)
     return kept
 
 
 def agreed_scale(poses: Sequence[FoundPose], scores: Doubles, best: int) -> float:
     """Mean scale (of logarithms, weighted by exp(score)) of the poses with the same head as pose `best`."""
-    near = np.array([_apart(pose, poses[best]) < SAME_HEAD for pose in poses])
+    near = np.array([apart(pose, poses[best]) < SAME_HEAD for pose in poses])
     weight = np.where(near, np.exp(np.minimum(scores - scores[best], 0.0)), 0.0)
     return float(np.exp(weight @ np.log([pose.scale for pose in poses]) / weight.sum()))
 
@@ -70,6 +70,6 @@ def lengths(pose: FoundPose, scale: float) -> Doubles:
     return np.array([*(np.log(max(1e-2, float(np.linalg.norm(span)) / scale)) for span in spans), 1.0])
 
 
-def _apart(a: FoundPose, b: FoundPose) -> float:
+def apart(a: FoundPose, b: FoundPose) -> float:
     """Distance of two necks in units of the larger S."""
     return float(np.linalg.norm(a.points[0] - b.points[0])) / max(a.scale, b.scale)
