@@ -16,7 +16,7 @@ class PoseSettings(Settings):
     iterations: int = setting(6, "rounds of proposing and selecting", low=0, high=1000)
     modes: int = setting(16, "poses of the detector from which particles start", low=1, high=200)
     solutions: int = setting(10, "diverse solutions that are given, the best one included", low=1, high=100)
-    others: float = setting(0.5, "probability from which people beside the surest one are reported", low=0.0, high=1.0)
+    others: float = setting(0.25, "probability from which people beside the surest one are reported", low=0.0, high=1.0)
     seed: int = setting(
         0, "seed of all random draws; also picks the letters that ids begin with", low=0, high=1_000_000
     )

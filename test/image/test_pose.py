@@ -260,7 +260,7 @@ def test_ten_people_and_half_people(joints: np.ndarray) -> None:
 
 
 def test_doubtful_people_are_left_out_beside_a_sure_one(joints: np.ndarray) -> None:
-    sure, doubtful = (Guess(keypoints(joints), confidence) for confidence in (0.9, 0.3))
+    sure, doubtful = (Guess(keypoints(joints), confidence) for confidence in (0.9, 0.22))
     quick = PoseSettings(particles=12, iterations=1)
     for people, settings, count in (
         ((sure, doubtful), quick, 1),
