@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # make venv   set everything up in .venv          make test   linter, type checker and tests
 # make demo   sample bag -> replay -> report      make lint   linter and type checker alone
+# make bench  speed as ratios taken in one run
 
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
@@ -8,7 +9,7 @@ SAMPLE := bags/cache/sample
 # The two variables that the ROS wheels leave in their children would keep another environment's Python from starting.
 CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: venv demo sample-bag test lint config lock clean
+.PHONY: venv demo sample-bag test lint bench config lock clean
 
 venv:
 	@python=$$(sh scripts/find_python.sh) && $(CLEAN_ENV) "$$python" -I scripts/make_venv.py
@@ -28,6 +29,9 @@ lint: venv
 test: lint
 	@$(PYTHON) scripts/ensure_browser.py
 	@$(CLEAN_ENV) $(PYTHON) -m pytest
+
+bench: venv
+	@$(CLEAN_ENV) .venv/bin/flowing-puppet bench
 
 config: venv
 	@$(PYTHON) scripts/write_config.py

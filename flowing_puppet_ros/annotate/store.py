@@ -88,7 +88,7 @@ class AnnotationStore:
             return revision + 1
 
     def write_stick_figures(self, path: Path, items: Sequence[str]) -> None:
-        """Write the stick figures of all people; a frame's number is the one in its name, or its place if some agree."""
+        """Write all stick figures; a frame's number is the one in its name, or its place where some agree."""
         numbers = [_number(key) for key in items]
         if None in numbers or len(set(numbers)) < len(numbers):
             numbers = list(range(len(items)))

@@ -64,8 +64,8 @@ def test_hands_vary_from_flat_to_closed_and_the_same_seed_gives_the_same(body: A
     assert bends.min() < 0 and bends.max() > 75
     kept = np.all(angles[:, 0] == 0, axis=(1, 2))
     assert 0.2 < kept.mean() < 0.5
-    np.testing.assert_array_equal(turned[kept, finger], np.tile(np.diag([-1.0, -1.0, 1.0]), (kept.sum(), 1, 1)))
-    np.testing.assert_array_equal(turned[~kept, finger], np.tile(np.eye(3), ((~kept).sum(), 1, 1)))
+    np.testing.assert_array_equal(turned[kept, finger], np.tile(np.diag([-1.0, -1.0, 1.0]), (int(kept.sum()), 1, 1)))
+    np.testing.assert_array_equal(turned[~kept, finger], np.tile(np.eye(3), (int((~kept).sum()), 1, 1)))
 
 
 def test_every_pose_may_have_another_rest_shape(body: AnnyBody, fingers: Fingers) -> None:
