@@ -15,7 +15,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.learn.annotations import Annotations
-from flowing_puppet_ros.learn.detector import LearnDetectorSettings, Learned, learn
+from flowing_puppet_ros.learn.detector import RANKED, LearnDetectorSettings, Learned, learn
 from flowing_puppet_ros.learn.detector_data import examples_of
 from flowing_puppet_ros.settings import make_out_folder
 
@@ -62,9 +62,10 @@ def model_card(
         people=learned.people,
         files=files,
         command=f"flowing-puppet learn detector {arguments.annotations.name}{left_out} --every {settings.every} "
-        f"--steps {settings.steps} --held-out {settings.held_out} --seed {settings.seed} --out FOLDER",
+        f"--steps {settings.steps} --trees {settings.trees} --held-out {settings.held_out} --seed {settings.seed} --out FOLDER",
         minutes=seconds / 60,
         held_out=learned.held_out,
+        ranked=min(RANKED, learned.held_out),
         found=100 * learned.found,
         filters=len(learned.detector.parts.filters),
         trees=len(learned.detector.forest.leaves),
@@ -82,8 +83,8 @@ regression for the confidence. No neural network.
   {minutes:.0f} minutes of one processor core, with the command
   `{command}`
 - Only statistics of the images are in the file, no image.
-- Calibrated on {held_out} people of other videos than the filters were learned on: there the surest pose has the right
-  place (half a shoulder width) and scale (25 %) in {found:.0f} % of the images.
+- Calibrated on people of other videos than the filters were learned on ({held_out}, of whom about {ranked} are looked
+  at): there the surest pose has the right place (half a shoulder width) and scale (25 %) in {found:.0f} % of the images.
 - Limits: upright people, seen from the front or half from the side, shoulders at least a twentieth of the image's
   longer side wide; no knees and ankles; arms in front of the face, and people seen from the side, are often missed.
 - Licence: Apache-2.0, as the package.
