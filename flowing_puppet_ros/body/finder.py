@@ -38,6 +38,8 @@ HYPOTHESIS_STEPS, LIMBS_FINISHED = 12, 3
 LIMB_OFF = 0.6
 # A limb hypothesis must be this much closer than the body that it came from, and none helps a body so many metres off.
 CLOSER, HOPELESS = 0.98, 0.06
+# Where this share of the cloud is uncovered the whole body is probably wrong: only a leap is worth another round.
+MOSTLY_OFF, LEAP = 0.25, 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,9 +156,10 @@ class BodyFinder:
             states = [body.state, *self._limbs_moved(body, cloud, grid, rng)]
             candidates = ordered(lambda state: self.candidate(state, cloud), states, self._threads)
             closest = min(candidates, key=lambda candidate: candidate.cost)
-            if closest.cost > CLOSER * body.cost:
+            wanted = LEAP if body.judgement.uncovered > MOSTLY_OFF else CLOSER
+            body, before = min(body, closest, key=lambda candidate: candidate.cost), body
+            if closest.cost > wanted * before.cost:
                 break
-            body = closest
         return body
 
     def _limbs_moved(self, body: Candidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> list[BodyState]:
