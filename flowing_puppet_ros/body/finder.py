@@ -91,7 +91,7 @@ class BodyFinder:
         self._proposer = Proposer(model, points)
         self.limbs = LimbSearch(model, self.search, self._proposer)
         self.bank = BodyBank(model, points)
-        self._view_search = ViewSearch(model, self.bank, self._proposer, self.refiner)
+        self._view_search = ViewSearch(model, self.bank, self._proposer, self.refiner, self._threads)
 
     def find(self, cloud: Cloud, rng: np.random.Generator, progress: Progress) -> BodyState:
         """The body of a cloud of which nothing but the upright is known."""

@@ -18,10 +18,11 @@ from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.particles import particles_of, state_of
 from flowing_puppet_ros.body.proposals import Proposer
 from flowing_puppet_ros.body.refine import Refiner, RefineWeights
+from flowing_puppet_ros.body.threads import ordered
 from flowing_puppet_ros.body.view_cloud import ViewCloud
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-STARTS, KEPT = 12, 3
+STARTS, KEPT = 32, 8
 LIMB_SAMPLES, LIMB_ROUNDS = 600, 3
 CHAINS = (("shoulder", "upper_arm", "lower_arm", "hand"), ("upper_leg", "lower_leg", "foot"))
 TRIED = 0.003
@@ -35,8 +36,11 @@ CLOSE = RefineWeights(sigma_start=0.06, sigma_end=0.04, iterations=5)
 class ViewSearch:
     """Finds bodies of one model in clouds from one side."""
 
-    def __init__(self, model: StitchedPuppet, bank: BodyBank, proposer: Proposer, refiner: Refiner) -> None:
+    def __init__(
+        self, model: StitchedPuppet, bank: BodyBank, proposer: Proposer, refiner: Refiner, threads: int = 1
+    ) -> None:
         self._model = model
+        self._threads = threads
         self._bank = bank
         self._proposer = proposer
         self._refiner = refiner
@@ -58,17 +62,22 @@ class ViewSearch:
             progress: called with the fraction done.
         """
         coarse = Coarse.of(cloud)
-        found = []
-        for turn, body in enumerate(self._starts(cloud, coarse)):
-            body = self._with_better_limbs(body, cloud, coarse, rng)
+        starts = self._starts(cloud, coarse)
+        progress(0.2)
+
+        def improved(start: tuple[BodyState, np.random.Generator]) -> tuple[float, BodyState]:
+            body = self._with_better_limbs(start[0], cloud, coarse, start[1])
             body = self._refined(body, cloud, _finish(cloud, steps))
-            found.append((self._bank.cost(body, coarse), body))
-            progress((turn + 1) / KEPT)
+            return self._bank.cost(body, coarse), body
+
+        found = ordered(improved, list(zip(starts, rng.spawn(len(starts)), strict=True)), self._threads)
+        progress(1.0)
         return min(found, key=lambda pair: pair[0])[1]
 
     def _starts(self, cloud: ViewCloud, coarse: Coarse) -> list[BodyState]:
         """The best of the bank's bodies after a few steps of Gauss-Newton."""
-        bodies = [self._refined(body, cloud, ROUGH) for body in self._bank.best(coarse, STARTS)]
+        best = self._bank.best(coarse, STARTS)
+        bodies = ordered(lambda body: self._refined(body, cloud, ROUGH), best, self._threads)
         return sorted(bodies, key=lambda body: self._bank.cost(body, coarse))[:KEPT]
 
     def _with_better_limbs(
