@@ -96,8 +96,8 @@ def drag(page: Page, start: tuple[float, float], end: tuple[float, float]) -> No
 
 
 def wait(page: Page, holds: Callable[[], bool]) -> None:
-    """Wait until something holds, ten seconds at most."""
-    for _ in range(200):
+    """Wait until something holds, at most a minute: where nothing is compiled yet the first flow takes its time."""
+    for _ in range(1200):
         if holds():
             return
         page.wait_for_timeout(50)

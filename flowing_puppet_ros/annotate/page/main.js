@@ -68,9 +68,12 @@ function todo() {
 
 async function add(ask) {
   const { key } = people;
+  say("one moment ...");
   try {
     const found = await ask();
-    if (people.key === key) people.add(found);
+    if (people.key !== key) return;
+    say("");
+    people.add(found);
   } catch (error) {
     say(error.message, true);
   }
