@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.annotate.store import Person
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker
@@ -61,6 +62,7 @@ def carried(parts: int, people: list[Person], before: NDArray[np.uint8], image: 
     """
     if before.shape != image.shape:
         raise InputError("the image before has another size; puppets are carried between images of one size")
+    flow = OpticalFlow().at_working_scale(before, image)
     moved = []
     for person in people:
         model = body(person["gender"], parts)
@@ -68,7 +70,7 @@ def carried(parts: int, people: list[Person], before: NDArray[np.uint8], image: 
         joints = np.array(person["joints"], dtype=np.float64)
         given = Keypoints(model.joint_names, joints[:, :2], np.ones(len(joints)))
         tracker.step(before, 0, [given])
-        found = tracker.step(image, 1).puppets
+        found = tracker.step(image, 1, flow=flow).puppets
         if found:
             at = np.where(np.isfinite(found[0].joints), found[0].joints, joints[:, :2])
             moved.append(

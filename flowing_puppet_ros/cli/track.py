@@ -87,7 +87,12 @@ def _stepper(arguments: argparse.Namespace, tracker: FlowingPuppetTracker, given
         return lambda frame, detections: (tracker.step(frame.image, frame.stamp_ns, detections), None)
     likelihood, settings = PartLikelihood.load(arguments.parts), DetectionSettings.from_arguments(arguments)
     video = VideoTracker(tracker, PartDetector.load(), likelihood, settings)
-    return lambda frame, detections: video.step(frame.image, frame.stamp_ns)
+
+    def step(frame: Frame, detections: list[Keypoints] | None) -> Stepped:
+        result, found = video.step(frame.image, frame.stamp_ns)
+        return result, None if arguments.live else video.sights(frame.image, result, found)
+
+    return step
 
 
 @dataclass

@@ -18,7 +18,7 @@ from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_
 from flowing_puppet_ros.image.carry import Grid
 from flowing_puppet_ros.image.detector_person import PersonDetection
 from flowing_puppet_ros.image.pose_evidence import Window
-from flowing_puppet_ros.image.smoothing import joint_motion
+from flowing_puppet_ros.image.smoothing import joint_motion, sampled
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_shape import View
 
@@ -149,6 +149,6 @@ def _best(arm: ArmHypotheses) -> Floats:
 def _motion(flow: FlowPair, grid: Grid, places: Floats) -> Floats:
     """How far the flow takes places (K, 2, 2)."""
     flat = places.reshape(-1, 2)
-    first, _ = joint_motion((flow[0], -flow[0]), grid, flat, flat)
-    moved, trust = joint_motion(flow, grid, flat, flat + first)
-    return np.asarray(np.where((trust > 0)[:, None], moved, 0.0).reshape(places.shape))
+    ahead = np.nan_to_num(sampled(flow[0], grid.reduced(flat))) / grid.factor
+    moved, _ = joint_motion(flow, grid, flat, flat + ahead)
+    return moved.reshape(places.shape)

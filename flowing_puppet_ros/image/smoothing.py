@@ -46,7 +46,7 @@ def joint_motion(flow: FlowPair, grid: Grid, before: Floats, after: Floats) -> t
     The mean of the forward flow at the one place and the reversed backward flow at the other; 0 trust where a place or
     its flow is unknown. `flow` is on the working grid of `grid`.
     """
-    forth, back = (_sampled(field, grid.reduced(at)) for field, at in zip(flow, (before, after), strict=True))
+    forth, back = (sampled(field, grid.reduced(at)) for field, at in zip(flow, (before, after), strict=True))
     motion = 0.5 * (forth - back)
     known = np.isfinite(motion).all(axis=1)
     gap = np.where(known, ((forth + back) ** 2).sum(axis=1), np.inf)
@@ -101,7 +101,7 @@ def _huber(distance: Floats, width: float) -> Floats:
     return np.minimum(1.0, width / np.maximum(distance, 1e-9))
 
 
-def _sampled(field: NDArray[np.float32], points: Floats) -> Floats:
+def sampled(field: NDArray[np.float32], points: Floats) -> Floats:
     """Flow (J, 2) at points (J, 2) of its grid, between pixels; NaN outside the grid."""
     height, width = field.shape[:2]
     inside = ((points >= -0.5) & (points <= np.array([width, height]) - 0.5)).all(axis=1)

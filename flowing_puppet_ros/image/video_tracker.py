@@ -36,16 +36,22 @@ class VideoTracker:
     settings: DetectionSettings
     images: int = 0
 
-    def step(self, image: NDArray[np.uint8], stamp_ns: int) -> tuple[TrackResult, dict[str, Sight]]:
-        """Take the next `image` (H, W, 3) RGB or (H, W) grey; the result, and how each of its people is seen in it."""
+    def step(self, image: NDArray[np.uint8], stamp_ns: int) -> tuple[TrackResult, list[PersonDetection]]:
+        """Take the next `image` (H, W, 3) RGB or (H, W) grey; the result, and whom the detector found if it looked."""
         look = self.images % self.settings.detect_every == 0
         self.images += 1
-        found = self._detect(image) if look else None
-        result = self.tracker.step(image, stamp_ns, None if found is None else [person.keypoints for person in found])
+        found = self._detect(image) if look else []
+        keypoints = [person.keypoints for person in found] if look else None
+        return self.tracker.step(image, stamp_ns, keypoints), found
+
+    def sights(
+        self, image: NDArray[np.uint8], result: TrackResult, found: Sequence[PersonDetection]
+    ) -> dict[str, Sight]:
+        """How each person of a step is seen in its image, by id; only hypotheses need this, tracking does not."""
         colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
         # Sums of several BLAS threads would differ in their last bits.
         with threadpool_limits(1):
-            return result, {puppet.id: self._sight(puppet, colour, found or []) for puppet in result.puppets}
+            return {puppet.id: self._sight(puppet, colour, found) for puppet in result.puppets}
 
     def _detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
         people = self.tracker.settings.most_people

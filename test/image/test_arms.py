@@ -163,7 +163,9 @@ def test_a_clip_joins_the_guesses_that_move_with_the_person() -> None:
     path = PathSettings()
     clip = Clip(CapsuleModel(), SmoothingSettings(), path)  # type: ignore[arg-type]
     for t in range(9):
-        clip.add(*video.step(draw(pose(t)), t))
+        image = draw(pose(t))
+        result, found = video.step(image, t)
+        clip.add(result, video.sights(image, result, found))
     wrist = NAMES.index("left_wrist")
     for t, people in enumerate(clip.people()):
         (puppet,) = people
@@ -175,7 +177,8 @@ def test_between_runs_of_the_detector_people_are_carried() -> None:
     settings = DetectionSettings(detect_every=4)
     video = VideoTracker(tracker(), finder, NoEvidence(), settings)  # type: ignore[arg-type]
     for t in range(6):
-        result, sights = video.step(draw(pose(0)), t)
+        result, found = video.step(draw(pose(0)), t)
+        sights = video.sights(draw(pose(0)), result, found)
         assert [puppet.id for puppet in result.puppets] == ["a1"] == list(sights)
         assert (sights["a1"].detection is None) == (t % 4 > 0)
     assert finder.images == 2
