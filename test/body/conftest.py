@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ring of synthetic cameras that several tests look through; the capsule man can be imported."""
+"""What several tests share: the neutral model, a ring of synthetic cameras; the capsule man can be imported."""
 
 import sys
 from collections.abc import Callable
@@ -9,8 +9,22 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.camera import Camera
+from flowing_puppet_ros.body.points import PartPoints, part_points
+from flowing_puppet_ros.model.sp import StitchedPuppet
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture(scope="session")
+def model() -> StitchedPuppet:
+    """The shipped neutral model, which cannot be changed."""
+    return StitchedPuppet.load("neutral")
+
+
+@pytest.fixture(scope="session")
+def points(model: StitchedPuppet) -> tuple[PartPoints, ...]:
+    """Its points."""
+    return part_points(model)
 
 
 def _look_at(eye: np.ndarray, focal: float, size: tuple[int, int], lens: tuple[float, ...]) -> Camera:

@@ -13,11 +13,6 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 
 @pytest.fixture(scope="module")
-def model() -> StitchedPuppet:
-    return StitchedPuppet.load("neutral")
-
-
-@pytest.fixture(scope="module")
 def body(model: StitchedPuppet) -> BodyState:
     return model.sample(np.random.default_rng(3), pose_scale=0.3)
 

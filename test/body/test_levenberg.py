@@ -8,23 +8,13 @@ from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.geometry import vertex_normals
 from flowing_puppet_ros.body.levenberg import CONTRADICTING_WEIGHT, POSE_PRIOR, assemble, improve, prepared_part
 from flowing_puppet_ros.body.particles import Particles, particles_of
-from flowing_puppet_ros.body.points import PartPoints, part_points
+from flowing_puppet_ros.body.points import PartPoints
 from flowing_puppet_ros.body.proposals import Proposer, WalkNoise
 from flowing_puppet_ros.evidence.cloud import CloudGrid, look_up
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 UPPER_LEG = 10
-
-
-@pytest.fixture(scope="module")
-def model() -> StitchedPuppet:
-    return StitchedPuppet.load("neutral")
-
-
-@pytest.fixture(scope="module")
-def points(model: StitchedPuppet) -> tuple[PartPoints, ...]:
-    return part_points(model)
 
 
 def copies(model: StitchedPuppet, count: int) -> list[Particles]:

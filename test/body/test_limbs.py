@@ -17,11 +17,6 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 
 @pytest.fixture(scope="module")
-def model() -> StitchedPuppet:
-    return StitchedPuppet.load("neutral")
-
-
-@pytest.fixture(scope="module")
 def finder(model: StitchedPuppet) -> BodyFinder:
     return BodyFinder(model, FitterSettings(limb_rounds=2))
 

@@ -13,11 +13,6 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 
 
 @pytest.fixture(scope="module")
-def model() -> StitchedPuppet:
-    return StitchedPuppet.load("neutral")
-
-
-@pytest.fixture(scope="module")
 def finish(model: StitchedPuppet) -> SurfaceFinish:
     return SurfaceFinish(model.faces, len(model.part_of_vertex), FinishWeights())
 

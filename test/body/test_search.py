@@ -8,23 +8,13 @@ from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.geometry import vertex_normals
 from flowing_puppet_ros.body.limbs import LimbSearch, limb_groups
 from flowing_puppet_ros.body.particles import Particles, particles_of
-from flowing_puppet_ros.body.points import PartPoints, part_points
+from flowing_puppet_ros.body.points import PartPoints
 from flowing_puppet_ros.body.proposals import Proposer
 from flowing_puppet_ros.body.schedule import limb_stages
 from flowing_puppet_ros.body.search import Search, SearchWeights
 from flowing_puppet_ros.evidence.cloud import CloudGrid
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-
-
-@pytest.fixture(scope="module")
-def model() -> StitchedPuppet:
-    return StitchedPuppet.load("neutral")
-
-
-@pytest.fixture(scope="module")
-def points(model: StitchedPuppet) -> tuple[PartPoints, ...]:
-    return part_points(model)
 
 
 @pytest.fixture(scope="module")

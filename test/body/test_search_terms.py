@@ -9,7 +9,7 @@ from flowing_puppet_ros.body.energy import JointTargets, Judged, stitching_costs
 from flowing_puppet_ros.body.geometry import farthest_points, vertex_normals
 from flowing_puppet_ros.body.initial import body_from_joints, joint_targets, turned_around
 from flowing_puppet_ros.body.particles import Particles, particles_of, state_of
-from flowing_puppet_ros.body.points import PartPoints, part_points
+from flowing_puppet_ros.body.points import PartPoints
 from flowing_puppet_ros.body.proposals import Conditional, Proposer, WalkNoise
 from flowing_puppet_ros.body.refine import Refiner, RefineWeights
 from flowing_puppet_ros.body.schedule import four_stages, local_stages
@@ -20,16 +20,6 @@ from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 UPPER_LEG = 10
-
-
-@pytest.fixture(scope="module")
-def model() -> StitchedPuppet:
-    return StitchedPuppet.load("neutral")
-
-
-@pytest.fixture(scope="module")
-def points(model: StitchedPuppet) -> tuple[PartPoints, ...]:
-    return part_points(model)
 
 
 def copies(model: StitchedPuppet, count: int) -> list[Particles]:

@@ -22,11 +22,6 @@ MIRROR = np.array([1.0, -1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
-def body() -> AnnyBody:
-    return AnnyBody("neutral")
-
-
-@pytest.fixture(scope="module")
 def poses(body: AnnyBody) -> PoseSampler:
     return PoseSampler(body)
 

@@ -15,11 +15,6 @@ MIRROR = np.array([1.0, -1.0, 1.0])
 
 
 @pytest.fixture(scope="module")
-def body() -> AnnyBody:
-    return AnnyBody("neutral")
-
-
-@pytest.fixture(scope="module")
 def fingers(body: AnnyBody) -> Fingers:
     return Fingers(body)
 
