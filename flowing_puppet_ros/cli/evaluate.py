@@ -9,6 +9,7 @@ from flowing_puppet_ros.cli import (
     evaluate_bag,
     evaluate_bodies,
     evaluate_correspondence,
+    evaluate_hands,
     evaluate_joints,
     evaluate_likelihood,
     evaluate_pcp,
@@ -23,6 +24,7 @@ KINDS = {
     "correspondence": evaluate_correspondence,
     "bag": evaluate_bag,
     "likelihood": evaluate_likelihood,
+    "hands": evaluate_hands,
 }
 
 
