@@ -225,11 +225,10 @@ def test_a_filter_agrees_with_the_best_path_that_ends_now() -> None:
         person = sight(Guesser(joints, {"left": guesses, "right": guesses}, rng.normal(0, 0.3, 3)), joints)
         found, sure = arms.step(person, still() if t else None, GRID, 40.0)["left"]
         if t:
-            order = np.argsort(-running, kind="stable")[:CARRIED]
-            guesses = np.concatenate([guesses, history[-1].places[order]])
+            before = np.argsort(best_path(history, 40.0, SETTINGS)[-1], kind="stable")[:CARRIED]
+            guesses = np.concatenate([guesses, history[-1].places[before]])
         history.append(ArmHypotheses(guesses, person.judged("left", guesses, SETTINGS), np.zeros_like(guesses)))
         cost = best_path(history, 40.0, SETTINGS)[-1]
-        running = -cost
         np.testing.assert_allclose(found, guesses[cost.argmin()])
         assert 0.0 < sure <= 1.0
 
@@ -239,10 +238,10 @@ def test_a_filter_is_carried_through_images_without_a_look() -> None:
     start = np.array([[20.0, 20.0], [24.0, 28.0]])
     arms = ArmFilter(SETTINGS)
     for t in (0, 2):
-        guesses = np.array([start + (3.0 * t, 0.0), start + (0.0, 15.0)])
+        guesses = np.array([start + np.array([3.0 * t, 0.0]), start + np.array([0.0, 15.0])])
         scores = np.array([0.0, -0.1]) if t == 0 else np.array([-0.2, 0.0])
         person = sight(Guesser(joints, {"left": guesses, "right": guesses}, scores), joints)
         found, _ = arms.step(person, (forth, -forth) if t else None, GRID, 40.0)["right"]
         if t == 0:
             arms.carry((forth, -forth), GRID)
-    np.testing.assert_allclose(found, start + (6.0, 0.0), atol=1e-5)
+    np.testing.assert_allclose(found, start + np.array([6.0, 0.0]), atol=1e-5)
