@@ -218,7 +218,7 @@ def _hull_and_fitter(
     hull = VisualHullComponent(chosen, factory)  # type: ignore[arg-type]
     renamed = {f"{camera.name}/image": camera.image for camera in cameras}
     fitter = BodyFitterComponent(_settings(BodyFitterComponent, "body_fitter", settings), factory)  # type: ignore[arg-type]
-    joined = {"silhouettes": "/silhouettes", "points": "", "initial": ""}
+    joined = {"silhouettes": "/silhouettes", "points": "", "depth": "", "camera_info": "", "initial": ""}
     return [Instance("visual_hull", hull, "", renamed), Instance("body_fitter", fitter, "", joined)]
 
 
@@ -227,7 +227,8 @@ def _cloud_fitter(
 ) -> Instance:
     namespace = cloud.rpartition("/")[0]
     fitter = BodyFitterComponent(_settings(BodyFitterComponent, "body_fitter", settings), factory)  # type: ignore[arg-type]
-    instance = Instance(f"{cloud.lstrip('/')}/body_fitter", fitter, namespace, {"points": cloud, "silhouettes": ""})
+    renamed = {"points": cloud, "depth": "", "camera_info": "", "silhouettes": ""}
+    instance = Instance(f"{cloud.lstrip('/')}/body_fitter", fitter, namespace, renamed)
     fitter.expects("initial", topics.get(instance.topic("initial")) == BODIES)
     return instance
 
