@@ -19,6 +19,8 @@ from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.messages import MessageFactory
 
 Output = list[tuple[str, Any]]
+MOST_WARNINGS = 100
+"""Different sentences that a component logs in its life; what can be wrong with hostile input has no end."""
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -51,6 +53,10 @@ class Component:
     """Base of the stream components."""
 
     settings_type: ClassVar[type[Settings]]
+    fixed: ClassVar[frozenset[str]] = frozenset()
+    """Settings that stay as they were when the node was started."""
+    adoptable: ClassVar[frozenset[str]] = frozenset()
+    """Settings that `adopt` changes; a change of any other needs a new component."""
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
 
@@ -79,6 +85,13 @@ class Component:
 
     def reset(self) -> None:
         """Forget the past: the next message starts a new recording."""
+
+    def adopt(self, settings: Settings) -> None:
+        """Go on with settings that differ from the present ones in `adoptable` ones only."""
+        self.settings = settings
+
+    def warm_up(self) -> None:
+        """Do now what would delay the first messages (compiling, first use of the models)."""
 
     def expects(self, port: str, expected: bool) -> None:
         """Say whether anybody publishes on an optional input, so that the component knows what to wait for."""
@@ -110,7 +123,7 @@ class Component:
     def _warn(self, sentence: str) -> None:
         """Log `sentence` once in the component's life; sentences that differ in their numbers only are the same."""
         reason = re.sub(r"[0-9.]+", "#", sentence)
-        if reason not in self._warned:
+        if reason not in self._warned and len(self._warned) < MOST_WARNINGS:
             self._warned.add(reason)
             self.warnings.append(sentence)
 
