@@ -136,15 +136,16 @@ def _nothing_usable(topics: Mapping[str, str]) -> str:
 
 
 def _detection_notes(trackers: list[Instance], topics: Mapping[str, str]) -> list[str]:
-    """Say which cameras track nobody because no keypoints of people come with their images."""
+    """Say in which cameras the package's own detector finds the people though the recording seems to have them."""
     wanted = [tracker.topic("detections") for tracker in trackers]
     others = sorted(name for name, kind in topics.items() if kind == PUPPETS and name not in wanted)
     return [
-        f"nobody is tracked in {tracker.topic('image')}: it needs keypoints of people ({PUPPETS}) on {topic}"
+        f"the detector of this package finds the people in {tracker.topic('image')}: there are no keypoints "
+        f"({PUPPETS}) on {topic}"
         + (f", not {topics[topic]}" if topic in topics else "")
-        + (f"; --topic-map {others[0]}:={topic} renames what is there" if others else "")
+        + (f"; --topic-map {others[0]}:={topic} takes those that are there" if others else "")
         for tracker, topic in zip(trackers, wanted, strict=True)
-        if topics.get(topic) != PUPPETS
+        if topics.get(topic) != PUPPETS and (others or topic in topics)
     ]
 
 

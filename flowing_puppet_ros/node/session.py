@@ -6,7 +6,8 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Callable
-from functools import partial
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, partial
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -69,6 +70,7 @@ class Session[C: Component]:
             self._close_outputs()
             raise
         self.topics = [node.resolve_topic_name(port.name) for port in component.inputs if not port.optional]
+        component.background = _background()
         self.worker = Worker(queue, self._failed)
 
     def activate(self) -> None:
@@ -232,6 +234,12 @@ class Session[C: Component]:
         text = f"a message failed: {type(error).__name__}: {reason} ({where.filename}:{where.lineno})"
         self._diagnostics.failed(text)
         self._node.get_logger().error(text, throttle_duration_sec=QUIET_SECONDS)
+
+
+@cache
+def _background() -> ThreadPoolExecutor:
+    """One thread for the slow work of all components of this process: the workers need the other cores."""
+    return ThreadPoolExecutor(1, thread_name_prefix="background")
 
 
 def _same(message: Any) -> Any:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -57,6 +58,8 @@ class Component:
     """Settings that stay as they were when the node was started."""
     adoptable: ClassVar[frozenset[str]] = frozenset()
     """Settings that `adopt` changes; a change of any other needs a new component."""
+    background: Executor | None = None
+    """Where a live node lets slow work run beside the messages; None: all work is done at once, as in a replay."""
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
 
@@ -89,9 +92,6 @@ class Component:
     def adopt(self, settings: Settings) -> None:
         """Go on with settings that differ from the present ones in `adoptable` ones only."""
         self.settings = settings
-
-    def warm_up(self) -> None:
-        """Do now what would delay the first messages (compiling, first use of the models)."""
 
     def expects(self, port: str, expected: bool) -> None:
         """Say whether anybody publishes on an optional input, so that the component knows what to wait for."""

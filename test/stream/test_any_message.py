@@ -14,7 +14,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream import images
 from flowing_puppet_ros.stream.clouds import decode_cloud
 
-ENCODINGS = sorted(images._RAW) + ["16UC1", "32FC1", "32FC2", "64FC1", "nv12", "", "rgb8 ", "\u00e9"]
+ENCODINGS = [*sorted(images._RAW), "16UC1", "32FC1", "32FC2", "64FC1", "nv12", "", "rgb8 ", "\u00e9"]
 sizes = st.one_of(st.integers(0, 9), st.sampled_from([2**16, 2**31, 2**32 - 1]))
 data = st.binary(max_size=300)
 
