@@ -30,6 +30,11 @@ class NodeSettings(Settings):
     """Settings that every node has beside those of its component."""
 
     queue: int = setting(4, "messages of one input that may wait; the oldest is dropped for a newer", low=1, high=1000)
+    autostart: bool = setting(True, "configure and activate at the start; without, a lifecycle manager does")
+
+
+FIXED = frozenset({"autostart"})
+"""Settings of every node that cannot be changed once it runs."""
 
 
 def parameter_yaml(name: str) -> str:

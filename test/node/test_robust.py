@@ -106,6 +106,7 @@ def value(reports: list[Any], key: str) -> str | None:
 def test_time_that_jumps_back_starts_anew(start: Callable[..., Path], peer: Any) -> None:
     log = start("optical_flow", "-p", "use_sim_time:=true")
     clock = connected(peer, Clock, "/clock")
+    peer.spin_until(lambda: "ready" in log.read_text(), "the node")
     for seconds in (100, 101, 50):
         clock.publish(Clock(clock=clock_time(seconds)))
         peer.spin_for(0.3)
