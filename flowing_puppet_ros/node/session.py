@@ -98,6 +98,8 @@ class Session[C: Component]:
         """Let the running task end, then close the outputs."""
         self.deactivate()
         self.worker.stop()
+        # The worker takes no more tasks, and what runs in the background must end too.
+        self.component.reset()
         self._close_outputs()
 
     def _close_outputs(self) -> None:
@@ -147,7 +149,7 @@ class Session[C: Component]:
         self._subscriptions.append(made)
 
     def _output(self, name: str) -> list[tuple[Publisher, Callable[[Any], Any]]]:
-        """Return the publishers of an output, opened if need be, each with what makes its message of the component's."""
+        """The publishers of an output, opened if need be, each with what makes its message of the component's."""
         if name in self._outputs:
             return self._outputs[name]
         port = self.component.output(name)
