@@ -35,6 +35,7 @@ setup(
         NAME: [
             "py.typed",
             "annotate/page/*",
+            "view/web/*",
             "weights/*.npz",
             "weights/*.md",
             "interfaces/*/*/*.msg",
@@ -49,7 +50,10 @@ setup(
     ],
     python_requires=">=3.12",
     install_requires=requirements("runtime"),
-    extras_require={"learn": requirements("learn") + requirements("learn-assets")},
+    extras_require={
+        "learn": requirements("learn") + requirements("learn-assets"),
+        "cluster": requirements("cluster"),
+    },
     entry_points={
         "console_scripts": [
             "flowing-puppet = flowing_puppet_ros.cli:main",

@@ -9,6 +9,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from mcap.reader import make_reader
 from mcap.records import Channel, Message, Schema
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader
@@ -96,6 +97,17 @@ class Bag:
         except Exception as error:  # as above; what the caller does between two messages never lands here
             raise InputError(f"{self.path} is damaged: {str(error).rstrip('.') or type(error).__name__}") from error
 
+    def note(self, name: str) -> dict[str, str]:
+        """The texts that `BagWriter.note` put into the file's metadata under this name; empty without any."""
+        path = next(iter(sorted(self.path.glob("*.mcap"))), self.path) if self.path.is_dir() else self.path
+        if path.suffix != ".mcap":
+            return {}
+        try:
+            with path.open("rb") as stream:
+                return next((m.metadata for m in make_reader(stream).iter_metadata() if m.name == name), {})
+        except Exception:  # a damaged file fails in the library in any way; its messages may be whole
+            return {}
+
     @property
     def count(self) -> int:
         """Number of messages."""
@@ -156,6 +168,13 @@ def open_bag(path: Path | str, salvage: bool = False) -> Bag:
         if len(files) == 1 and (not complete or is_truncated(files[0])):
             path = files[0]
     return Bag(path, salvage)
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a file or folder looks like one bag: by its ending, its metadata, or the only bag file in it."""
+    if path.is_dir():
+        return (path / "metadata.yaml").exists() or len([*path.glob("*.mcap"), *path.glob("*.db3")]) == 1
+    return path.suffix in (".mcap", ".db3")
 
 
 def _no_bag(path: Path) -> str:
