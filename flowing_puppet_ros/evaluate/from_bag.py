@@ -56,7 +56,7 @@ class Recording:
     bodies: dict[int, list[Any]] = field(default_factory=dict)
     triangles: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     body_frame: str = ""
-    cloud_topics: dict[str, str] = field(default_factory=dict)  # "hull" and "body_vertices" -> topic
+    cloud_topics: dict[str, str] = field(default_factory=dict)  # "hull", "body_vertices", the input's "points" -> topic
     counts: dict[str, int] = field(default_factory=dict)  # messages of each topic that replay wrote
 
     @property
@@ -93,8 +93,11 @@ def read_recording(given: Bag, made: Bag) -> Recording:
                 _take(recording, frames, record.topic, record.type, record.message)
     for name, kind in made.topics.items():
         leaf = name.rpartition("/")[2]
-        if kind == CLOUD and leaf in ("hull", "points", "body_vertices"):
-            recording.cloud_topics["body_vertices" if leaf == "body_vertices" else "hull"] = name
+        if kind == CLOUD and leaf in ("hull", "body_vertices"):
+            recording.cloud_topics[leaf] = name
+    for name, kind in given.topics.items():
+        if kind == CLOUD and name.rpartition("/")[2] not in ("hull", "body_vertices"):
+            recording.cloud_topics.setdefault("points", name)
     _find_images(recording, given)
     _place_cameras(recording, frames)
     return recording
