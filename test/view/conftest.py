@@ -73,9 +73,15 @@ def replay(tmp_path: Path) -> Replay:
     """Makes the bags of a replay, given what they should hold; returns the paths of the input and the output."""
 
     def make(**content: bool) -> tuple[Path, Path]:
-        return write_replay(tmp_path, Content(**content))
+        return write_bags(tmp_path, Content(**content))
 
     return make
+
+
+@pytest.fixture(scope="session")
+def write_replay() -> Replay:
+    """Makes the bags of a replay in a folder; returns the paths of the input and the output."""
+    return lambda folder: write_bags(folder, Content())
 
 
 def joints_at(frame: int) -> dict[str, np.ndarray]:
@@ -83,7 +89,7 @@ def joints_at(frame: int) -> dict[str, np.ndarray]:
     return {name: point + np.array([0, 0.02 * frame, 0]) for name, point in JOINTS.items()}
 
 
-def write_replay(folder: Path, content: Content) -> tuple[Path, Path]:
+def write_bags(folder: Path, content: Content) -> tuple[Path, Path]:
     """Write the input and the output bag; returns their paths."""
     given, made = folder / "given", folder / "made"
     with BagWriter(given) as bag:
