@@ -53,6 +53,7 @@ setup(
     extras_require={
         "learn": requirements("learn") + requirements("learn-assets"),
         "cluster": requirements("cluster"),
+        "rerun": requirements("rerun"),
     },
     entry_points={
         "console_scripts": [

@@ -19,8 +19,8 @@ NAME = PACKAGE.name
 MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
 FOUNDATION = {"errors", "settings"}
-OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed"}
-OPTIONAL = {"learn": "learn", "cli.cluster": "cluster"}
+OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "rerun"}
+OPTIONAL = {"learn": "learn", "cli.cluster": "cluster", "view.rerun_file": "rerun"}
 """Where what a requirements file other than runtime.txt lists may be imported."""
 BELOW_STREAM = {"model", "evidence", "inference", "flow", "image", "body"}
 MAY_IMPORT = {
@@ -104,7 +104,7 @@ for name in {names}:
 
 def test_third_party_imports_are_required() -> None:
     """What the package imports stands in requirements/runtime.txt, or in another file where only a part imports it."""
-    distributions = importlib.metadata.packages_distributions()
+    distributions = {"rerun": ["rerun-sdk"]} | dict(importlib.metadata.packages_distributions())
     listed = {
         name: {
             re.split(r"[=<>\[]", line)[0].lower()

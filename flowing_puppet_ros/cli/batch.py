@@ -16,20 +16,15 @@ from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
-from threading import Lock
 from typing import Any
 
 from tqdm import tqdm
 
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.body.threads import usable
-from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.cli.task import Answer, Summary, Task, answer
+from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import make_out_folder
-
-Summary = dict[str, Any]
-
-# One input at a time a process: a process of a cluster may run several threads, and what works here uses all cores.
-_ALONE = Lock()
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,25 +45,6 @@ class Verb:
     tell: Callable[[Summary], None]
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One input on its way to a process or another machine."""
-
-    work: Callable[[Path, Any], Summary]
-    source: Path
-    options: Any
-    version: str = __version__
-
-
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """The summary of a finished input, or one sentence about what failed and its exit status."""
-
-    summary: Summary
-    error: str = ""
-    status: int = 0
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of verbs that take many inputs."""
     group = parser.add_argument_group("several inputs")
@@ -81,17 +57,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--again", action="store_true", help="redo inputs that are finished")
 
 
-def answer(task: Task) -> Answer:
-    """Do one task; whatever goes wrong is in the answer."""
-    if task.version != __version__:
-        return Answer({}, f"a worker has version {__version__} of this package and not {task.version}", 1)
-    try:
-        with _ALONE:
-            return Answer(task.work(task.source, task.options))
-    except PuppetError as error:
-        return Answer({}, str(error), error.exit_status)
-    except Exception as error:  # one input of a thousand must not end the others
-        return Answer({}, f"{task.source} failed: {type(error).__name__}: {error}", 1)
+def placed(path: Path, arguments: argparse.Namespace) -> Path:
+    """A path as the machines of a cluster find it, whose processes run in other folders."""
+    return path if arguments.scheduler is None else path.absolute()
 
 
 def run_batch(verb: Verb, sources: Sequence[Path], options: Any, out: Path, arguments: argparse.Namespace) -> int:

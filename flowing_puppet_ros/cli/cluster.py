@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from flowing_puppet_ros.cli.batch import Answer, Task, answer
+from flowing_puppet_ros.cli.task import Answer, Task, answer
 from flowing_puppet_ros.errors import InputError, PuppetError
 
 if TYPE_CHECKING:

@@ -10,12 +10,15 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from flowing_puppet_ros.body.fitter import FitterSettings
 from flowing_puppet_ros.body.frames import UNITS, UP_NAMES
-from flowing_puppet_ros.body.io import SUFFIXES
+from flowing_puppet_ros.body.io import SUFFIXES, read_scan
 from flowing_puppet_ros.body.people import ExtractionSettings
 from flowing_puppet_ros.cli import batch
 from flowing_puppet_ros.cli.fit_file import FitOptions, files_of, fit_file
@@ -59,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " <stem>-1 and so on, the likeliest person first",
     )
     ExtractionSettings.add_arguments(parser)
+    parser.add_argument("--rerun", type=Path, metavar="RRD", help="write the fits as a recording for the Rerun viewer")
     batch.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object per input on stdout")
 
@@ -66,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Fit every input; one that fails is reported and the others go on."""
     options = FitOptions(
-        out=arguments.out,
+        out=batch.placed(arguments.out, arguments),
         model=arguments.model,
         up=arguments.up,
         upright=arguments.upright,
@@ -76,18 +80,46 @@ def run(arguments: argparse.Namespace) -> int:
         settings=FitterSettings.from_arguments(arguments),
         extraction=ExtractionSettings.from_arguments(arguments),
     )
-    sources = [source for given in arguments.inputs for source in _scans(given)]
+    sources = [batch.placed(source, arguments) for given in arguments.inputs for source in _scans(given)]
     several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
-    verb = batch.Verb("fit", fit_file, files_of, lambda summary: _tell(summary, arguments.json))
+    finished: list[dict[str, Any]] = []
+    if arguments.rerun is not None:
+        from flowing_puppet_ros.view.rerun_file import rerun_sdk
+
+        rerun_sdk()
+
+    def tell(summary: dict[str, Any]) -> None:
+        _tell(summary, arguments.json)
+        finished.extend([] if "error" in summary else [summary])
+
+    verb = batch.Verb("fit", fit_file, files_of, tell)
     if several:
-        return batch.run_batch(verb, sources, options, arguments.out, arguments)
-    make_out_folder(arguments.out)
+        status = batch.run_batch(verb, sources, options, arguments.out, arguments)
+    else:
+        status = _one(verb, sources[0], options)
+    if arguments.rerun is not None and finished:
+        from flowing_puppet_ros.view.rerun_file import write_fits
+
+        write_fits(_fits(finished), arguments.rerun)
+    return status
+
+
+def _one(verb: batch.Verb, source: Path, options: FitOptions) -> int:
+    make_out_folder(options.out)
     try:
-        verb.tell(fit_file(sources[0], options, shown=True))
+        verb.tell(fit_file(source, options, shown=True))
     except PuppetError as error:
-        verb.tell({"input": str(sources[0]), "error": str(error)})
+        verb.tell({"input": str(source), "error": str(error)})
         raise
     return 0
+
+
+def _fits(summaries: list[dict[str, Any]]) -> Iterator[tuple[str, np.ndarray, Path]]:
+    for summary in summaries:
+        points = read_scan(Path(summary["input"])).points
+        for fit in summary.get("people", [summary]):
+            output = Path(fit["output"])
+            yield output.stem, points, output
 
 
 def _scans(given: Path) -> list[Path]:

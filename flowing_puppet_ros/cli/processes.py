@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
 from flowing_puppet_ros.body.threads import usable
-from flowing_puppet_ros.cli.batch import Answer, Task, answer
+from flowing_puppet_ros.cli.task import Answer, Task, answer
 
 # What tells the libraries how many threads to start; it is read when they are imported.
 THREADS = (

@@ -34,6 +34,7 @@ class Told:
 
     out: Path = field(repr=False)
     reports: Path | None
+    recordings: Path | None
     options: ReplayOptions
 
 
@@ -58,6 +59,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--report", type=Path, metavar="HTML", help="write a report with pictures and figures; of several, a folder"
     )
+    parser.add_argument(
+        "--rerun", type=Path, metavar="RRD", help="write a recording for the Rerun viewer; of several, a folder"
+    )
     batch.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object an input")
 
@@ -75,12 +79,21 @@ def run(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         salvage=arguments.salvage,
     )
-    sources = [source for given in arguments.inputs for source in bags_of(given)]
+    if arguments.rerun is not None:
+        from flowing_puppet_ros.view.rerun_file import rerun_sdk
+
+        rerun_sdk()
+    sources = [batch.placed(source, arguments) for given in arguments.inputs for source in bags_of(given)]
     if sources == arguments.inputs and len(sources) == 1 and arguments.scheduler is None:
         return _one(sources[0], arguments, options)
     if arguments.out.suffix == ".mcap":
         raise InputError(f"--out is {arguments.out}: the results of several bags need a folder")
-    told = Told(arguments.out, arguments.report, replace(options, progress=False))
+    told = Told(
+        out=batch.placed(arguments.out, arguments),
+        reports=arguments.report and batch.placed(arguments.report, arguments),
+        recordings=arguments.rerun and batch.placed(arguments.rerun, arguments),
+        options=replace(options, progress=False),
+    )
     verb = batch.Verb("replay", replay_one, files_of, lambda summary: _tell(summary, arguments.json))
     return batch.run_batch(verb, sources, told, arguments.out, arguments)
 
@@ -90,6 +103,8 @@ def _one(source: Path, arguments: argparse.Namespace, options: ReplayOptions) ->
     try:
         if arguments.report:
             _report(source, arguments.out, arguments.report, summary)
+        if arguments.rerun:
+            _record(source, arguments.out, arguments.rerun, summary)
     finally:
         # The output bag is there, whatever becomes of the report.
         _tell(summary, arguments.json)
@@ -103,12 +118,14 @@ def replay_one(source: Path, told: Told) -> dict[str, Any]:
     summary = replay(source, target, told.options)
     if told.reports is not None:
         _report(source, target, told.reports / f"{name}.html", summary)
+    if told.recordings is not None:
+        _record(source, target, told.recordings / f"{name}.rrd", summary)
     return summary
 
 
 def files_of(summary: dict[str, Any]) -> list[Path]:
     """The files that a summary of `replay_one` names."""
-    return [Path(summary[name]) for name in ("output", "report") if name in summary]
+    return [Path(summary[name]) for name in ("output", "report", "rerun") if name in summary]
 
 
 def _report(source: Path, target: Path, report: Path, summary: dict[str, Any]) -> None:
@@ -116,6 +133,13 @@ def _report(source: Path, target: Path, report: Path, summary: dict[str, Any]) -
 
     write_report(source, target, report, summary)
     summary["report"] = str(report)
+
+
+def _record(source: Path, target: Path, recording: Path, summary: dict[str, Any]) -> None:
+    from flowing_puppet_ros.view.rerun_file import write_replay
+
+    write_replay(source, target, recording)
+    summary["rerun"] = str(recording)
 
 
 def _tell(summary: dict[str, Any], as_json: bool) -> None:
@@ -165,6 +189,5 @@ def _text(summary: dict[str, Any]) -> str:
         f"({summary['frames_per_second']:.1f} images a second)",
         f"results: {summary['output']}",
     ]
-    if "report" in summary:
-        lines.append(f"report: {summary['report']}")
+    lines += [f"{name}: {summary[name]}" for name in ("report", "rerun") if name in summary]
     return "\n".join(lines)

@@ -8,11 +8,8 @@ import struct
 import numpy as np
 
 from flowing_puppet_ros.bag.reader import Bag, Record
-from flowing_puppet_ros.evaluate.from_bag import BODIES, CLOUD, IMAGE, PUPPETS, namespace
+from flowing_puppet_ros.evaluate.from_bag import BODIES, CLOUD, IMAGE, MADE, PUPPETS, leaf, namespace
 from flowing_puppet_ros.stream.component import SILHOUETTES
-
-MADE = ("overlay", "part_labels", "preview", "hull", "body_vertices")
-"""Last words of topics that results have, too."""
 
 Times = dict[int, int]  # stamp -> log time, both ns
 
@@ -26,7 +23,7 @@ def timing(given: Bag, made: Bag) -> dict[str, float]:
     sensors = {
         name: _times(given, name)
         for name, kind in given.topics.items()
-        if (kind in IMAGE or kind == CLOUD) and _leaf(name) not in MADE
+        if (kind in IMAGE or kind == CLOUD) and leaf(name) not in MADE
     }
     arrived: Times = {}
     for times in sensors.values():
@@ -34,7 +31,7 @@ def timing(given: Bag, made: Bag) -> dict[str, float]:
             arrived[stamp] = max(time, arrived.get(stamp, time))
     figures: dict[str, float] = {}
     for label, role, unit in (("puppets", PUPPETS, "images"), ("bodies", BODIES, "clouds")):
-        topics = [name for name, kind in made.topics.items() if kind == role and _leaf(name) == label]
+        topics = [name for name, kind in made.topics.items() if kind == role and leaf(name) == label]
         results = {topic: _times(made, topic) for topic in topics}
         late = [(time - arrived.get(stamp, stamp)) * 1e-9 for one in results.values() for stamp, time in one.items()]
         if late:
@@ -59,10 +56,6 @@ def _inputs(topic: str, role: str, sensors: dict[str, Times], given: Bag, made: 
     if beside or not clouds:
         return beside
     return {stamp for name, kind in made.topics.items() if kind == SILHOUETTES for stamp in _times(made, name)}
-
-
-def _leaf(topic: str) -> str:
-    return topic.removesuffix("/compressed").rpartition("/")[2]
 
 
 def _times(bag: Bag, topic: str) -> Times:

@@ -33,9 +33,10 @@ figure{margin:10px 0}img{max-width:100%;height:auto;border-radius:4px;vertical-a
 .row{display:flex;flex-wrap:wrap;gap:12px;align-items:flex-start}.row figure{margin:0 0 6px;flex:0 1 auto}
 .row img{outline:1px solid var(--rule);outline-offset:-1px}.row.three figure{flex:0 1 32%}
 .row.views{flex-wrap:nowrap;overflow-x:auto}.row.views figure{flex:0 1 24%;min-width:150px}
-.frame{display:none}.frame.on{display:block}.frame img{height:min(62vh,420px);width:auto;object-fit:contain;object-position:left}
+.frame{display:none}.frame.on{display:block}
+.frame img{height:min(62vh,420px);width:auto;object-fit:contain;object-position:left}
 .panes{display:flex;gap:16px;align-items:stretch}.panes>*{flex:1 1 0;min-width:0}.pictures{flex:0 1 auto;max-width:58%}
-.three{display:flex;flex-direction:column}.three canvas{width:100%;flex:1 1 380px;min-height:380px;touch-action:none;
+.space{display:flex;flex-direction:column}.space canvas{width:100%;flex:1 1 380px;min-height:380px;touch-action:none;
 border:1px solid var(--rule);border-radius:4px;cursor:grab}[hidden]{display:none!important}
 .controls{display:flex;flex-wrap:wrap;gap:6px 14px;align-items:center;margin:8px 0}.controls label{white-space:nowrap}
 .scrub{position:sticky;bottom:0;background:var(--bg);border-top:1px solid var(--rule);padding:8px 0;margin:0;z-index:1;
@@ -47,7 +48,8 @@ padding:3px 14px}
 svg.plot{width:100%;max-width:820px;height:auto;display:block}
 svg .grid{stroke:var(--rule);stroke-width:1}svg text{fill:var(--soft);font-size:12px}
 svg .end{text-anchor:end}svg .centre{text-anchor:middle}svg .mid{dominant-baseline:central}
-svg .now{stroke:var(--fg);stroke-width:1.2}svg[data-time]{cursor:crosshair;touch-action:pan-y}
+svg .now{display:none;stroke:var(--fg);stroke-width:1.2}.timeline svg .now{display:inline}
+.timeline svg{cursor:crosshair;touch-action:pan-y}
 svg .line{fill:none;stroke-width:1.8;stroke-linejoin:round}
 .legend{display:flex;flex-wrap:wrap;gap:2px 18px;margin:4px 0 10px;font-size:.9rem;color:var(--soft)}
 .key{display:inline-block;width:22px;height:4px;border-radius:2px;margin-right:7px;vertical-align:middle}
@@ -57,7 +59,7 @@ details{margin:10px 0}summary{cursor:pointer}
 """ + "".join(f".s{k}{{stroke:var(--c{k})}}.d{k}{{fill:var(--c{k})}}.k{k}{{background:var(--c{k})}}" for k in range(8))
 
 # Without scripts every frame is shown, one below the other, and what needs them is not.
-NO_SCRIPT = "<noscript><style>.frame{display:block}.scrub,.three,svg .now{display:none}</style></noscript>"
+NO_SCRIPT = "<noscript><style>.frame{display:block}.scrub,.space,.timeline svg .now{display:none}</style></noscript>"
 
 
 def script(name: str) -> str:

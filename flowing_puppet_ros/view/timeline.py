@@ -14,12 +14,12 @@ from flowing_puppet_ros.view.page import figure, json_block
 SCRIPTS = ("scene.js", "timeline.js")
 
 _THREE = (
-    '<div class="three"><canvas tabindex="0" role="application" aria-label="3D view of the bodies: drag or arrow keys '
+    '<div class="space"><canvas tabindex="0" role="application" aria-label="3D view of the bodies: drag or arrow keys '
     'turn, plus and minus zoom, Home resets"></canvas><div class="controls">'
     '<label><input type="checkbox" checked data-shows="mesh"> bodies</label>'
     '<label><input type="checkbox" checked data-shows="points"> points</label>'
     '<button type="button" data-home>Reset view</button><span class="soft">drag: turn; two fingers, right button or '
-    'Shift: move; wheel: zoom</span></div></div><p class="no-three soft" hidden>This browser has no WebGL 2, so there '
+    'Shift: move; wheel: zoom</span></div></div><p class="no-space soft" hidden>This browser has no WebGL 2, so there '
     "is no 3D view; the still pictures below show the bodies.</p>"
 )
 

@@ -18,8 +18,8 @@ from batch_work import Plan, work  # type: ignore[import-not-found]
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.cli import main
-from flowing_puppet_ros.cli.batch import Task
 from flowing_puppet_ros.cli.processes import in_processes
+from flowing_puppet_ros.cli.task import Task
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 FAST = ["--particles", "4", "--iterations", "2", "--restarts", "0", "--limb-rounds", "0", "--lm-steps", "1"]

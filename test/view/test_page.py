@@ -166,7 +166,7 @@ def test_without_webgl_the_still_pictures_are_named(report: Path, browser: Brows
     context = browser.new_context(viewport={"width": 1100, "height": 900})
     context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page = opener(context)
-    assert page.locator(".no-three").is_visible() and not page.locator("canvas").is_visible()
+    assert page.locator(".no-space").is_visible() and not page.locator("canvas").is_visible()
     move(page, 2)
     assert page.locator(".frame.on figcaption").text_content() == "front, 0.20 s"
     context.close()

@@ -195,6 +195,15 @@ def test_the_same_bags_make_the_same_page(replay: Replay, tmp_path: Path) -> Non
     assert pages[0] == pages[1]
 
 
+def test_the_output_alone_shows_its_overlays_bodies_and_settings(replay: Replay) -> None:
+    _, made = replay(overlays=True)
+    data = gather(made, made)
+    assert [round(float(picture.mean()) / 40) for _, picture in data.strip] == [0, 1, 2, 3, 4]
+    assert data.scene is not None and len(data.scene["frames"]) == 3 and data.flow == []
+    text = Page(report_page(data)).text
+    assert "front/puppet_tracker: settings" in text and "particles" in text and "42" in text
+
+
 def test_settings_that_are_alike_stand_in_one_table(replay: Replay) -> None:
     summary = {
         "settings": {"cam01/tracker": {"seed": 3}, "cam02/tracker": {"seed": 3}, "fitter": {"seed": 4}},

@@ -10,7 +10,7 @@ class Timeline {
     this.button = root.querySelector('[data-play]');
     this.said = root.querySelector('output');
     this.pictures = [...root.querySelectorAll('.frame')];
-    this.plots = [...document.querySelectorAll('svg[data-time]')];
+    this.plots = [...root.querySelectorAll('svg[data-time]')];
     this.scene = this.makeScene();
     this.timer = 0;
     this.slider.addEventListener('input', () => { this.stop(); this.show(+this.slider.value); });
@@ -31,8 +31,8 @@ class Timeline {
       return scene;
     } catch (error) {
       // The still pictures further down show the bodies, too.
-      this.root.querySelector('.three').hidden = true;
-      this.root.querySelector('.no-three').hidden = false;
+      this.root.querySelector('.space').hidden = true;
+      this.root.querySelector('.no-space').hidden = false;
       return null;
     }
   }
