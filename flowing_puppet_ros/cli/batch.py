@@ -13,7 +13,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,11 +72,11 @@ def run_batch(verb: Verb, sources: Sequence[Path], options: Any, out: Path, argu
         raise InputError(f"--jobs is {arguments.jobs}; give 1 or more")
     _refuse_twins(sources)
     make_out_folder(out)
-    ledger = Ledger(out / f"{verb.name}.jsonl")
+    ledger = Ledger(out / f"{verb.name}.jsonl", verb.files)
     keys = [_key(verb.name, source, options) for source in sources]
     answers: dict[int, Answer] = {}
     for index, key in enumerate(keys):
-        summary = None if arguments.again else ledger.finished(key, verb.files)
+        summary = None if arguments.again else ledger.finished(key)
         if summary is not None:
             answers[index] = Answer(summary)
     todo = [index for index in range(len(sources)) if index not in answers]
@@ -145,35 +145,40 @@ def _refuse_twins(sources: Iterable[Path]) -> None:
 
 
 class Ledger:
-    """What is finished in a folder of results: a line of JSON for each, the last one of a key counts.
+    """What is finished in a folder of results: a line of JSON for each, the last one that wrote a file counts.
 
     Only the process that runs the batch writes it; a line that was cut off in the middle does not count.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, files: Callable[[Summary], list[Path]]) -> None:
         self._path = path
+        self._files = files
         self._summaries: dict[str, Summary] = {}
+        self._writers: dict[Path, str] = {}
         try:
             lines = path.read_text("utf8", errors="replace").splitlines() if path.exists() else []
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}; remove it to start anew") from error
         for line in lines:
-            try:
+            with suppress(ValueError, KeyError, TypeError, RecursionError):
                 entry = json.loads(line)
-                self._summaries[entry["key"]] = dict(entry["summary"])
-            except (ValueError, KeyError, TypeError, RecursionError):
-                continue
+                self._take(str(entry["key"]), dict(entry["summary"]))
 
-    def finished(self, key: str, files: Callable[[Summary], list[Path]]) -> Summary | None:
-        """The summary of a finished input whose files are still there, else None."""
+    def _take(self, key: str, summary: Summary) -> None:
+        self._writers |= dict.fromkeys(self._files(summary), key)
+        self._summaries[key] = summary
+
+    def finished(self, key: str) -> Summary | None:
+        """The summary of a finished input whose files are still there and its own, else None."""
         summary = self._summaries.get(key)
-        try:
-            return summary if summary is not None and all(path.is_file() for path in files(summary)) else None
-        except (KeyError, TypeError):
+        if summary is None:
             return None
+        whole = all(self._writers[path] == key and path.is_file() for path in self._files(summary))
+        return summary if whole else None
 
     def add(self, key: str, summary: Summary) -> None:
         """Write down that an input is finished."""
+        self._take(key, summary)
         with self._path.open("a", encoding="utf8") as stream:
             # The line before may have been cut off by a kill.
             stream.write("\n" * bool(stream.tell()) + json.dumps({"key": key, "summary": summary}))
