@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from mcap.reader import make_reader
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader
 from ruamel.yaml import YAML
@@ -185,6 +186,17 @@ class Bag:
         chosen = set(self.details if topics is None else topics)
         yield from heapq.merge(*(part.messages(chosen) for part in self._parts), key=lambda record: record.log_time)
 
+    def note(self, name: str) -> dict[str, str]:
+        """The texts that `BagWriter.note` put into the file's metadata under this name; empty without any."""
+        path = next(iter(sorted(self.path.glob("*.mcap"))), self.path) if self.path.is_dir() else self.path
+        if path.suffix != ".mcap":
+            return {}
+        try:
+            with path.open("rb") as stream:
+                return next((m.metadata for m in make_reader(stream).iter_metadata() if m.name == name), {})
+        except Exception:  # a damaged file fails in the library in any way; its messages may be whole
+            return {}
+
     @property
     def count(self) -> int:
         """Number of messages."""
@@ -240,6 +252,18 @@ def _is_indexed(storage: Any) -> bool:
     """Whether a file is a database, or an MCAP file whose chunks are all indexed."""
     chunks = getattr(storage, "chunks", None)
     return chunks is None or (bool(chunks) and all(chunk.channel_count for chunk in chunks))
+
+
+def is_bag(path: Path) -> bool:
+    """Whether a file or folder looks like one bag: by its ending, or its metadata, or because one was recorded in it.
+
+    A recorder that was stopped by force leaves no metadata, but its files `<folder>_0`, `<folder>_1`, ...
+    """
+    if path.is_dir():
+        files = [*path.glob("*.mcap"), *path.glob("*.db3")]
+        split = all(re.fullmatch(re.escape(path.resolve().name) + r"_\d+", file.stem) for file in files)
+        return (path / "metadata.yaml").exists() or len(files) == 1 or (len(files) > 1 and split)
+    return path.suffix in (".mcap", ".db3")
 
 
 def _no_bag(path: Path) -> str:
