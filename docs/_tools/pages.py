@@ -82,7 +82,11 @@ def port_row(port: Port) -> list[str]:
         notes.append("optional")
     if port.lazy:
         notes.append("made only while somebody listens")
-    shown = f"[`{package}/{message}`](/generated/messages.md)" if package == "flowing_puppet_msgs" else f"`{package}/{message}`"
+    shown = (
+        f"[`{package}/{message}`](/generated/messages.md)"
+        if package == "flowing_puppet_msgs"
+        else f"`{package}/{message}`"
+    )
     return [f"`{port.name}`", shown, QOS[port.qos], ", ".join(notes)]
 
 
