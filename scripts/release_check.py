@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -22,6 +23,7 @@ MANIFESTS = ("package.xml", "msg_defs/package.xml")
 LICENSE = "Apache-2.0"
 SPDX = f"SPDX-License-Identifier: {LICENSE}"
 SOURCES = (".py", ".sh", ".js", ".css", ".yaml", ".toml", "CMakeLists.txt", "package.xml", "Makefile", ".ci/run")
+NOT_COPIED = (".*", "build", "install", "log", "out", "docs", "test", "bags", "*.egg-info", "__pycache__")
 # What a package without would install and then not work.
 CARRIED = ("weights/*.npz", "weights/*.md", "annotate/page/*", "interfaces/*/*/*.msg", "py.typed")
 
@@ -79,8 +81,10 @@ def check_tree(root: Path) -> Iterator[str]:
 def check_packages(root: Path) -> Iterator[str]:
     """The source archive and the wheel build, and hold weights, page files and interface definitions."""
     with tempfile.TemporaryDirectory() as folder:
-        code = f"import setuptools.build_meta as b; print(b.build_sdist({folder!r})); print(b.build_wheel({folder!r}))"
-        done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True)
+        # A copy, since a `build` folder of earlier packages would lend them its files.
+        copy = shutil.copytree(root, Path(folder) / "copy", ignore=shutil.ignore_patterns(*NOT_COPIED))
+        code = f"import setuptools.build_meta as b; b.build_sdist({folder!r}); b.build_wheel({folder!r})"
+        done = subprocess.run([sys.executable, "-c", code], cwd=copy, capture_output=True, text=True)
         if done.returncode:
             yield f"the packages do not build: {(done.stderr.strip().splitlines() or ['no reason given'])[-1]}"
             return
