@@ -5,13 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arms import Sight
-from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
+from flowing_puppet_ros.image.detector import DetectorSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection
 from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
@@ -26,23 +28,36 @@ class DetectionSettings(Settings):
     least_person: float = setting(0.3, "probability from which a detected person is tracked", low=0.0, high=1.0)
 
 
+class Detector(Protocol):
+    """What finds people in one image, see `detector.PartDetector`."""
+
+    def detect(self, image: NDArray[np.uint8], settings: DetectorSettings) -> list[PersonDetection]:
+        """The people in an image, the surest first."""
+        ...
+
+
 @dataclass(slots=True, eq=False)
 class VideoTracker:
     """Runs the detector on the images of a video and the tracker on what it finds."""
 
     tracker: FlowingPuppetTracker
-    detector: PartDetector
+    detector: Detector
     likelihood: Likelihood
     settings: DetectionSettings
     images: int = 0
 
-    def step(self, image: NDArray[np.uint8], stamp_ns: int) -> tuple[TrackResult, list[PersonDetection]]:
-        """Take the next `image` (H, W, 3) RGB or (H, W) grey; the result, and whom the detector found if it looked."""
+    def step(
+        self, image: NDArray[np.uint8], stamp_ns: int, flow: FlowPair | None = None
+    ) -> tuple[TrackResult, list[PersonDetection]]:
+        """Take the next `image` (H, W, 3) RGB or (H, W) grey; the result, and whom the detector found if it looked.
+
+        `flow` is as `FlowingPuppetTracker.step` takes it.
+        """
         look = self.images % self.settings.detect_every == 0
         self.images += 1
-        found = self._detect(image) if look else []
+        found = self.detect(image) if look else []
         keypoints = [person.keypoints for person in found] if look else None
-        return self.tracker.step(image, stamp_ns, keypoints), found
+        return self.tracker.step(image, stamp_ns, keypoints, flow), found
 
     def sights(
         self, image: NDArray[np.uint8], result: TrackResult, found: Sequence[PersonDetection]
@@ -53,7 +68,8 @@ class VideoTracker:
         with threadpool_limits(1):
             return {puppet.id: self._sight(puppet, colour, found) for puppet in result.puppets}
 
-    def _detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
+    def detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
+        """The people in an image who are sure enough to be tracked."""
         people = self.tracker.settings.most_people
         return self.detector.detect(
             image, DetectorSettings(least_confidence=self.settings.least_person, most_people=min(people, 80))
