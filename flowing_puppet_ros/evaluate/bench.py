@@ -29,6 +29,7 @@ from flowing_puppet_ros.body.search import Search, SearchWeights
 from flowing_puppet_ros.body.tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.evaluate import plain
 from flowing_puppet_ros.evaluate.synthetic_scans import surface_samples
+from flowing_puppet_ros.evaluate.tables import Row
 from flowing_puppet_ros.evidence.cloud import CloudGrid, look_up
 from flowing_puppet_ros.inference import diverse
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -39,7 +40,6 @@ GROWTH = {"points": (2500, 5000, 10000), "particles": (10, 20, 40), "iterations"
 BASE = {"points": 5000, "particles": 20, "iterations": 10}
 PLAIN_SIZE = (10, 3)  # particles and iterations of the search that is also run plainly
 TRACKED_POINTS, TRACKED_FRAMES, WALK = 5000, 6, 0.03  # points, frames, metres a frame
-Row = dict[str, Any]
 
 
 class Bench:
