@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from flowing_puppet_ros.stream.visual_hull import VisualHullComponent
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PACKAGE = ROOT / "flowing_puppet_ros"
+MEASURED = ROOT / "docs" / "measured"
 API = {
     "model": "What a puppet is",
     "evidence": "How well a puppet explains data",
@@ -41,7 +43,14 @@ QOS = {
 
 def write(folder: Path) -> None:
     """Write every generated page; files whose text is unchanged are not touched."""
-    for name, text in [*node_tables(), *interfaces.pages(), *commands.pages(), *api_pages(), *model_cards()]:
+    for name, text in [
+        *node_tables(),
+        *bench_tables(),
+        *interfaces.pages(),
+        *commands.pages(),
+        *api_pages(),
+        *model_cards(),
+    ]:
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         if not path.is_file() or path.read_text() != text:
@@ -100,6 +109,21 @@ def parameter_table(*settings: type[Settings]) -> str:
         default = repr(info.default).replace("'", '"') if info.type is str else str(info.default).lower()
         rows.append([f"`{info.name}`", f"`{default}`", info.unit, limits, info.help])
     return table(["parameter", "default", "unit", "range", "meaning"], rows)
+
+
+def bench_tables() -> Iterator[tuple[str, str]]:
+    """Yield the tables of what `flowing-puppet bench` measured, as it was kept in docs/measured."""
+    for path in sorted(MEASURED.glob("*.json")):
+        for part, rows in json.loads(path.read_text()).items():
+            heads = [head.replace("_", " ") for head in rows[0]]
+            yield f"bench/{part}.md", table(heads, ([figure(value) for value in row.values()] for row in rows))
+
+
+def figure(value: object) -> str:
+    """Return a measured value to three digits; None, which stands for no finite number, is never."""
+    if value is None:
+        return "never"
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def api_pages() -> Iterator[tuple[str, str]]:

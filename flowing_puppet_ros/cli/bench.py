@@ -22,6 +22,8 @@ PARTS = {
     "growth": Bench.growth,
     "tracking": Bench.tracking,
     "fits": Bench.fits,
+    "images": Bench.images,
+    "replay": Bench.replay,
 }
 
 

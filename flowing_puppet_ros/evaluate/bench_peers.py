@@ -90,7 +90,8 @@ def gradient(folder: Path, count: int, seed: int, mocap: Path | None) -> list[Ro
         truth = person.template_vertices(fitter.model.name)
         with tempfile.TemporaryDirectory() as place:
             path = Path(place) / "task.npz"
-            np.savez(path, **body, cloud=cloud.points[chosen], truth=truth)
+            task: dict[str, Any] = {**body, "cloud": cloud.points[chosen], "truth": truth}
+            np.savez(path, **task)
             curve = np.array(GRADIENT.run(folder, str(path), str(STEPS), str(EVERY))["curve"])
         rows.append(gradient_row(score.vertex_error, score.seconds, curve))
     return rows
