@@ -87,10 +87,14 @@ def test_a_peer_is_installed_once_and_speaks_json(tmp_path: Path, monkeypatch: p
     (tmp_path / "echo.py").write_text("import json, sys\nprint('noise')\nprint(json.dumps(sys.argv[1:]))\n")
     (tmp_path / "fail.py").write_text("raise SystemExit('no such thing')\n")
     monkeypatch.setattr(bench_peers, "SCRIPTS", tmp_path)
-    calls = []
-    monkeypatch.setattr(
-        bench_peers, "_run", lambda command, run=bench_peers._run: calls.append(command) or run(command)
-    )
+    calls: list[list[str]] = []
+    really = bench_peers._run
+
+    def run(command: list[str]) -> str:
+        calls.append(command)
+        return really(command)
+
+    monkeypatch.setattr(bench_peers, "_run", run)
     (tmp_path / "echo" / "bin").mkdir(parents=True)
     (tmp_path / "echo" / "bin" / "python").symlink_to(sys.executable)
     (tmp_path / "echo" / "installed").write_text("()")
