@@ -128,7 +128,7 @@ def test_third_party_imports_are_required() -> None:
 def test_locked_versions_cover_the_requirements() -> None:
     folder = ROOT / "requirements"
     locked = {line.split("==")[0] for line in (folder / "lock.txt").read_text().splitlines()}
-    for name in ("runtime", "learn", "cluster", "dev", "build", "ros"):
+    for name in ("runtime", "learn", "cluster", "dev", "docs", "build", "ros"):
         for line in (folder / f"{name}.txt").read_text().splitlines():
             if not line.startswith("#"):
                 assert re.split(r"[=<>\[]", line)[0].lower().replace("_", "-") in {

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure speed as ratios taken in one run: look-ups, steps, search, growth, tracking, whole fits."""
+"""Measure speed as ratios taken in one run: look-ups, steps, search, growth, tracking, whole fits, images, replay.
+
+`bench peers` compares with what people use today.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bench import Bench
 from flowing_puppet_ros.evaluate.tables import text_table
 
+SUBVERBS = {"peers": "bench_peers"}
 PARTS = {
     "look-ups": Bench.look_ups,
     "steps": Bench.steps,
@@ -18,6 +22,8 @@ PARTS = {
     "growth": Bench.growth,
     "tracking": Bench.tracking,
     "fits": Bench.fits,
+    "images": Bench.images,
+    "replay": Bench.replay,
 }
 
 
