@@ -22,7 +22,7 @@ from flowing_puppet_ros.image.arm_path import PathSettings
 from flowing_puppet_ros.image.arms import Sight
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
-from flowing_puppet_ros.image.detector_person import PersonDetection
+from flowing_puppet_ros.image.detector_person import PersonDetection, Place
 from flowing_puppet_ros.image.flowing import LoopSettings
 from flowing_puppet_ros.image.flowing_clip import FlowingClip, given_sights
 from flowing_puppet_ros.image.flowing_energy import EnergySettings
@@ -69,6 +69,16 @@ class _Remembering:
 
     detector: Detector
     _seen: dict[tuple[bytes, DetectorSettings], list[PersonDetection]] = field(default_factory=dict)
+    _candidates: dict[bytes, list[Place]] = field(default_factory=dict)
+
+    def candidates(self, image: NDArray[np.uint8]) -> list[Place]:
+        key = image.tobytes()
+        if key not in self._candidates:
+            self._candidates[key] = self.detector.candidates(image)
+        return self._candidates[key]
+
+    def at(self, image: NDArray[np.uint8], places: Sequence[Place]) -> list[PersonDetection]:
+        return self.detector.at(image, places)
 
     def detect(self, image: NDArray[np.uint8], settings: DetectorSettings) -> list[PersonDetection]:
         key = image.tobytes(), settings
@@ -131,15 +141,18 @@ def _keypoints(run: ClipRun, video: VideoTracker, frame: Frame) -> Sequence[Keyp
     return [person.keypoints for person in video.detect(frame.image)]
 
 
-def _steps(run: ClipRun, still: bool = False) -> Iterator[tuple[TrackResult, dict[str, Sight] | None]]:
-    """Step through the clip; `still` tells the tracker that nothing moves."""
+def _steps(
+    run: ClipRun, still: bool = False, whole: bool = True
+) -> Iterator[tuple[TrackResult, dict[str, Sight] | None]]:
+    """Step through the clip; `still` tells the tracker that nothing moves, `whole` searches the clip for people first."""
     video, tracker = run.video(), run.tracker()
+    paths = video.search(frame.image for frame in run.frames) if whole and run.given is None else None
     for frame in run.frames:
         flow = _no_flow(run, frame) if still else None
         if run.given is not None:
             yield tracker.step(frame.image, frame.stamp_ns, run.keypoints(frame), flow), None
         else:
-            result, found = video.step(frame.image, frame.stamp_ns, flow)
+            result, found = video.step(frame.image, frame.stamp_ns, flow, paths)
             yield result, video.sights(frame.image, result, found)
 
 
@@ -150,7 +163,7 @@ def _no_flow(run: ClipRun, frame: Frame) -> FlowPair:
 
 
 def _live(run: ClipRun) -> Track:
-    return [_located(result.puppets) for result, _ in _steps(run)]
+    return [_located(result.puppets) for result, _ in _steps(run, whole=False)]
 
 
 def _whole(run: ClipRun, still: bool = False) -> Track:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -57,7 +58,8 @@ class ComponentNode[C: Component](Node):
         self._diagnostics = Diagnostics(self.get_fully_qualified_name(), name)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported = self._steady.now()
-        self._outputs = {port.name: self._open_output(port) for port in self.component.outputs}
+        outputs = self.component.outputs
+        self._outputs = {port.name: self._open_output(port) for port in outputs if not port.per_person}
         self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
         self._optional = [port for port in self.component.inputs if port.optional]
         self._lazy = [port for port in self.component.outputs if port.lazy]
@@ -119,11 +121,19 @@ class ComponentNode[C: Component](Node):
             self.get_logger().warning(warning)
 
     def _publish(self, name: str, message: Any) -> None:
+        """Publish on an output; that of a person is opened at the first message and closed at None."""
+        if message is None:
+            for publisher, _ in self._outputs.pop(name, []):
+                self.destroy_publisher(publisher)
+            return
+        port = self.component.output(name)
+        if name not in self._outputs:
+            self._outputs[name] = self._open_output(replace(port, name=name))
         extra = len(self._outputs[name]) > 1
         for publisher, converted in self._outputs[name]:
             if not extra or publisher.get_subscription_count():
                 publisher.publish(converted(message))
-        self._diagnostics.passed(name)
+        self._diagnostics.passed(port.name)
         if hasattr(message, "header"):
             self._diagnostics.took((self.get_clock().now().nanoseconds - header_ns(message.header)) * 1e-9)
 
