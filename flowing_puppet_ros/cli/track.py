@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this verb."""
     parser.add_argument("input", help="video file, folder of images, or bag (.mcap, .db3 or a rosbag2 folder)")
     parser.add_argument("--out", required=True, help="tracks.json to write")
-    parser.add_argument("--init", help="keypoints.json, people of one or more frames, instead of the detector")
+    parser.add_argument("--init", help="keypoints.json or sticks.txt, people of one or more frames, for the detector")
     parser.add_argument("--topic", default="", help="image topic of a bag [the first camera with detections]")
     parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated .mcap")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")

@@ -66,6 +66,7 @@ class FrameSource:
         capture = cv2.VideoCapture(str(self.path))
         index, broken = 0, 0
         try:
+            # Containers often announce more frames than they have: what is missing at the end says nothing.
             while broken <= MOST_BROKEN:
                 read, image = capture.read()
                 if read:
@@ -78,8 +79,6 @@ class FrameSource:
                 else:
                     broken += 1
                 index += 1
-            if index - broken < self.count and self.warn is not None:
-                self.warn(f"{self.path} ends after {index - broken} of the {self.count} frames that it announces")
         finally:
             capture.release()
 

@@ -83,7 +83,3 @@ def test_a_video_goes_on_after_frames_that_cannot_be_decoded(tmp_path: Path) -> 
     assert frames[-1].index >= 27
     assert abs(int(frames[-1].image[0, 0, 2]) - (290 - 256)) < 6, "the last image is the last"
     assert len(frames) == 30 or said
-    (tmp_path / "c.avi").write_bytes(data[: len(data) // 2])
-    said.clear()
-    assert len(list(open_frames(tmp_path / "c.avi", said.append))) < 30
-    assert said == [] or "ends after" in said[-1]
