@@ -27,6 +27,7 @@ from flowing_puppet_ros.image.association import Detection, associate
 from flowing_puppet_ros.image.carry import Carriage, Grid, carry_people, paint_people
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.people import Person, TrackerSettings
+from flowing_puppet_ros.image.shots import colours_of, is_cut
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_render import depth_order
 from flowing_puppet_ros.model.ds_shape import PuppetShape, View
@@ -89,11 +90,12 @@ class TrackResult:
 
 @dataclass(slots=True, eq=False)
 class _Previous:
-    """What the next step needs of an image: its stamp, the grid and the small grey picture."""
+    """What the next step needs of an image: its stamp, the grid, the small grey picture and its colours."""
 
     stamp_ns: int
     grid: Grid
     grey: NDArray[np.uint8]
+    colours: Floats
 
 
 class FlowingPuppetTracker:
@@ -128,19 +130,23 @@ class FlowingPuppetTracker:
 
         `detections` are the people a detector found in this image; None when none ran, empty when it found nobody.
         `flow` is (forward from the previous image, backward to it), each (h, w, 2) in pixels of its own grid of any
-        resolution, NaN unknown; computed here when not given. A stamp before the previous one or an image of another
-        size restarts the tracker with a warning. InputError for what is no image.
+        resolution, NaN unknown; computed here when not given. A stamp before the previous one, an image of another size
+        and a cut between shots restart the tracker with a warning. InputError for what is no image.
         """
         image = as_image(image)
         size = (image.shape[1], image.shape[0])
         grid = Grid(size, working_size(image.shape, self.optical_flow.settings.max_side))
         warnings = self._restart_if_broken(stamp_ns, size)
         previous = self._previous
-        self._previous = _Previous(stamp_ns, grid, self.optical_flow.prepare(image))
+        self._previous = _Previous(stamp_ns, grid, self.optical_flow.prepare(image), colours_of(image))
         carriage, pair = None, None
         if previous is not None and self.people:
             pair = self._flow(previous, flow, warnings)
-            carriage = carry_people(self.model, self.people, pair, grid, self.settings)
+            if is_cut(previous.colours, self._previous.colours, pair):
+                warnings.append("the picture changes as at a cut between shots: tracking starts anew")
+                self.people, pair = [], None
+            else:
+                carriage = carry_people(self.model, self.people, pair, grid, self.settings)
         self._take(detections, warnings)
         self.people = [person for person in self.people if self._lives(person, size)]
         for person in self.people:
