@@ -158,7 +158,7 @@ class _Replay:
                 qos = "latched" if self._new_name[name] == STATIC else detail.qos
                 writer.add_topic(self._new_name[name], detail.type, qos)
         for topic, port in self._outputs.items():
-            if port.name in _TOO_LARGE:
+            if port.name in _TOO_LARGE or port.per_person:
                 continue
             if port.compressed:
                 writer.add_topic(f"{topic}/compressed", COMPRESSED_IMAGE, port.qos)
@@ -193,15 +193,19 @@ class _Replay:
 
     def _emit(self, writer: BagWriter, log_time: int, instance: Instance, outputs: Output) -> None:
         """Write messages and hand them on, in the order in which they were made."""
-        queue = deque((instance.topic(port), message) for port, message in outputs)
+        queue = deque((instance, port, message) for port, message in outputs)
         while queue:
-            topic, message = queue.popleft()
-            self._write(writer, topic, log_time, message, self._outputs[topic])
+            source, name, message = queue.popleft()
+            if message is None:  # the end of a person's topic, which a bag does not tell
+                continue
+            topic = source.topic(name)
+            self._write(writer, topic, log_time, message, source.component.output(name))
             for receiver, port in self._routes.get(topic, []):
-                made = self._handle(receiver, port, message)
-                queue.extend((receiver.topic(name), item) for name, item in made)
+                queue.extend((receiver, made, item) for made, item in self._handle(receiver, port, message))
 
     def _write(self, writer: BagWriter, topic: str, log_time: int, message: Any, port: Port) -> None:
+        if port.per_person and not writer.has_topic(topic):
+            writer.add_topic(topic, port.type, port.qos)
         if port.compressed:
             writer.write(f"{topic}/compressed", log_time, compress(self._factory, message))
         elif port.name not in _TOO_LARGE:

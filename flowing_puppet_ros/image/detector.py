@@ -9,7 +9,7 @@ regression on both scores says how probable it is that somebody was found. The j
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.detector_forest import Forest
 from flowing_puppet_ros.image.detector_parts import PARTS, PartFilters, Window, window_at
-from flowing_puppet_ros.image.detector_person import FoundPose, PersonDetection
+from flowing_puppet_ros.image.detector_person import FoundPose, PersonDetection, Place
 from flowing_puppet_ros.image.detector_rank import SAME_PLACE, Ranking, agreed_scale, apart, best_places
 from flowing_puppet_ros.image.detector_root import Candidate, RootFilters, resize
 from flowing_puppet_ros.image.detector_search import choose, propose
@@ -98,18 +98,43 @@ class PartDetector:
 
     def detect(self, image: NDArray[np.uint8], settings: DetectorSettings = DEFAULTS) -> list[PersonDetection]:
         """The people in an image (H, W, 3) RGB or (H, W) grey, uint8, the surest first; InputError for other arrays."""
-        pixels = checked(image)
-        longest = max(pixels.shape[:2])
-        if min(pixels.shape[:2]) < LEAST_SIDE:
+        small, factor = _shrunk(image, settings)
+        if small is None:
             return []
-        factor = min(1.0, settings.largest_side / longest)
-        small = resize(pixels, factor) if factor < 1 else pixels
-        if min(small.shape[:2]) < LEAST_SIDE:
-            return []
-        smallest = max(settings.smallest * factor, max(small.shape[:2]) / 20 if settings.smallest == 0 else 8.0)
         # Several BLAS threads would sum in another order, and people who run many nodes have no cores to spare.
         with threadpool_limits(1):
-            return self._people(small, smallest, factor, settings)
+            return self._people(small, _smallest(small, factor, settings), factor, settings)
+
+    def candidates(self, image: NDArray[np.uint8], settings: DetectorSettings = DEFAULTS) -> list[Place]:
+        """All places of an image in which a pose was sought, in no order, several for one person among them."""
+        small, factor = _shrunk(image, settings)
+        if small is None:
+            return []
+        with threadpool_limits(1):
+            poses = self.look(small, _smallest(small, factor, settings), settings.places)
+        scores = self.ranking.scores(poses)
+        found = []
+        for pose, score in zip(poses, scores, strict=True):
+            neck, face = ((pose.points[PARTS.index(name)] + 0.5) / factor - 0.5 for name in ("neck", "face"))
+            scale = self.ranking.corrected_scale(pose, pose.scale) / factor
+            found.append(Place(neck, face, scale, self.ranking.log_odds(float(score))))
+        return found
+
+    def at(
+        self, image: NDArray[np.uint8], places: Sequence[Place], settings: DetectorSettings = DEFAULTS
+    ) -> list[PersonDetection]:
+        """The best pose at each of some places of an image, in their order; none where the image is too small."""
+        small, factor = _shrunk(image, settings)
+        if small is None:
+            return []
+        found = []
+        with threadpool_limits(1):
+            for place in places:
+                neck, face = ((at + 0.5) * factor - 0.5 for at in (place.neck, place.face))
+                window = window_at(small, (neck[0], neck[1]), (face[0], face[1]), place.scale * factor)
+                confidence = 1 / (1 + float(np.exp(-place.log_odds)))
+                found.append(PersonDetection(self.parts, self.pose_in(window, np.zeros(0)), confidence, factor))
+        return found
 
     def _people(
         self, image: NDArray[np.uint8], smallest: float, factor: float, settings: DetectorSettings
@@ -149,6 +174,20 @@ class PartDetector:
         """The best pose in a window, with measures that are known already."""
         beliefs = upward(self.parts.tree, self.parts.unary(window))
         return FoundPose(window, beliefs, best_placement(self.parts.tree, beliefs), measures)
+
+
+def _shrunk(image: NDArray[np.uint8], settings: DetectorSettings) -> tuple[NDArray[np.uint8] | None, float]:
+    """The image as it is looked at, None when it is too small, and its size in units of the given one."""
+    pixels = checked(image)
+    factor = min(1.0, settings.largest_side / max(pixels.shape[:2]))
+    if min(pixels.shape[:2]) * factor < LEAST_SIDE:
+        return None, factor
+    return resize(pixels, factor) if factor < 1 else pixels, factor
+
+
+def _smallest(image: NDArray[np.uint8], factor: float, settings: DetectorSettings) -> float:
+    """Smallest shoulder width to look for, px of an image that is `factor` times as large as the given one."""
+    return max(settings.smallest * factor, max(image.shape[:2]) / 20 if settings.smallest == 0 else 8.0)
 
 
 def checked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -43,6 +43,30 @@ class FoundPose:
     def points(self) -> Doubles:
         """The parts (P, 2) px of the image that was looked at."""
         return self.window.points_of(self.placement[:, 1:].astype(np.float64))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """Where a person may stand: `neck` and `face` (2,) px of the given image, scale S in px, log-odds that one does."""
+
+    neck: Doubles
+    face: Doubles
+    scale: float
+    log_odds: float
+
+    def apart(self, other: Place) -> float:
+        """Distance of the necks in units of the larger S."""
+        return float(np.hypot(*(self.neck - other.neck))) / max(self.scale, other.scale)
+
+    def resized(self, scale: float) -> Place:
+        """The same neck at another scale."""
+        return replace(self, face=self.neck + (self.face - self.neck) * (scale / self.scale), scale=scale)
+
+    def mixed(self, other: Place, share: float) -> Place:
+        """A place between two: 0 this one, 1 the other."""
+        neck, face = ((1 - share) * a + share * b for a, b in ((self.neck, other.neck), (self.face, other.face)))
+        scale = self.scale ** (1 - share) * other.scale**share
+        return Place(neck, face, scale, (1 - share) * self.log_odds + share * other.log_odds)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,9 +34,13 @@ class Ranking:
         """Score (N,) of every pose."""
         return np.array([float(self.weight @ pose.measures) for pose in poses])
 
+    def log_odds(self, score: float) -> float:
+        """Log-odds that a pose of this score is that of a person."""
+        return float(self.odds[0] * score + self.odds[1])
+
     def probability(self, score: float) -> float:
         """Probability that a pose of this score is that of a person."""
-        return 1 / (1 + float(np.exp(-(self.odds[0] * score + self.odds[1]))))
+        return 1 / (1 + float(np.exp(-self.log_odds(score))))
 
     def corrected_scale(self, pose: FoundPose, scale: float) -> float:
         """S of a person whose poses agree on about `scale`, by the lengths in the best one."""

@@ -3,16 +3,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arms import Sight
-from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
-from flowing_puppet_ros.image.detector_person import PersonDetection
+from flowing_puppet_ros.image.clip_people import ClipPeople, PersonPath
+from flowing_puppet_ros.image.detector import DetectorSettings
+from flowing_puppet_ros.image.detector_person import PersonDetection, Place
 from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.settings import Settings, setting
@@ -24,6 +29,25 @@ class DetectionSettings(Settings):
 
     detect_every: int = setting(1, "images from one run of the detector to the next", low=1, high=10000)
     least_person: float = setting(0.3, "probability from which a detected person is tracked", low=0.0, high=1.0)
+    search_every: int = setting(
+        2, "images from one search for people to the next where a whole clip is known", low=1, high=10000
+    )
+
+
+class Detector(Protocol):
+    """What finds people in one image, see `detector.PartDetector`."""
+
+    def detect(self, image: NDArray[np.uint8], settings: DetectorSettings) -> list[PersonDetection]:
+        """The people in an image, the surest first."""
+        ...
+
+    def candidates(self, image: NDArray[np.uint8]) -> list[Place]:
+        """All places in an image where people may be."""
+        ...
+
+    def at(self, image: NDArray[np.uint8], places: Sequence[Place]) -> list[PersonDetection]:
+        """The best pose at each of some places."""
+        ...
 
 
 @dataclass(slots=True, eq=False)
@@ -31,18 +55,42 @@ class VideoTracker:
     """Runs the detector on the images of a video and the tracker on what it finds."""
 
     tracker: FlowingPuppetTracker
-    detector: PartDetector
+    detector: Detector
     likelihood: Likelihood
     settings: DetectionSettings
     images: int = 0
 
-    def step(self, image: NDArray[np.uint8], stamp_ns: int) -> tuple[TrackResult, list[PersonDetection]]:
-        """Take the next `image` (H, W, 3) RGB or (H, W) grey; the result, and whom the detector found if it looked."""
-        look = self.images % self.settings.detect_every == 0
+    def step(
+        self,
+        image: NDArray[np.uint8],
+        stamp_ns: int,
+        flow: FlowPair | None = None,
+        paths: Sequence[PersonPath] | None = None,
+    ) -> tuple[TrackResult, list[PersonDetection]]:
+        """Take the next `image` (H, W, 3) RGB or (H, W) grey; the result, and whom the detector found if it looked.
+
+        `flow` is as `FlowingPuppetTracker.step` takes it. Where the whole clip was searched before, the detector looks
+        only where the `paths` of its people lead.
+        """
+        number = self.images
         self.images += 1
-        found = self._detect(image) if look else []
+        look = paths is not None or number % self.settings.detect_every == 0
+        if paths is None:
+            found = self.detect(image) if look else []
+        else:
+            found = self.detector.at(image, [place for path in paths if (place := path.at(number)) is not None])
         keypoints = [person.keypoints for person in found] if look else None
-        return self.tracker.step(image, stamp_ns, keypoints), found
+        return self.tracker.step(image, stamp_ns, keypoints, flow), found
+
+    def search(self, images: Iterable[NDArray[np.uint8]]) -> list[PersonPath]:
+        """Look for the people of a whole clip before it is tracked; images that cannot be used are passed over."""
+        every = self.settings.search_every
+        clip = ClipPeople(self.settings.least_person, self.tracker.settings.most_people, every)
+        for number, image in enumerate(images):
+            if number % every == 0:
+                with contextlib.suppress(InputError):
+                    clip.add(number, self.detector.candidates(image))
+        return clip.paths()
 
     def sights(
         self, image: NDArray[np.uint8], result: TrackResult, found: Sequence[PersonDetection]
@@ -53,7 +101,8 @@ class VideoTracker:
         with threadpool_limits(1):
             return {puppet.id: self._sight(puppet, colour, found) for puppet in result.puppets}
 
-    def _detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
+    def detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
+        """The people in an image who are sure enough to be tracked."""
         people = self.tracker.settings.most_people
         return self.detector.detect(
             image, DetectorSettings(least_confidence=self.settings.least_person, most_people=min(people, 80))

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -65,7 +66,8 @@ class Session[C: Component]:
         self._outputs: dict[str, list[tuple[Publisher, Callable[[Any], Any]]]] = {}
         try:
             for port in component.outputs:
-                self._outputs[port.name] = self._open_output(port)
+                if not port.per_person:
+                    self._outputs[port.name] = self._open_output(port)
         except Exception:
             self._close_outputs()
             raise
@@ -97,11 +99,13 @@ class Session[C: Component]:
         self.worker.stop()
         self._close_outputs()
 
-    def _close_outputs(self) -> None:
-        for publishers in self._outputs.values():
-            for publisher, _ in publishers:
-                self._node.destroy_publisher(publisher)
-        self._outputs.clear()
+    def _close_output(self, name: str) -> None:
+        for publisher, _ in self._outputs.pop(name, []):
+            self._node.destroy_publisher(publisher)
+
+    def _close_outputs(self, kept: Collection[str] = ()) -> None:
+        for name in set(self._outputs) - set(kept):
+            self._close_output(name)
 
     def reset(self) -> None:
         """Drop the messages that wait and let the next one start anew."""
@@ -111,6 +115,8 @@ class Session[C: Component]:
     def _reset(self) -> None:
         self.component.reset()
         self._last_stamp = None
+        with self._publishing:
+            self._close_outputs(kept=[port.name for port in self.component.outputs])
 
     @property
     def stamped(self) -> bool:
@@ -133,16 +139,17 @@ class Session[C: Component]:
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=partial(self._incompatible, name, "subscription"),
                 incompatible_type=partial(self._other_type, name),
+                message_lost=partial(self._lost, port.name, name),
             ),
         )
         self._subscriptions.append(made)
 
-    def _open_output(self, port: Port) -> list[tuple[Publisher, Callable[[Any], Any]]]:
+    def _open_output(self, port: Port, person: bool = False) -> list[tuple[Publisher, Callable[[Any], Any]]]:
         """Return the publishers of a port, each with what makes its message out of the component's."""
         made: list[tuple[Publisher, Callable[[Any], Any]]]
-        made = [(self._publisher(message_type(port.type), port.name, port.qos), _same)]
+        made = [(self._publisher(message_type(port.type), port.name, port.qos, person), _same)]
         if port.compressed:
-            compressed = self._publisher(message_type(COMPRESSED_IMAGE), self._compressed(port), port.qos)
+            compressed = self._publisher(message_type(COMPRESSED_IMAGE), self._compressed(port), port.qos, person)
             made.append((compressed, partial(compress, self.component.factory)))
         return made
 
@@ -150,14 +157,13 @@ class Session[C: Component]:
         """Return the topic of a port's compressed images: it follows the port when that is remapped."""
         return f"{self._node.resolve_topic_name(port.name)}/compressed"
 
-    def _publisher(self, kind: Any, topic: str, qos: str) -> Publisher:
+    def _publisher(self, kind: Any, topic: str, qos: str, person: bool) -> Publisher:
         name = self._node.resolve_topic_name(topic)
+        # Overriding options are parameters; for every person who ever came they would be without end.
+        options = None if person else QoSOverridingOptions.with_default_policies()
+        events = PublisherEventCallbacks(incompatible_qos=partial(self._incompatible, name, "publisher"))
         return self._node.create_publisher(
-            kind,
-            topic,
-            _PUBLISHER_QOS[qos],
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            event_callbacks=PublisherEventCallbacks(incompatible_qos=partial(self._incompatible, name, "publisher")),
+            kind, topic, _PUBLISHER_QOS[qos], qos_overriding_options=options, event_callbacks=events
         )
 
     def _incompatible(self, topic: str, side: str, event: Any) -> None:
@@ -168,6 +174,14 @@ class Session[C: Component]:
 
     def _other_type(self, topic: str, _: Any) -> None:
         self._complain(f"{topic}: somebody uses another message type; remap that topic or this node's")
+
+    def _lost(self, port: str, topic: str, event: Any) -> None:
+        """Count what the middleware lost on the way; the first time say what helps."""
+        self.component.counters[f"lost {port}"] = event.total_count
+        self._complain_once(
+            f"{topic}: messages are lost on the way; large ones need qos_overrides.{topic}.subscription.reliability "
+            "reliable (and a reliable publisher), or compressed images"
+        )
 
     def _complain(self, sentence: str) -> None:
         self._diagnostics.complained(sentence)
@@ -212,19 +226,28 @@ class Session[C: Component]:
     def publish(self, outputs: Output) -> None:
         """Publish what the component made, unless the session has ended meanwhile."""
         for name, message in outputs:
+            port = self.component.output(name)
             with self._publishing:
                 if not self.active:
                     return
+                if message is None:
+                    self._close_output(name)
+                    continue
+                if name not in self._outputs:
+                    self._outputs[name] = self._open_output(replace(port, name=name), person=True)
                 publishers = self._outputs[name]
                 for publisher, converted in publishers:
                     if len(publishers) == 1 or publisher.get_subscription_count():
                         publisher.publish(converted(message))
-            self._diagnostics.passed(name)
-            if name in _PEOPLE:
-                self._diagnostics.people = len(getattr(message, _PEOPLE[name]))
-            if hasattr(message, "header"):
-                age = self._node.get_clock().now().nanoseconds - header_ns(message.header)
-                self._diagnostics.took(age * 1e-9)
+            self._count(port, message)
+
+    def _count(self, port: Port, message: Any) -> None:
+        self._diagnostics.passed(port.name)
+        if port.name in _PEOPLE:
+            self._diagnostics.people = len(getattr(message, _PEOPLE[port.name]))
+        if hasattr(message, "header"):
+            age = self._node.get_clock().now().nanoseconds - header_ns(message.header)
+            self._diagnostics.took(age * 1e-9)
 
     def _failed(self, error: Exception) -> None:
         if not self.active or not self._node.context.ok():

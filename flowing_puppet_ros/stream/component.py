@@ -20,6 +20,8 @@ from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.messages import MessageFactory
 
 Output = list[tuple[str, Any]]
+"""Names of output ports, or of a person's topic of one (`Port.of`), each with a message; None closes such a topic."""
+_ID = "{id}"
 MOST_WARNINGS = 100
 """Different sentences that a component logs in its life; what can be wrong with hostile input has no end."""
 
@@ -40,6 +42,10 @@ class Port:
     qos: "sensor" (best effort, what sensors publish), "reliable" or "latched" (transient local).
     lazy: worth making only when somebody listens. compressed: the same image also travels as CompressedImage on
     `<name>/compressed`. optional: an input the component works without.
+
+    An output with `{id}` in its name is one topic a person. The component puts `port.of(id)` beside each message; who
+    runs the component opens that topic at its first message and closes it at a message that is None, which says that
+    the person is lost. Such a port is neither lazy nor compressed.
     """
 
     name: str
@@ -48,6 +54,23 @@ class Port:
     lazy: bool = False
     compressed: bool = False
     optional: bool = False
+
+    @property
+    def per_person(self) -> bool:
+        """Whether this is a topic for every person."""
+        return _ID in self.name
+
+    def of(self, identity: str) -> str:
+        """Return the name of a person's topic."""
+        return self.name.replace(_ID, identity)
+
+    def covers(self, name: str) -> bool:
+        """Whether `name` is this port's, or that of one of its people."""
+        before, found, after = self.name.partition(_ID)
+        if not found:
+            return name == self.name
+        identity = name[len(before) : len(name) - len(after)]
+        return bool(identity) and "/" not in identity and name == self.of(identity)
 
 
 class Component:
@@ -100,6 +123,13 @@ class Component:
     def wants(self, port: str, wanted: bool) -> None:
         """Say whether anybody listens to a lazy output."""
         self._switch(self._wanted, self.outputs, port, wanted)
+
+    def output(self, name: str) -> Port:
+        """Return the output port that `name`, as it stands beside a message, belongs to; KeyError when none does."""
+        for port in self.outputs:
+            if port.covers(name):
+                return port
+        raise KeyError(name)
 
     def drain_warnings(self) -> list[str]:
         """Return the sentences to log that arose since the last call."""
