@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # make venv   set everything up in .venv          make test   linter, type checker and tests
 # make demo   sample bag -> replay -> report      make lint   linter and type checker alone
-# make bench  speed as ratios taken in one run    make docs   the documentation site, into out/site
+# make bench  speed as ratios, and live nodes     make docs   the documentation site, into out/site
 # make coverage, make release-check, make figures, make config, make lock: see CONTRIBUTING.md
 
 SHELL := /bin/bash
@@ -47,6 +47,7 @@ release-check: venv
 
 bench: venv
 	@$(CLEAN_ENV) .venv/bin/flowing-puppet bench
+	@$(CLEAN_ENV) .venv/bin/flowing-puppet bench live --seconds 60
 
 config: venv
 	@$(PYTHON) scripts/write_config.py

@@ -21,7 +21,7 @@ from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.node.diagnostics import Condition, Diagnostics
 from flowing_puppet_ros.node.factory import RosMessageFactory
 from flowing_puppet_ros.node.parameters import changed, declare, with_floats
-from flowing_puppet_ros.node.registry import COMPONENTS, FIXED, NodeSettings
+from flowing_puppet_ros.node.registry import COMPONENTS, FIXED, node_settings
 from flowing_puppet_ros.node.session import Session
 from flowing_puppet_ros.stream.component import Component
 
@@ -50,7 +50,7 @@ class ComponentNode[C: Component](LifecycleNode):
         self.problem = ""
         self._component = component
         self._settings = declare(self, COMPONENTS[component].settings_type, COMPONENTS[component].fixed)
-        self._own = declare(self, NodeSettings, FIXED)
+        self._own = declare(self, node_settings(component), FIXED)
         self._diagnostics = Diagnostics(self.get_fully_qualified_name(), component)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported = self._steady.now()
@@ -148,7 +148,7 @@ class ComponentNode[C: Component](LifecycleNode):
             session.close()
 
     def _converted(self, parameters: list[Parameter]) -> list[Parameter]:
-        return with_floats((type(self._settings), NodeSettings), parameters)
+        return with_floats((type(self._settings), type(self._own)), parameters)
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
         """Say whether a change can be made, and make none."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
@@ -48,8 +49,7 @@ class Session[C: Component]:
 
     Callbacks only put messages in line; the worker thread hands them to the component in order of arrival and
     publishes what comes out. Whatever a message does, the session goes on. What the worker still computes when the
-    session is deactivated or closed is not published. The topics of a person are opened at their first message, and
-    closed when the person is lost, and when everybody is forgotten.
+    session is deactivated or closed is not published.
     """
 
     def __init__(self, node: Node, component: C, queue: int, diagnostics: Diagnostics) -> None:
@@ -68,7 +68,7 @@ class Session[C: Component]:
         try:
             for port in component.outputs:
                 if not port.per_person:
-                    self._output(port.name)
+                    self._outputs[port.name] = self._open_output(port)
         except Exception:
             self._close_outputs()
             raise
@@ -102,14 +102,13 @@ class Session[C: Component]:
         self.component.reset()
         self._close_outputs()
 
-    def _close_outputs(self) -> None:
-        with self._publishing:
-            for name in list(self._outputs):
-                self._close_output(name)
-
     def _close_output(self, name: str) -> None:
         for publisher, _ in self._outputs.pop(name, []):
             self._node.destroy_publisher(publisher)
+
+    def _close_outputs(self, kept: Collection[str] = ()) -> None:
+        for name in set(self._outputs) - set(kept):
+            self._close_output(name)
 
     def reset(self) -> None:
         """Drop the messages that wait and let the next one start anew."""
@@ -118,10 +117,9 @@ class Session[C: Component]:
 
     def _reset(self) -> None:
         self.component.reset()
-        with self._publishing:
-            for name in [name for name in self._outputs if self.component.output(name).per_person]:
-                self._close_output(name)
         self._last_stamp = None
+        with self._publishing:
+            self._close_outputs(kept=[port.name for port in self.component.outputs])
 
     @property
     def stamped(self) -> bool:
@@ -139,23 +137,22 @@ class Session[C: Component]:
             kind,
             topic,
             partial(self._received, port.name, name),
-            copy(_SUBSCRIPTION_QOS[port.qos]),
+            copy(_SUBSCRIPTION_QOS[port.qos]),  # an override changes the profile itself
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=partial(self._incompatible, name, "subscription"),
                 incompatible_type=partial(self._other_type, name),
+                message_lost=partial(self._lost, port.name, name),
             ),
         )
         self._subscriptions.append(made)
 
-    def _output(self, name: str) -> list[tuple[Publisher, Callable[[Any], Any]]]:
-        """The publishers of an output, opened if need be, each with what makes its message of the component's."""
-        if name in self._outputs:
-            return self._outputs[name]
-        port = self.component.output(name)
-        made = self._outputs[name] = [(self._publisher(port, message_type(port.type), name), _same)]
+    def _open_output(self, port: Port, person: bool = False) -> list[tuple[Publisher, Callable[[Any], Any]]]:
+        """Return the publishers of a port, each with what makes its message out of the component's."""
+        made: list[tuple[Publisher, Callable[[Any], Any]]]
+        made = [(self._publisher(message_type(port.type), port.name, port.qos, person), _same)]
         if port.compressed:
-            compressed = self._publisher(port, message_type(COMPRESSED_IMAGE), self._compressed(port))
+            compressed = self._publisher(message_type(COMPRESSED_IMAGE), self._compressed(port), port.qos, person)
             made.append((compressed, partial(compress, self.component.factory)))
         return made
 
@@ -163,16 +160,13 @@ class Session[C: Component]:
         """Return the topic of a port's compressed images: it follows the port when that is remapped."""
         return f"{self._node.resolve_topic_name(port.name)}/compressed"
 
-    def _publisher(self, port: Port, kind: Any, topic: str) -> Publisher:
+    def _publisher(self, kind: Any, topic: str, qos: str, person: bool) -> Publisher:
         name = self._node.resolve_topic_name(topic)
-        # An override is a parameter that stays: the people who come and go have none.
-        options = None if port.per_person else QoSOverridingOptions.with_default_policies()
+        # Overriding options are parameters; for every person who ever came they would be without end.
+        options = None if person else QoSOverridingOptions.with_default_policies()
+        events = PublisherEventCallbacks(incompatible_qos=partial(self._incompatible, name, "publisher"))
         return self._node.create_publisher(
-            kind,
-            topic,
-            copy(_PUBLISHER_QOS[port.qos]),
-            qos_overriding_options=options,
-            event_callbacks=PublisherEventCallbacks(incompatible_qos=partial(self._incompatible, name, "publisher")),
+            kind, topic, copy(_PUBLISHER_QOS[qos]), qos_overriding_options=options, event_callbacks=events
         )
 
     def _incompatible(self, topic: str, side: str, event: Any) -> None:
@@ -183,6 +177,14 @@ class Session[C: Component]:
 
     def _other_type(self, topic: str, _: Any) -> None:
         self._complain(f"{topic}: somebody uses another message type; remap that topic or this node's")
+
+    def _lost(self, port: str, topic: str, event: Any) -> None:
+        """Count what the middleware lost on the way; the first time say what helps."""
+        self.component.counters[f"lost {port}"] = event.total_count
+        self._complain_once(
+            f"{topic}: messages are lost on the way; large ones need qos_overrides.{topic}.subscription.reliability "
+            "reliable (and a reliable publisher), or compressed images"
+        )
 
     def _complain(self, sentence: str) -> None:
         self._diagnostics.complained(sentence)
@@ -227,22 +229,28 @@ class Session[C: Component]:
     def publish(self, outputs: Output) -> None:
         """Publish what the component made, unless the session has ended meanwhile."""
         for name, message in outputs:
+            port = self.component.output(name)
             with self._publishing:
                 if not self.active:
                     return
                 if message is None:
                     self._close_output(name)
                     continue
-                publishers = self._output(name)
+                if name not in self._outputs:
+                    self._outputs[name] = self._open_output(replace(port, name=name), person=True)
+                publishers = self._outputs[name]
                 for publisher, converted in publishers:
                     if len(publishers) == 1 or publisher.get_subscription_count():
                         publisher.publish(converted(message))
-            self._diagnostics.passed(self.component.output(name).name)
-            if name in _PEOPLE:
-                self._diagnostics.people = len(getattr(message, _PEOPLE[name]))
-            if hasattr(message, "header"):
-                age = self._node.get_clock().now().nanoseconds - header_ns(message.header)
-                self._diagnostics.took(age * 1e-9)
+            self._count(port, message)
+
+    def _count(self, port: Port, message: Any) -> None:
+        self._diagnostics.passed(port.name)
+        if port.name in _PEOPLE:
+            self._diagnostics.people = len(getattr(message, _PEOPLE[port.name]))
+        if hasattr(message, "header"):
+            age = self._node.get_clock().now().nanoseconds - header_ns(message.header)
+            self._diagnostics.took(age * 1e-9)
 
     def _failed(self, error: Exception) -> None:
         if not self.active or not self._node.context.ok():

@@ -208,4 +208,4 @@ def test_help_lists_the_parameters() -> None:
     command = [str(Path(sys.executable).with_name("puppet_tracker")), "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert "overlay_side [960]" in shown
-    assert "queue [4]" in shown
+    assert "queue [1]" in shown
