@@ -39,7 +39,7 @@ SCRIPTS = ROOT / "scripts" / "peers"
 HIDDEN = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH")
 PEER_POINTS = 2500  # of the cloud, for the gradients: more make them slower, not better
 SHAPES, SHAPE_COUNT = 200, 10  # people, and components of their shapes, that the gradients may use
-STEPS, EVERY = 400, 20
+STEPS, EVERY = 1000, 20
 
 
 @dataclass(frozen=True, slots=True)

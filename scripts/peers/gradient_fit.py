@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
-HEADINGS, RATE, PRIOR_POSE, PRIOR_SHAPE = 4, 0.02, 1e-4, 1e-4
+HEADINGS, PRIOR_POSE, PRIOR_SHAPE = 4, 1e-4, 1e-4
+RATES = 0.03, 0.003  # step size at the start and at the end, falling exponentially
 DECAY = (0.9, 0.999)
 
 
@@ -93,7 +94,8 @@ def main(path: str, steps: int, every: int) -> None:
         slope = gradient_of(unknowns, of_vertex, of_point)
         first = jax.tree.map(lambda m, g: DECAY[0] * m + (1 - DECAY[0]) * g, first, slope)
         second = jax.tree.map(lambda v, g: DECAY[1] * v + (1 - DECAY[1]) * g * g, second, slope)
-        scale = RATE * np.sqrt(1 - DECAY[1] ** step) / (1 - DECAY[0] ** step)
+        rate = RATES[0] * (RATES[1] / RATES[0]) ** (step / steps)
+        scale = rate * np.sqrt(1 - DECAY[1] ** step) / (1 - DECAY[0] ** step)
         moves = jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + 1e-8), first, second)
         unknowns = tuple(old - scale * move for old, move in zip(unknowns, moves, strict=True))
     print(json.dumps({"curve": curve}))
