@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from flowing_puppet_ros.body.crowd import Crowd
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.people import PersonCloud, extract_people
+from flowing_puppet_ros.body.planes import PlaneMemory
 from flowing_puppet_ros.body.viewpoint import one_sided
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
@@ -65,11 +66,13 @@ class ScenePeople:
         self._settings = settings
         self._crowd = Crowd(fitter, settings, settings.seed, background)
         self._single: bool | None = None
+        self._planes = PlaneMemory()
 
     def reset(self) -> None:
         """Forget everybody."""
         self._crowd.reset()
         self._single = None
+        self._planes = PlaneMemory()
 
     def drain(self) -> tuple[Counter[str], list[InputError]]:
         """What was counted, and why people could not be used, since the last call."""
@@ -91,7 +94,7 @@ class ScenePeople:
                 return [(ONE, self._full_fit(whole[0], viewpoint, seed))], []
             return self._crowd.step_one(whole[0], view.stamp, viewpoint, seed), []
         known = self._crowd.bodies(view.stamp) if settings.track else ()
-        people = extract_people(view.points, view.normals, settings, self._sensor(), known)
+        people = extract_people(view.points, view.normals, settings, self._sensor(), known, self._planes)
         viewpoint = self._viewpoint(people)
         if settings.track:
             return self._crowd.step(people, view.stamp, viewpoint, seed), self._crowd.held
