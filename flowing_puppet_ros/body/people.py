@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.body.planes import Plane, find_floor, find_wall
+from flowing_puppet_ros.body.planes import Plane, PlaneMemory, find_floor, find_wall
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
 
@@ -70,6 +70,7 @@ def extract_people(
     settings: ExtractionSettings,
     viewpoint: np.ndarray | None = None,
     known: Sequence[np.ndarray] = (),
+    memory: PlaneMemory | None = None,
 ) -> list[PersonCloud]:
     """Find the people in a scene; the same cloud gives the same answer.
 
@@ -83,6 +84,7 @@ def extract_people(
         viewpoint: (3,) where the sensor stood; None when the cloud was joined from several places, so that gaps do
             not grow with the distance.
         known: points (K, 3) in metres on each body that is expected in the cloud, where it should be by now.
+        memory: the planes of the clouds before this one, which save looking for floor and walls in every cloud.
 
     Returns:
         The known people, then the new ones, the likeliest first; empty when there is none.
@@ -103,7 +105,7 @@ def extract_people(
     drawn_in = _drawn_in(local) if viewpoint is not None else local
     voxel = _voxels(drawn_in, settings.gap / VOXELS_A_GAP)
     centres = _means(local, voxel)
-    free, floor = _without_planes(centres, settings.clearance)
+    free, floor = _without_planes(centres, settings.clearance, origin, memory)
     label = np.full(len(centres), -1)
     label[free] = _clusters(_means(drawn_in, voxel)[free], settings.gap)
     strangers = label.max() + 1
@@ -193,19 +195,43 @@ def _means(points: np.ndarray, voxel: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(voxel, column) / count for column in points.T], axis=1)
 
 
-def _without_planes(centres: np.ndarray, clearance: float) -> tuple[np.ndarray, Plane | None]:
-    """Which voxels (M,) belong neither to the floor nor to what is below it nor to walls, and the floor."""
+def _without_planes(
+    centres: np.ndarray, clearance: float, origin: np.ndarray, memory: PlaneMemory | None
+) -> tuple[np.ndarray, Plane | None]:
+    """Which voxels (M,) belong neither to the floor nor to what is below it nor to walls, and the floor.
+
+    `centres` are relative to `origin`, which may differ from cloud to cloud.
+    """
+    known = memory.recall(centres + origin, clearance) if memory else None
+    if known is None:
+        floor, walls = _found_planes(centres, clearance)
+        if memory:
+            memory.keep(
+                centres + origin, clearance, *((floor and floor.moved(origin)), [w.moved(origin) for w in walls])
+            )
+    else:
+        floor, walls = known[0] and known[0].moved(-origin), [wall.moved(-origin) for wall in known[1]]
+    return np.flatnonzero(_off(centres, clearance, floor, walls)), floor
+
+
+def _off(centres: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]) -> np.ndarray:
+    off = np.ones(len(centres), dtype=bool) if floor is None else floor.height(centres) > clearance
+    for wall in walls:
+        off &= np.abs(wall.height(centres)) > clearance
+    return off
+
+
+def _found_planes(centres: np.ndarray, clearance: float) -> tuple[Plane | None, list[Plane]]:
     rng = np.random.default_rng(0)
-    free = np.arange(len(centres))
     floor = find_floor(_some(centres), clearance, rng)
-    if floor is not None:
-        free = free[floor.height(centres) > clearance]
-    for _ in range(MAX_WALLS):
-        wall = find_wall(_some(centres[free]), clearance, rng) if len(free) >= 3 else None
+    walls: list[Plane] = []
+    while len(walls) < MAX_WALLS:
+        free = centres[_off(centres, clearance, floor, walls)]
+        wall = find_wall(_some(free), clearance, rng) if len(free) >= 3 else None
         if wall is None:
             break
-        free = free[np.abs(wall.height(centres[free])) > clearance]
-    return free, floor
+        walls.append(wall)
+    return floor, walls
 
 
 def _some(points: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from flowing_puppet_ros.body.crowd import Crowd, CrowdSettings
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.people import ExtractionSettings, PersonCloud, extract_people
+from flowing_puppet_ros.body.planes import PlaneMemory
 from flowing_puppet_ros.body.viewpoint import one_sided
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
@@ -78,11 +79,13 @@ class ScenePeople:
         self._settings = settings
         self._crowd = Crowd(fitter, settings, fitter.settings.seed)
         self._single: bool | None = None
+        self._planes = PlaneMemory()
 
     def reset(self) -> None:
         """Forget everybody."""
         self._crowd.reset()
         self._single = None
+        self._planes = PlaneMemory()
 
     def drain(self) -> tuple[Counter[str], list[InputError]]:
         """What was counted, and why people could not be used, since the last call."""
@@ -106,7 +109,7 @@ class ScenePeople:
                 return [(ONE, self._full_fit(whole[0], viewpoint, seed))], []
             return self._crowd.step_one(whole[0], view.stamp, viewpoint, seed, background), []
         known = self._crowd.bodies(view.stamp) if settings.track else ()
-        people = extract_people(view.points, view.normals, settings, self._sensor(view), known)
+        people = extract_people(view.points, view.normals, settings, self._sensor(view), known, self._planes)
         viewpoint = self._viewpoint(view, people)
         if settings.track:
             return self._crowd.step(people, view.stamp, viewpoint, seed, background), self._crowd.held
