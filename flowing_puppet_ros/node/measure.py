@@ -3,7 +3,8 @@
 
 `python -m flowing_puppet_ros.node.measure NODE INPUT.npz --rate HZ --seconds S [-- ROS arguments of the node]` starts
 the node as a process of its own, publishes the array `images` (N,H,W,3) or `clouds` (N,P,3) of the file to and fro with
-the present time as stamps, and prints one JSON object.
+the present time as stamps, and prints one JSON object. Input travels reliably: of images of a megabyte a best-effort
+subscriber of Fast DDS as it is shipped misses a quarter.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import numpy as np
 import rclpy
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.qos import QoSProfile
 
 from flowing_puppet_ros.node.factory import RosMessageFactory, message_type
 from flowing_puppet_ros.stream.clouds import make_cloud
@@ -35,6 +36,7 @@ STREAMS = {
     "body_fitter": ("clouds", "points", POINT_CLOUD, "bodies", BODIES),
 }
 """Node -> array of the input file, input topic and type, output topic and type."""
+NAMESPACE = "/measured"
 PATIENCE = 120.0
 """Seconds that a node may take to start."""
 SETTLING = 60.0
@@ -46,7 +48,7 @@ class Feeder(Node):
 
     def __init__(self, name: str, arrays: Any) -> None:
         """Make the messages; only their stamps change later."""
-        super().__init__("measure", namespace="measured")
+        super().__init__("measure", namespace=NAMESPACE)
         array, topic, kind, output, output_kind = STREAMS[name]
         factory = RosMessageFactory()
         header = make_header(factory, 0, "sensor")
@@ -55,7 +57,7 @@ class Feeder(Node):
             for item in arrays[array]
         ]
         self.messages = [*once, *once[-2:0:-1]]
-        self.feed = self.create_publisher(message_type(kind), topic, qos_profile_sensor_data)
+        self.feed = self.create_publisher(message_type(kind), topic, QoSProfile(depth=2))
         self.people = output
         self.sent = 0
         self.came: list[tuple[float, float, int]] = []
@@ -76,7 +78,9 @@ class Feeder(Node):
 
 def measure(name: str, arrays: Any, rate: float, seconds: float, ros_arguments: list[str]) -> dict[str, Any]:
     """Run the node for `seconds` of input and return what was measured; RuntimeError when it does not start."""
-    command = [sys.executable, "-m", f"flowing_puppet_ros.node.{name}", "--ros-args", "-r", "__ns:=/measured"]
+    reliable = f"qos_overrides.{NAMESPACE}/{STREAMS[name][1]}.subscription.reliability:=reliable"
+    command = [sys.executable, "-m", f"flowing_puppet_ros.node.{name}", "--ros-args"]
+    command += ["-r", f"__ns:={NAMESPACE}", "-p", reliable]
     feeder = Feeder(name, arrays)
     executor = SingleThreadedExecutor()
     executor.add_node(feeder)

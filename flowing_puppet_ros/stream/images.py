@@ -17,6 +17,9 @@ JPEG_QUALITY = 85
 LARGEST_PIXELS = 100_000_000
 """Pixels of the largest image that is decoded; sizes beyond are lies or mistakes, and would take the memory."""
 
+FARTHEST_FLOW = 1e5
+"""Pixels; no flow leads farther than images are wide."""
+
 # encoding -> (channels, bytes a channel, OpenCV conversion to RGB)
 _RAW: dict[str, tuple[int, int, int | None]] = {
     "rgb8": (3, 1, None),
@@ -108,11 +111,13 @@ def decode_labels(message: Any) -> NDArray[np.uint8]:
 
 
 def decode_flow(message: Any) -> NDArray[np.float32]:
-    """Return the (H,W,2) flow of a 32FC2 Image: pixels, +x right, +y down, NaN where unknown."""
+    """Return the (H,W,2) flow of a 32FC2 Image: pixels, +x right, +y down, NaN where unknown or absurd."""
     if message.encoding.upper() != "32FC2":
         raise InputError(f"optical flow comes as 32FC2, not as {message.encoding!r}")
     pixels = _rows(message, 2, np.dtype(">f4" if message.is_bigendian else "<f4"))
-    return pixels.astype(np.float32, copy=False)
+    pixels = pixels.astype(np.float32, copy=False)
+    sane = np.abs(pixels) < FARTHEST_FLOW
+    return pixels if sane.all() else np.where(sane.all(axis=2, keepdims=True), pixels, np.float32(np.nan))
 
 
 def decode_depth(message: Any) -> NDArray[np.float32]:

@@ -198,7 +198,12 @@ class PuppetTrackerComponent(Component):
         if forward is None or backward is None:
             self.counters["images without flow"] += 1
             return None
-        return decode_flow(forward), decode_flow(backward)
+        self.counters["paired flows"] += 1
+        try:
+            return decode_flow(forward), decode_flow(backward)
+        except InputError as error:  # the image is good: its flow is computed here
+            self._unusable(error)
+            return None
 
     def _publish(self, header: Any, earlier: Any, image: NDArray[np.uint8], result: TrackResult) -> Output:
         puppets = make_puppets(self.factory, header, self._model, result.puppets)

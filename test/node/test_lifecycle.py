@@ -42,7 +42,7 @@ class Bench:
 
     def start(self, name: str, namespace: str = "", **parameters: Any) -> ComponentNode[Any]:
         """Start a node of ours."""
-        given = [Parameter(key, value=value) for key, value in parameters.items()]
+        given = [Parameter(key, value=value) for key, value in {"queue": 5, **parameters}.items()]
         return self.add(ComponentNode(name, namespace=namespace, parameter_overrides=given))
 
     def spin_until(self, condition: Callable[[], object], what: str) -> None:
