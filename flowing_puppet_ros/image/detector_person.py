@@ -64,7 +64,9 @@ class Place:
 
     def mixed(self, other: Place, share: float) -> Place:
         """A place between two: 0 this one, 1 the other."""
-        neck, face = ((1 - share) * a + share * b for a, b in ((self.neck, other.neck), (self.face, other.face)))
+        neck, face = (
+            (1 - share) * a + share * b for a, b in ((self.neck, other.neck), (self.face, other.face))
+        )
         scale = self.scale ** (1 - share) * other.scale**share
         return Place(neck, face, scale, (1 - share) * self.log_odds + share * other.log_odds)
 
