@@ -21,7 +21,7 @@ from flowing_puppet_ros.image.arm_path import PathSettings
 from flowing_puppet_ros.image.arms import Sight
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
-from flowing_puppet_ros.image.detector_person import PersonDetection
+from flowing_puppet_ros.image.detector_person import PersonDetection, Place
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
@@ -63,6 +63,16 @@ class _Remembering:
 
     detector: Detector
     _seen: dict[tuple[bytes, DetectorSettings], list[PersonDetection]] = field(default_factory=dict)
+    _candidates: dict[bytes, list[Place]] = field(default_factory=dict)
+
+    def candidates(self, image: NDArray[np.uint8]) -> list[Place]:
+        key = image.tobytes()
+        if key not in self._candidates:
+            self._candidates[key] = self.detector.candidates(image)
+        return self._candidates[key]
+
+    def at(self, image: NDArray[np.uint8], places: Sequence[Place]) -> list[PersonDetection]:
+        return self.detector.at(image, places)
 
     def detect(self, image: NDArray[np.uint8], settings: DetectorSettings) -> list[PersonDetection]:
         key = image.tobytes(), settings
@@ -125,15 +135,18 @@ def _keypoints(run: ClipRun, video: VideoTracker, frame: Frame) -> Sequence[Keyp
     return [person.keypoints for person in video.detect(frame.image)]
 
 
-def _steps(run: ClipRun, still: bool = False) -> Iterator[tuple[TrackResult, dict[str, Sight] | None]]:
-    """Step through the clip; `still` tells the tracker that nothing moves."""
+def _steps(
+    run: ClipRun, still: bool = False, whole: bool = True
+) -> Iterator[tuple[TrackResult, dict[str, Sight] | None]]:
+    """Step through the clip; `still`: nothing is said to move; `whole`: it is searched for people first."""
     video, tracker = run.video(), run.tracker()
+    paths = video.search(frame.image for frame in run.frames) if whole and run.given is None else None
     for frame in run.frames:
         flow = _no_flow(run, frame) if still else None
         if run.given is not None:
             yield tracker.step(frame.image, frame.stamp_ns, run.keypoints(frame), flow), None
         else:
-            result, found = video.step(frame.image, frame.stamp_ns, flow)
+            result, found = video.step(frame.image, frame.stamp_ns, flow, paths)
             yield result, video.sights(frame.image, result, found)
 
 
@@ -144,7 +157,7 @@ def _no_flow(run: ClipRun, frame: Frame) -> FlowPair:
 
 
 def _live(run: ClipRun) -> Track:
-    return [_located(result.puppets) for result, _ in _steps(run)]
+    return [_located(result.puppets) for result, _ in _steps(run, whole=False)]
 
 
 def _whole(run: ClipRun, still: bool = False) -> Track:

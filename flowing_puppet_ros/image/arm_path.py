@@ -51,7 +51,7 @@ def best_path(arms: Sequence[ArmHypotheses], width: float, settings: PathSetting
 
     The path of least cost goes through the least of each image. `width` is the shoulder width in pixels.
     """
-    steps = [_step_costs(a, b, width, settings) for a, b in pairwise(arms)]
+    steps = [step_costs(a, b, width, settings) for a, b in pairwise(arms)]
     forward = [-arms[0].score]
     for arm, step in zip(arms[1:], steps, strict=True):
         forward.append((forward[-1][:, None] + step).min(axis=0) - arm.score)
@@ -61,7 +61,7 @@ def best_path(arms: Sequence[ArmHypotheses], width: float, settings: PathSetting
     return [there + back for there, back in zip(forward, backward[::-1], strict=True)]
 
 
-def _step_costs(before: ArmHypotheses, after: ArmHypotheses, width: float, settings: PathSettings) -> Floats:
+def step_costs(before: ArmHypotheses, after: ArmHypotheses, width: float, settings: PathSettings) -> Floats:
     """Costs (K, K') of the steps between the hypotheses of two images."""
     expected = before.places + before.motion
     distance = np.linalg.norm(expected[:, None] - after.places[None], axis=3) @ (JOINT_SHARE / JOINT_SHARE.sum())

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.image.arm_path import PathSettings
-from flowing_puppet_ros.image.arms import ENDS, SIDES, ArmHistory, Sight
+from flowing_puppet_ros.image.arms import ENDS, ArmHistory, Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings, joint_motion, smoothed
 from flowing_puppet_ros.image.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds import DeformableStructures
@@ -97,10 +97,7 @@ class Clip:
 
     def _resolve_arms(self, arms: ArmHistory, detected: Floats, motion: Floats, scale: float) -> None:
         """Put the arms of the best path into the detected joints (T, J, 3) and their motion (T-1, J, 2)."""
-        mean = self.model.mean_joints()
-        ends = [self.model.joint_names.index(f"{side}_shoulder") for side in SIDES]
-        width = scale * float(np.linalg.norm(mean[ends[0]] - mean[ends[1]]))
-        for side, arm in arms.resolved(width).items():
+        for side, arm in arms.resolved(scale * self.model.shoulder_width).items():
             for k, name in enumerate(ENDS):
                 joint = self.model.joint_names.index(f"{side}_{name}")
                 detected[:, joint, :2] = arm.places[:, k]

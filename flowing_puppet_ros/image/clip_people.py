@@ -9,7 +9,7 @@ places are taken away, and the next person is looked for. Only places are kept o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,30 +29,34 @@ SPAN = 15  # looks before and after one over which the scale is averaged
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PersonPath:
-    """One person over a clip: `places` by number of the image looked at, and the `confidence` that it is a person."""
+    """One person over a clip: `places` by number of the image looked at, in order, `step` images from look to look."""
 
     places: dict[int, Place]
-    confidence: float
+    step: int
 
     def at(self, image: int) -> Place | None:
-        """The place in an image, between two looks the mean of both; None before the first and after the last."""
+        """The place in an image, between two looks the mean of both; None where the person is not there."""
         numbers = np.array(list(self.places))
-        if not numbers[0] <= image <= numbers[-1]:
+        if not numbers[0] - self.step < image < numbers[-1] + self.step:
             return None
-        after = int(np.searchsorted(numbers, image))
-        if numbers[after] == image:
-            return self.places[image]
+        inside = int(np.clip(image, numbers[0], numbers[-1]))
+        after = int(np.searchsorted(numbers, inside))
+        if numbers[after] == inside:
+            return self.places[inside]
         low, high = int(numbers[after - 1]), int(numbers[after])
-        share = (image - low) / (high - low)
-        return self.places[low].mixed(self.places[high], share)
+        return self.places[low].mixed(self.places[high], (inside - low) / (high - low))
 
 
 @dataclass(slots=True, eq=False)
 class ClipPeople:
-    """Collects the places of the images that were looked at, and tells the people."""
+    """Collects the places of the images that were looked at, one in `step`, and tells the people.
+
+    Up to `most` of them, each but the first with a probability of `least`.
+    """
 
     least: float
     most: int
+    step: int
     _looks: dict[int, list[Place]] = field(default_factory=dict)
 
     def add(self, image: int, places: Sequence[Place]) -> None:
@@ -64,29 +68,25 @@ class ClipPeople:
         images, looks = list(self._looks), [list(places) for places in self._looks.values()]
         found: list[PersonPath] = []
         while len(found) < self.most and (path := _best_path(looks)):
-            path_confidence = _confidence(list(path.values()))
-            if found and path_confidence < self.least:
+            log_odds = float(np.mean([place.log_odds for place in path.values()]))
+            if found and 1 / (1 + np.exp(-log_odds)) < self.least:
                 break
-            steady = zip(path, _steady(list(path.values())), strict=True)
-            found.append(PersonPath({images[number]: place for number, place in steady}, path_confidence))
+            steady = zip(path, _steady(list(path.values()), log_odds), strict=True)
+            found.append(PersonPath({images[number]: place for number, place in steady}, self.step))
             for number, place in path.items():
                 looks[number] = [other for other in looks[number] if other.apart(place) >= SAME_PLACE]
         return found
 
 
-def _confidence(path: Sequence[Place]) -> float:
-    """Probability by the mean log-odds of the places."""
-    return float(1 / (1 + np.exp(-np.mean([place.log_odds for place in path]))))
-
-
-def _steady(path: Sequence[Place]) -> list[Place]:
-    """The same places with the scale that most looks around agree on."""
+def _steady(path: Sequence[Place], log_odds: float) -> list[Place]:
+    """The same places with the scale that most looks around agree on, all as sure as the whole path is."""
     logs = np.log([place.scale for place in path])
     weight = np.exp(np.minimum([place.log_odds for place in path], 0.0))
     steady = []
     for k, place in enumerate(path):
         around = slice(max(0, k - SPAN), k + SPAN + 1)
-        steady.append(place.resized(float(np.exp(_weighted_median(logs[around], weight[around])))))
+        scale = float(np.exp(_weighted_median(logs[around], weight[around])))
+        steady.append(replace(place.resized(scale), log_odds=log_odds))
     return steady
 
 

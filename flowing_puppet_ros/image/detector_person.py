@@ -47,7 +47,7 @@ class FoundPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """Where a person may stand: `neck` and `face` (2,) px of the given image, `scale` S px, and log-odds that one does."""
+    """Where a person may stand: `neck` and `face` (2,) px of the given image, scale S in px, log-odds that one does."""
 
     neck: Doubles
     face: Doubles
@@ -64,9 +64,7 @@ class Place:
 
     def mixed(self, other: Place, share: float) -> Place:
         """A place between two: 0 this one, 1 the other."""
-        neck, face = (
-            (1 - share) * a + share * b for a, b in ((self.neck, other.neck), (self.face, other.face))
-        )
+        neck, face = ((1 - share) * a + share * b for a, b in ((self.neck, other.neck), (self.face, other.face)))
         scale = self.scale ** (1 - share) * other.scale**share
         return Place(neck, face, scale, (1 - share) * self.log_odds + share * other.log_odds)
 

@@ -32,10 +32,6 @@ class Scene(Protocol):
         """Log likelihood (P,) of a part with contours (P,K,2) px at scale (P,) px/m (Eq. 20)."""
         ...
 
-    def terms(self, part: int, contours: Array, scale: Array) -> Array:
-        """The terms (P,T) of that likelihood before they are weighted."""
-        ...
-
     def with_torso(self, torso: Array, head: Array) -> Self:
         """The evidence that also knows the colours inside the contours (K,2) px of a torso and a head."""
         ...
@@ -95,10 +91,6 @@ class Window:
     def log_likelihood(self, part: int, contours: Array, scale: Array) -> Array:
         """Log likelihood (P,) of a part with contours (P,K,2) in pixels of the image at scale (P,) px/m."""
         return self._scene.log_likelihood(part, self.inside(contours), scale * self._factor)
-
-    def terms(self, part: int, contours: Array, scale: Array) -> Array:
-        """The terms (P,T) of that likelihood before they are weighted."""
-        return self._scene.terms(part, self._inside(contours), scale * self._factor)
 
     def with_torso(self, torso: Array, head: Array) -> Window:
         """The window that also knows the colours inside the contours (K,2) of a torso and a head."""
