@@ -147,7 +147,7 @@ def _best(
 
 
 def _fitted(plane: Plane, points: np.ndarray) -> tuple[Plane, np.ndarray, np.ndarray]:
-    """The plane of least squares through points (N, 3) that faces as `plane`, their middle, and their axes by columns."""
+    """The plane of least squares through points (N, 3) that faces as `plane`, their middle, their axes by columns."""
     middle = points.mean(axis=0)
     axes = np.linalg.svd((points - middle).T @ (points - middle))[0]
     normal = axes[:, 2] * np.sign(axes[:, 2] @ plane.normal)

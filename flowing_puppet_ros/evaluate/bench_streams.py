@@ -21,8 +21,7 @@ from flowing_puppet_ros.flow.estimate import FlowSettings
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker
 from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.model.ds_render import depth_order
-from flowing_puppet_ros.view.overlay import DrawnPuppet, draw_puppets
+from flowing_puppet_ros.model.ds_render import depth_order, render_labels
 
 SIZES = ((320, 240), (640, 480), (1280, 960))
 PEOPLE = (1, 2, 4, 8)
@@ -73,12 +72,12 @@ def _crowd(model: DeformableStructures, size: tuple[int, int], count: int) -> Pe
 
 
 def _drawn(model: DeformableStructures, ground: np.ndarray, people: People) -> np.ndarray:
-    drawn = []
+    image, colours = ground.copy(), np.random.default_rng(0).integers(0, 255, (len(model.tree), 3))
     for joints, scale in people:
-        shape = model.puppet_from_joints(joints, scale)
-        certain, order = np.ones(len(joints)), depth_order(model)
-        drawn.append(DrawnPuppet("", model.joint_names, joints, certain, model.tree.names, shape.contours, order))
-    return draw_puppets(ground, drawn, opacity=0.9, labels=False)
+        contours = model.puppet_from_joints(joints, scale).contours
+        labels = render_labels(contours, depth_order(model), (ground.shape[0], ground.shape[1]))
+        image[labels > 0] = colours[labels[labels > 0] - 1]
+    return image
 
 
 def replaying(seed: int) -> list[Row]:
