@@ -72,7 +72,7 @@ class _Replay:
         self._options = options
         self._new_name = {name: options.topic_map.get(name, name) for name in bag.topics}
         self._factory = BagMessageFactory()
-        self.warnings: list[str] = []
+        self.warnings: list[str] = list(bag.notes)
         topics = {self._new_name[name]: kind for name, kind in bag.topics.items()}
         unknown = sorted(set(options.topic_map) - set(bag.topics))
         if unknown:

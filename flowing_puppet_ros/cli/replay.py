@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--params", type=Path, help="YAML file with the parameters of the nodes")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random [0]")
-    parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated .mcap")
+    parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated or damaged .mcap")
     parser.add_argument("--report", type=Path, metavar="HTML", help="write a report with pictures and figures")
     parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
 

@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, help="tracks.json to write")
     parser.add_argument("--init", help="keypoints.json, people of one or more frames, instead of the detector")
     parser.add_argument("--topic", default="", help="image topic of a bag [the first camera with detections]")
-    parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated .mcap")
+    parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated or damaged .mcap")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
     parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object")

@@ -18,6 +18,7 @@ from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import IMAGE, PUPPETS, Component, Output, Port
+from flowing_puppet_ros.stream.humans import Humans, HumansSettings, image_humans
 from flowing_puppet_ros.stream.images import decode_flow, decode_image, make_image
 from flowing_puppet_ros.stream.lookout import Lookout, LookoutSettings
 from flowing_puppet_ros.stream.messages import MessageFactory, header_ns, stamp_ns
@@ -27,12 +28,12 @@ from flowing_puppet_ros.stream.people import keypoints_of, make_puppets
 from flowing_puppet_ros.stream.waiting import Line, Shelf
 from flowing_puppet_ros.view.overlay import DrawnPuppet, draw_puppets
 
-_OF_A_NEW_TRACKER = {"model", "parts", "max_side", "seed"}
+_OF_A_NEW_TRACKER = {"model", "parts", "max_side", "seed", "humans", "humans_namespace"}
 
 
 @dataclass(frozen=True)
-class PuppetTrackerSettings(TrackerSettings, FlowSettings, LookoutSettings):
-    """Settings of the tracker, of the flow it computes, of its detector, and of what it waits for and draws."""
+class PuppetTrackerSettings(TrackerSettings, FlowSettings, LookoutSettings, HumansSettings):
+    """Settings of the tracker, its flow and its detector, and of what it waits for, draws and publishes."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     parts: int = setting(14, "parts of the puppet: 10, or 14 with hands and feet", low=10, high=14)
@@ -74,6 +75,8 @@ class PuppetTrackerComponent(Component):
         self._line = Line()
         self._shelves = {port.name: Shelf() for port in self.inputs if port.optional}
         self._header: Any = None
+        self._humans = Humans(settings, factory, "skeleton2d", "roi", "cropped")
+        self.outputs = (*type(self).outputs, *self._humans.ports)
 
     def reset(self) -> None:
         """Forget the people and everything that waits."""
@@ -205,6 +208,9 @@ class PuppetTrackerComponent(Component):
     def _publish(self, header: Any, earlier: Any, image: NDArray[np.uint8], result: TrackResult) -> Output:
         puppets = make_puppets(self.factory, header, self._model, result.puppets)
         outputs: Output = [("puppets", puppets)]
+        if self._humans.on:
+            made = image_humans(self.factory, header, image, puppets.puppets)
+            outputs += self._humans.publish(header, list(made), made)
         if "part_labels" in self._wanted:
             labels = result.labels(image.shape[:2])
             outputs.append(("part_labels", make_image(self.factory, header, labels, "mono8")))
