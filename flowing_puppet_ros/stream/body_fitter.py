@@ -115,11 +115,11 @@ class BodyFitterComponent(Component):
     def _view(self, cloud: Any, of_depth: bool) -> View:
         """The points of a cloud message in the region of interest, z up.
 
-        That of a depth image is seen from one side, in an optical frame, whose y axis points down.
+        That of a depth image is seen from one side, in an optical frame, whatever its name, whose y axis points down.
         """
-        up = "-y" if of_depth else self._settings.up
+        up = self._settings.up
         if up == "auto":
-            up = "-y" if OPTICAL.search(cloud.header.frame_id) else "z"
+            up = "-y" if of_depth or OPTICAL.search(cloud.header.frame_id) else "z"
         turn = upright(axis_of(up))
         points, normals = decode_cloud(cloud)
         inside = within(points, self._settings)

@@ -33,7 +33,7 @@ _OF_A_NEW_TRACKER = {"model", "parts", "max_side", "seed", "humans", "humans_nam
 
 @dataclass(frozen=True)
 class PuppetTrackerSettings(TrackerSettings, FlowSettings, LookoutSettings, HumansSettings):
-    """Settings of the tracker, its flow and its detector, and of what the component waits for, draws and publishes."""
+    """Settings of the tracker, its flow and its detector, and of what it waits for, draws and publishes."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     parts: int = setting(14, "parts of the puppet: 10, or 14 with hands and feet", low=10, high=14)
