@@ -45,7 +45,8 @@ class WristMoves:
     def __call__(self, vectors: Floats, rng: np.random.Generator) -> Floats:
         """Vectors (P,D) with one wrist each at a place drawn from one of the maps, chosen at random."""
         moved = vectors.copy()
-        which, side, bend = rng.integers(0, len(self.sums), len(vectors)), *rng.integers(0, 2, (2, len(vectors)))
+        which = rng.integers(0, len(self.sums), len(vectors))
+        side, bend = rng.integers(0, 2, len(vectors)), rng.integers(0, 2, len(vectors))
         drawn = rng.random(len(vectors))
         joints, scale = self.body.joints(vectors, self.legs)
         for k, name in enumerate(SIDES):

@@ -108,7 +108,7 @@ def test_puppets_are_carried_joint_by_joint() -> None:
     moved = carried(FRONT, moments, joints, contours) - joints
     inside = (joints > 5).all(axis=2) & (joints < (315, 235)).all(axis=2)
     upper = np.isin(np.arange(len(NAMES)), [NAMES.index(n) for n in NAMES if "knee" not in n and "ankle" not in n])
-    np.testing.assert_allclose(moved[inside & upper], np.tile([4.0, 2.0], (np.sum(inside & upper), 1)), atol=0.5)
+    np.testing.assert_allclose(moved[inside & upper], np.tile([4.0, 2.0], (int(np.sum(inside & upper)), 1)), atol=0.5)
 
 
 class Told:

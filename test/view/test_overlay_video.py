@@ -29,7 +29,8 @@ def puppet(shift: float) -> DrawnPuppet:
 
 
 def played(path: Path) -> list[np.ndarray]:
-    capture, frames = cv2.VideoCapture(str(path)), []
+    capture = cv2.VideoCapture(str(path))
+    frames: list[np.ndarray] = []
     while True:
         read, frame = capture.read()
         if not read:
