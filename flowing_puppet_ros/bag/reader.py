@@ -254,18 +254,6 @@ def _is_indexed(storage: Any) -> bool:
     return chunks is None or (bool(chunks) and all(chunk.channel_count for chunk in chunks))
 
 
-def is_bag(path: Path) -> bool:
-    """Whether a file or folder looks like one bag: by its ending, or its metadata, or because one was recorded in it.
-
-    A recorder that was stopped by force leaves no metadata, but its files `<folder>_0`, `<folder>_1`, ...
-    """
-    if path.is_dir():
-        files = [*path.glob("*.mcap"), *path.glob("*.db3")]
-        split = all(re.fullmatch(re.escape(path.resolve().name) + r"_\d+", file.stem) for file in files)
-        return (path / "metadata.yaml").exists() or len(files) == 1 or (len(files) > 1 and split)
-    return path.suffix in (".mcap", ".db3")
-
-
 def _no_bag(path: Path) -> str:
     return f"{path} is no ROS 2 bag that can be read (.mcap, .db3, or a folder with metadata.yaml)"
 

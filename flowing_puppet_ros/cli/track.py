@@ -19,6 +19,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from flowing_puppet_ros.bag.paths import is_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import FlowSettings
@@ -35,8 +36,6 @@ from flowing_puppet_ros.image.video import Frame, open_frames
 from flowing_puppet_ros.image.video_tracker import DetectionSettings, VideoTracker
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.view.overlay_video import check_overlay, drawn_tracks, write_overlay
-
-BAG_SUFFIXES = frozenset({".mcap", ".db3"})
 
 type Detected = tuple[Frame, list[Keypoints] | None]
 type Stepped = tuple[TrackResult, dict[str, Sight] | None]
@@ -208,11 +207,6 @@ def _check_reach(keypoints: dict[int, list[Keypoints]], count: int, arguments: a
         raise InputError(
             f"{arguments.init} has keypoints from frame {first} on, but {arguments.input} has {count} frames"
         )
-
-
-def is_bag(path: Path) -> bool:
-    """Whether `path` is a bag file or a folder that rosbag2 wrote."""
-    return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
 
 
 def _summarise(arguments: argparse.Namespace, tally: _Tally, seconds: float) -> None:

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from flowing_puppet_ros.bag.reader import Bag, is_bag, open_bag
+from flowing_puppet_ros.bag.paths import is_bag
+from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.body.surface import closest_on_mesh
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.from_bag import Joints, Recording, body_joints, read_recording
