@@ -29,12 +29,15 @@ SCORED = tuple(f"{side}_{name}" for name in ("shoulder", "elbow", "wrist") for s
 
 @dataclass(frozen=True, slots=True)
 class EnergySettings(Settings):
-    """Weights of the terms of Eq. 35, and how far the flow carries a puppet for its evidence there."""
+    """Weights of the terms of Eq. 35, and how far the flow carries a puppet for its evidence there.
 
-    prior_weight: float = setting(0.1, "weight of the body model's prior", low=0.0, high=100.0)
+    The weights come from `flowing-puppet learn flowing`, see weights/flowing_weights.md; the detector's is set by hand.
+    """
+
+    prior_weight: float = setting(0.15, "weight of the body model's prior", low=0.0, high=100.0)
     contour_weight: float = setting(1.0, "weight of the contours", low=0.0, high=100.0)
-    colour_weight: float = setting(1.0, "weight of skin and torso colour", low=0.0, high=100.0)
-    hand_weight: float = setting(0.5, "weight of the hand detectors", low=0.0, high=100.0)
+    colour_weight: float = setting(0.6, "weight of skin and torso colour", low=0.0, high=100.0)
+    hand_weight: float = setting(1.0, "weight of the hand detectors", low=0.0, high=100.0)
     score_weight: float = setting(3.0, "weight of the detector's score of each arm joint", low=0.0, high=100.0)
     forward: bool = setting(True, "use the evidence at the puppet that the flow carries forward")
     backward: bool = setting(True, "use the evidence at the puppet that the flow carries backward")

@@ -35,6 +35,7 @@ from flowing_puppet_ros.model.ds_shape import PuppetShape, View
 type Floats = NDArray[np.float64]
 
 LEAST_KNOWN = 3  # a person of whom fewer joints are known is lost
+HIDDEN = 0.3  # share of the confidence that is left of a joint behind somebody nearer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +152,8 @@ class FlowingPuppetTracker:
         self.people = [person for person in self.people if self._lives(person, size)]
         for person in self.people:
             person.settle(self.model)
-        puppets = [self._puppet(person, size) for person in self.people]
+        hidden = hidden_joints(self.model, self.people, grid)
+        puppets = [self._puppet(person, size, covered) for person, covered in zip(self.people, hidden, strict=True)]
         return TrackResult(puppets, pair, warnings, self.model, grid, carriage)
 
     def redirected(self, result: TrackResult, places: Mapping[str, Mapping[int, tuple[Floats, float]]]) -> TrackResult:
@@ -235,7 +237,7 @@ class FlowingPuppetTracker:
         low, high = known.min(axis=0), known.max(axis=0)
         return not ((high < 0).any() or (low > np.array(size) - 1).any())
 
-    def _puppet(self, person: Person, size: tuple[int, int]) -> TrackedPuppet:
+    def _puppet(self, person: Person, size: tuple[int, int], hidden: NDArray[np.bool_]) -> TrackedPuppet:
         shape = person.shape
         assert shape is not None
         order = depth_order(self.model, person.view)
@@ -245,7 +247,7 @@ class FlowingPuppetTracker:
             person.id,
             self.model.name,
             person.mean.copy(),
-            person.confidence(size),
+            person.confidence(size) * np.where(hidden, HIDDEN, 1.0),
             person.scale,
             person.view,
             float(energy),
@@ -255,6 +257,21 @@ class FlowingPuppetTracker:
             person.detected,
             person.detection,
         )
+
+
+def hidden_joints(model: DeformableStructures, people: Sequence[Person], grid: Grid) -> list[NDArray[np.bool_]]:
+    """Which joints (J,) of each person lie behind the puppet of somebody nearer."""
+    if len(people) < 2:
+        return [np.zeros(len(model.joint_names), dtype=bool) for _ in people]
+    labels = paint_people(model, [person.shape for person in people if person.shape is not None], grid)
+    height, width = labels.shape
+    hidden = []
+    for k, person in enumerate(people):
+        x, y = np.rint(grid.reduced(person.mean)).astype(np.int64).T
+        inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        owner = (labels[np.where(inside, y, 0), np.where(inside, x, 0)].astype(np.int64) - 1) // len(model.tree)
+        hidden.append(inside & (owner >= 0) & (owner != k))
+    return hidden
 
 
 def letters(seed: int) -> str:
