@@ -141,6 +141,12 @@ class ArmFilter:
         """
         return {side: self._side(side, sight, flow, grid, width) for side in SIDES}
 
+    def carry(self, flow: FlowPair | None, grid: Grid) -> None:
+        """Go on to an image in which nobody looks; `flow` as in `step`."""
+        if flow is not None:
+            for side, arm in self._arms.items():
+                self._arms[side] = replace(arm, places=arm.places + _motion(flow, grid, arm.places))
+
     def _side(self, side: str, sight: Sight, flow: FlowPair | None, grid: Grid, width: float) -> tuple[Floats, float]:
         before, places = self._arms.get(side), sight.hypotheses(side, self.settings.modes)
         if before is not None and flow is not None:

@@ -23,6 +23,9 @@ from flowing_puppet_ros.model.ds import DeformableStructures
 
 type Floats = NDArray[np.float64]
 
+DETECTOR_TRUST = 1 / 16
+"""Weight of a joint of our detector against one of given keypoints: it errs more, and the flow must hold against it."""
+
 
 @dataclass(slots=True, eq=False)
 class _Moment:
@@ -85,6 +88,7 @@ class Clip:
         motion, trust = np.array([m.motion for m in track[1:]]), np.array([m.trust for m in track[1:]])
         if identity in self._arms:
             self._resolve_arms(self._arms[identity], detected, motion, scale)
+            detected[..., 2] *= DETECTOR_TRUST
         confidence = np.where(np.isfinite(detected).all(axis=2), detected[..., 2], 0.0)
         if len(track) < 2 or not (confidence > 0).any():
             return start

@@ -34,7 +34,7 @@ def test_the_size_is_what_most_looks_say() -> None:
     assert face == pytest.approx([0.0, -20.0])
 
 
-def test_a_missed_look_is_filled_in_and_steps_are_halved() -> None:
+def test_a_missed_look_is_filled_in_and_places_between_looks_are_means() -> None:
     looks = [[place(100.0 + 10 * k)] if k != 3 else [] for k in range(7)]
     path = people(looks, step=2).paths()[0]
     found = path.at(6)
@@ -43,10 +43,16 @@ def test_a_missed_look_is_filled_in_and_steps_are_halved() -> None:
     assert odd is not None and odd.neck == pytest.approx([115.0, 50.0])
 
 
-def test_nobody_is_supposed_long_before_or_after_the_path() -> None:
-    looks: list[list[Place]] = [[], [], [], *[[place(100)] for _ in range(4)], [], []]
+def test_before_and_after_the_path_the_person_must_show_to_be_believed() -> None:
+    looks: list[list[Place]] = [*[[] for _ in range(20)], *[[place(100)] for _ in range(4)], *[[] for _ in range(20)]]
     path = people(looks, step=3).paths()[0]
-    assert path.at(6) is None and path.at(7) is not None and path.at(20) is not None and path.at(21) is None
+    for image in (58, 60, 69, 71):
+        found = path.at(image)
+        assert found is not None and found.least == -np.inf
+    for image in (57, 72, 15, 114):
+        supposed = path.at(image)
+        assert supposed is not None and supposed.neck[0] == 100.0 and supposed.least < supposed.score
+    assert path.at(14) is None and path.at(115) is None
 
 
 def test_two_people_are_two_paths_and_the_surer_comes_first() -> None:
