@@ -55,6 +55,8 @@ def open_bag_frames(
     lists the image topics when there is no such topic, and when the topic has no message.
     """
     with open_bag(path, salvage) as bag:
+        for note in bag.notes:
+            warn(note)
         images = sorted(name for name, kind in bag.topics.items() if kind in (IMAGE, COMPRESSED_IMAGE))
         people_topics = [name for name, kind in bag.topics.items() if kind == PUPPETS and name.endswith("/detections")]
         detected = {name.removesuffix("/detections"): name for name in people_topics}

@@ -1,22 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read rosbag2 bags in log order: a lone `.mcap` or `.db3`, a folder with `metadata.yaml`, or a truncated `.mcap`."""
+"""Read rosbag2 bags in log order: folders, lone files, files of other writers, and what is left of broken ones."""
 
 from __future__ import annotations
 
+import heapq
+import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
-from mcap.records import Channel, Message, Schema
+from mcap.reader import make_reader
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader
-from rosbags.serde import SerdeError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from flowing_puppet_ros.bag.salvage import is_truncated, salvaged_records
+from flowing_puppet_ros.bag.mcap_file import McapFile, is_mcap, is_truncated
 from flowing_puppet_ros.bag.typestore import typestore
 from flowing_puppet_ros.errors import InputError
 
@@ -32,10 +33,13 @@ class Record:
 
     @property
     def message(self) -> Any:
-        """The message object; InputError when the bytes are not a message of the type."""
+        """The message object; InputError when the bytes are not a message of the type, or the type is not known."""
+        store = typestore()
+        if self.type not in store.fielddefs:
+            raise InputError(f"the messages on {self.topic} have the type {self.type}, which is not known here")
         try:
-            return typestore().deserialize_cdr(self.raw, self.type)
-        except (SerdeError, KeyError, IndexError) as error:
+            return store.deserialize_cdr(self.raw, self.type)
+        except Exception as error:  # bytes that are no message fail in the library in any way
             raise InputError(f"a message on {self.topic} is not the {self.type} that it claims to be") from error
 
 
@@ -48,30 +52,129 @@ class Topic:
     qos: tuple[dict[str, Any], ...]
 
 
-class Bag:
-    """An open bag. Use as a context manager; messages are streamed, not held."""
+class _Part(Protocol):
+    """A file, or a folder with metadata, of a bag."""
 
-    def __init__(self, path: Path, salvage: bool = False) -> None:
-        """Open `path`; with `salvage` also an MCAP file whose end is missing."""
+    details: dict[str, Topic]
+
+    def messages(self, topics: set[str]) -> Iterator[Record]:
+        """Yield the messages of some topics in log order."""
+
+    def close(self) -> None:
+        """Close the files."""
+
+
+class _NoIndex(Exception):
+    """The index does not lead to every message."""
+
+
+class _Indexed:
+    """What the index of a file, or of a folder with metadata, leads to."""
+
+    def __init__(self, path: Path) -> None:
+        """Open it; InputError when it is no bag, _NoIndex when only a scan finds everything in order."""
         self.path = path
-        self._salvage = path.is_file() and path.suffix != ".db3" and is_truncated(path)
-        if self._salvage and not salvage:
-            raise InputError(f"{path} is cut off before its end: add --salvage to read what is whole")
-        self._reader: Reader | None = None
-        if self._salvage:
-            self.details = self._scan()
-            if not self.details:
-                raise InputError(f"{path} is cut off so early that it has no whole message")
-            return
         try:
             self._reader = Reader(path)
             self._reader.open()
         except Exception as error:  # a damaged file fails in the libraries in any way
             raise InputError(_no_bag(path)) from error
+        storages = getattr(self._reader.storage, "storages", [self._reader.storage])
+        # What is compressed as a whole, or message by message, only this reader can read.
+        self.compressed = bool(self._reader.compression_mode)
+        if not self.compressed and not all(map(_is_indexed, storages)):
+            self._reader.close()
+            raise _NoIndex
         self.details = {
             c.topic: Topic(c.msgtype, c.msgcount, tuple(_qos(q) for q in getattr(c.ext, "offered_qos_profiles", ())))
             for c in self._reader.connections
         }
+
+    def messages(self, topics: set[str]) -> Iterator[Record]:
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        if not connections:
+            return
+        try:
+            for connection, log_time, raw in self._reader.messages(connections):
+                yield Record(connection.topic, connection.msgtype, log_time, bytes(raw))
+        except Exception as error:  # as above; what the caller does between two messages never lands here
+            reason = str(error).rstrip(".") or type(error).__name__
+            raise InputError(f"{self.path} is damaged: {reason}; add --salvage to read the rest") from error
+
+    def close(self) -> None:
+        self._reader.close()
+
+
+class _Scanned:
+    """An MCAP file that is read without an index."""
+
+    def __init__(self, path: Path, salvage: bool) -> None:
+        self._file = McapFile(path, salvage)
+        self.details: dict[str, Topic] = {}
+        for number, channel in self._file.channels.items():
+            known = self.details.get(channel.topic)
+            count = self._file.counts[number] + (known.count if known else 0)
+            qos = _parse_qos(channel.metadata.get("offered_qos_profiles", ""))
+            self.details[channel.topic] = Topic(self._file.types[number], count, qos)
+        self.note = ""
+        if salvage:
+            lost = (
+                f", {self._file.damaged} damaged places ({self._file.skipped_bytes} bytes) passed over"
+                if self._file.damaged
+                else ""
+            )
+            count = sum(topic.count for topic in self.details.values())
+            self.note = f"{path}: {count} messages salvaged{lost}"
+
+    def messages(self, topics: set[str]) -> Iterator[Record]:
+        numbers = [number for number, channel in self._file.channels.items() if channel.topic in topics]
+        for number, log_time, raw in self._file.messages(numbers):
+            yield Record(self._file.channels[number].topic, self._file.types[number], log_time, raw)
+
+    def close(self) -> None:
+        pass
+
+
+class Bag:
+    """An open bag. Use as a context manager; messages are streamed, not held.
+
+    `notes` says what was salvaged, `compressed` whether its files or its messages are compressed one by one.
+    """
+
+    def __init__(self, path: Path, files: Collection[Path], salvage: bool = False) -> None:
+        """Open the `files` (or the folder with metadata) of the bag `path`."""
+        self.path = path
+        self.notes: list[str] = []
+        self._parts: list[_Part] = []
+        try:
+            for file in files:
+                self._parts.append(self._opened(file, salvage))
+        except BaseException:
+            self.close()
+            raise
+        self.compressed = any(getattr(part, "compressed", False) for part in self._parts)
+        self.details: dict[str, Topic] = {}
+        for part in self._parts:
+            for name, topic in part.details.items():
+                known = self.details.get(name)
+                self.details[name] = Topic(topic.type, topic.count + (known.count if known else 0), topic.qos)
+
+    def _opened(self, path: Path, salvage: bool) -> _Part:
+        lone = path.is_file() and path.suffix != ".db3" and is_mcap(path)
+        if lone and is_truncated(path) and not salvage:
+            raise InputError(f"{path} is cut off before its end: add --salvage to read what is whole")
+        if lone and salvage:
+            scanned = _Scanned(path, salvage)
+            if not sum(topic.count for topic in scanned.details.values()) and is_truncated(path):
+                raise InputError(f"{path} is cut off so early that it has no whole message")
+            self.notes.append(scanned.note)
+            return scanned
+        try:
+            return _Indexed(path)
+        except (InputError, _NoIndex):
+            if not lone:
+                raise
+            return _Scanned(path, salvage=False)
 
     @property
     def topics(self) -> dict[str, str]:
@@ -79,22 +182,20 @@ class Bag:
         return {name: topic.type for name, topic in self.details.items()}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Record]:
-        """Yield the messages of `topics` (all by default) in the order of their log times.
-
-        A truncated file is read in the order of its bytes, which is the order of writing.
-        """
+        """Yield the messages of `topics` (all by default) in the order of their log times."""
         chosen = set(self.details if topics is None else topics)
-        if self._reader is None:
-            yield from self._salvaged(chosen)
-            return
-        connections = [c for c in self._reader.connections if c.topic in chosen]
-        if not connections:
-            return
+        yield from heapq.merge(*(part.messages(chosen) for part in self._parts), key=lambda record: record.log_time)
+
+    def note(self, name: str) -> dict[str, str]:
+        """The texts that `BagWriter.note` put into the file's metadata under this name; empty without any."""
+        path = next(iter(sorted(self.path.glob("*.mcap"))), self.path) if self.path.is_dir() else self.path
+        if path.suffix != ".mcap":
+            return {}
         try:
-            for connection, log_time, raw in self._reader.messages(connections):
-                yield Record(connection.topic, connection.msgtype, log_time, bytes(raw))
-        except Exception as error:  # as above; what the caller does between two messages never lands here
-            raise InputError(f"{self.path} is damaged: {str(error).rstrip('.') or type(error).__name__}") from error
+            with path.open("rb") as stream:
+                return next((m.metadata for m in make_reader(stream).iter_metadata() if m.name == name), {})
+        except Exception:  # a damaged file fails in the library in any way; its messages may be whole
+            return {}
 
     @property
     def count(self) -> int:
@@ -103,35 +204,8 @@ class Bag:
 
     def close(self) -> None:
         """Close the files."""
-        if self._reader is not None:
-            self._reader.close()
-            self._reader = None
-
-    def _scan(self) -> dict[str, Topic]:
-        counts: dict[str, int] = {}
-        types: dict[str, tuple[str, tuple[dict[str, Any], ...]]] = {}
-        for channel, name, _ in self._salvaged_messages():
-            counts[channel.topic] = counts.get(channel.topic, 0) + 1
-            types[channel.topic] = (name, _parse_qos(channel.metadata.get("offered_qos_profiles", "")))
-        return {topic: Topic(name, counts[topic], qos) for topic, (name, qos) in types.items()}
-
-    def _salvaged(self, chosen: set[str]) -> Iterator[Record]:
-        for channel, name, message in self._salvaged_messages():
-            if channel.topic in chosen:
-                yield Record(channel.topic, name, message.log_time, message.data)
-
-    def _salvaged_messages(self) -> Iterator[tuple[Channel, str, Message]]:
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        with self.path.open("rb") as stream:
-            for record in salvaged_records(stream):
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif record.channel_id in channels and channels[record.channel_id].schema_id in schemas:
-                    channel = channels[record.channel_id]
-                    yield channel, schemas[channel.schema_id].name, record
+        while self._parts:
+            self._parts.pop().close()
 
     def __enter__(self) -> Self:
         return self
@@ -143,19 +217,41 @@ class Bag:
 
 
 def open_bag(path: Path | str, salvage: bool = False) -> Bag:
-    """Open a bag for reading; InputError in one sentence when it is missing, no bag, or cut off."""
+    """Open a bag for reading; InputError in one sentence when it is missing, no bag, cut off or damaged.
+
+    With `salvage` the MCAP files of a broken bag are read as far as they can be.
+    """
     path = Path(path)
     if not path.exists():
         raise InputError(f"there is no bag {path}")
-    if path.is_dir():
-        files = sorted(path.glob("*.mcap")) + sorted(path.glob("*.db3"))
-        complete = (path / "metadata.yaml").exists()
-        if not complete and len(files) != 1:
-            raise InputError(f"the folder {path} is no bag: it has no metadata.yaml and {len(files)} bag files")
-        # A recorder that was stopped by force leaves no metadata, or metadata of a file that is cut off.
-        if len(files) == 1 and (not complete or is_truncated(files[0])):
-            path = files[0]
-    return Bag(path, salvage)
+    if not path.is_dir():
+        return Bag(path, [path], salvage)
+    files = sorted(path.glob("*.mcap"), key=_natural) or sorted(path.glob("*.db3"), key=_natural)
+    complete = (path / "metadata.yaml").exists()
+    if not complete and not files:
+        raise InputError(f"the folder {path} is no bag: it has no metadata.yaml and 0 bag files")
+    # A recorder that was stopped by force leaves no metadata, or metadata of a file that is cut off.
+    if files and (not complete or any(is_truncated(file) for file in files)):
+        return Bag(path, files, salvage)
+    try:
+        bag = Bag(path, [path])
+    except _NoIndex:
+        return Bag(path, files, salvage)
+    if salvage and files and not bag.compressed:
+        bag.close()
+        return Bag(path, files, salvage)
+    return bag
+
+
+def _natural(path: Path) -> list[Any]:
+    """Key that sorts the second file of a split bag before the tenth."""
+    return [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", path.name)]
+
+
+def _is_indexed(storage: Any) -> bool:
+    """Whether a file is a database, or an MCAP file whose chunks are all indexed."""
+    chunks = getattr(storage, "chunks", None)
+    return chunks is None or (bool(chunks) and all(chunk.channel_count for chunk in chunks))
 
 
 def _no_bag(path: Path) -> str:

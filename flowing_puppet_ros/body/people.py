@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.body.planes import Plane, find_floor, find_wall
+from flowing_puppet_ros.body.planes import Plane, PlaneMemory, find_floor, find_wall
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
 
@@ -22,6 +23,9 @@ EXTENTS = ((0.5, 0.9, 2.0, 2.6), (0.15, 0.3, 1.1, 1.9), (0.02, 0.07, 0.8, 1.3))
 FLAT_SHARE = (0.6, 0.8)
 """Shares of places on three planes at right angles: of a person at most the first, of furniture the second and more."""
 FLAT_COSINE, SQUARE_COSINE = np.cos(np.radians(20.0)), np.sin(np.radians(20.0))
+CLAIM, LEAST_SHARE, MOST_SHARE = 0.25, 0.1, 0.5
+"""Metres from a known body within which places may be its own; shares of a cluster from which it claims these places,
+and from which all of the cluster."""
 LOWEST = (0.5, 1.2)
 """Metres above the floor at which a person's lowest point usually lies, and where it cannot."""
 
@@ -50,12 +54,14 @@ class PersonCloud:
         normals: (N, 3) or None, as they came.
         rows: (N,) indices into the scene's points, ascending.
         likeness: 0 to 1, how much size, shape and place are a person's.
+        owner: index of the known body that stands in these points, None of somebody new.
     """
 
     points: np.ndarray
     normals: np.ndarray | None
     rows: np.ndarray
     likeness: float
+    owner: int | None = None
 
 
 def extract_people(
@@ -63,8 +69,13 @@ def extract_people(
     normals: np.ndarray | None,
     settings: ExtractionSettings,
     viewpoint: np.ndarray | None = None,
+    known: Sequence[np.ndarray] = (),
+    memory: PlaneMemory | None = None,
 ) -> list[PersonCloud]:
     """Find the people in a scene; the same cloud gives the same answer.
+
+    Who is known keeps their points when they touch somebody else or fall into pieces behind something, and is taken
+    for a person however little of them is seen.
 
     Args:
         points: (N, 3) metres, z up; those that are not finite are ignored.
@@ -72,9 +83,11 @@ def extract_people(
         settings: limits.
         viewpoint: (3,) where the sensor stood; None when the cloud was joined from several places, so that gaps do
             not grow with the distance.
+        known: points (K, 3) in metres on each body that is expected in the cloud, where it should be by now.
+        memory: the planes of the clouds before this one, which save looking for floor and walls in every cloud.
 
     Returns:
-        The people, the likeliest first; empty when there is none.
+        The known people, then the new ones, the likeliest first; empty when there is none.
 
     Raises:
         InputError: when the arrays have wrong shapes.
@@ -92,17 +105,43 @@ def extract_people(
     drawn_in = _drawn_in(local) if viewpoint is not None else local
     voxel = _voxels(drawn_in, settings.gap / VOXELS_A_GAP)
     centres = _means(local, voxel)
-    free, floor = _without_planes(centres, settings.clearance)
+    free, floor = _without_planes(centres, settings.clearance, origin, memory)
     label = np.full(len(centres), -1)
     label[free] = _clusters(_means(drawn_in, voxel)[free], settings.gap)
+    strangers = label.max() + 1
+    if known and len(free):
+        label[free] = _claimed(centres[free] + origin, label[free], known)
     people = []
-    for _, group in _groups(label[voxel]):
+    for number, group in _groups(label[voxel]):
+        owner = int(number - strangers) if number >= strangers else None
         likeness = person_likeness(local[group], floor)
-        if len(group) >= settings.least_points and likeness >= settings.likeness:
+        if len(group) >= settings.least_points and (owner is not None or likeness >= settings.likeness):
             chosen = rows[group]
-            people.append(PersonCloud(points[chosen], None if normals is None else normals[chosen], chosen, likeness))
-    people.sort(key=lambda person: -person.likeness)
+            own_normals = None if normals is None else normals[chosen]
+            people.append(PersonCloud(points[chosen], own_normals, chosen, likeness, owner))
+    people.sort(key=lambda person: (person.owner is None, -person.likeness))
     return people[: settings.people]
+
+
+def _claimed(centres: np.ndarray, label: np.ndarray, known: Sequence[np.ndarray]) -> np.ndarray:
+    """Labels (M,) with the places (M, 3) of the k-th known body's points under the first free label + k.
+
+    A body takes a cluster of which it explains most. It takes what is near it of a larger one, and clusters that
+    several bodies stand in are divided by the nearest body.
+    """
+    trees = [cKDTree(points) for points in known]
+    distance = np.stack([tree.query(centres)[0] for tree in trees])
+    nearest, closest = distance.argmin(axis=0), distance.min(axis=0)
+    claimed, first = label.copy(), int(label.max()) + 1
+    for _, group in _groups(label):
+        near = group[closest[group] < CLAIM]
+        share = np.bincount(nearest[near], minlength=len(known)) / len(group)
+        owners = np.flatnonzero(share > LEAST_SHARE)
+        if not len(owners):
+            continue
+        taken = group if share.sum() > MOST_SHARE else near
+        claimed[taken] = first + owners[distance[np.ix_(owners, taken)].argmin(axis=0)]
+    return claimed
 
 
 def person_likeness(points: np.ndarray, floor: Plane | None) -> float:
@@ -156,19 +195,43 @@ def _means(points: np.ndarray, voxel: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(voxel, column) / count for column in points.T], axis=1)
 
 
-def _without_planes(centres: np.ndarray, clearance: float) -> tuple[np.ndarray, Plane | None]:
-    """Which voxels (M,) belong neither to the floor nor to what is below it nor to walls, and the floor."""
+def _without_planes(
+    centres: np.ndarray, clearance: float, origin: np.ndarray, memory: PlaneMemory | None
+) -> tuple[np.ndarray, Plane | None]:
+    """Which voxels (M,) belong neither to the floor nor to what is below it nor to walls, and the floor.
+
+    `centres` are relative to `origin`, which may differ from cloud to cloud.
+    """
+    known = memory.recall(centres + origin, clearance) if memory else None
+    if known is None:
+        floor, walls = _found_planes(centres, clearance)
+        if memory:
+            memory.keep(
+                centres + origin, clearance, *((floor and floor.moved(origin)), [w.moved(origin) for w in walls])
+            )
+    else:
+        floor, walls = known[0] and known[0].moved(-origin), [wall.moved(-origin) for wall in known[1]]
+    return np.flatnonzero(_off(centres, clearance, floor, walls)), floor
+
+
+def _off(centres: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]) -> np.ndarray:
+    off = np.ones(len(centres), dtype=bool) if floor is None else floor.height(centres) > clearance
+    for wall in walls:
+        off &= np.abs(wall.height(centres)) > clearance
+    return off
+
+
+def _found_planes(centres: np.ndarray, clearance: float) -> tuple[Plane | None, list[Plane]]:
     rng = np.random.default_rng(0)
-    free = np.arange(len(centres))
     floor = find_floor(_some(centres), clearance, rng)
-    if floor is not None:
-        free = free[floor.height(centres) > clearance]
-    for _ in range(MAX_WALLS):
-        wall = find_wall(_some(centres[free]), clearance, rng) if len(free) >= 3 else None
+    walls: list[Plane] = []
+    while len(walls) < MAX_WALLS:
+        free = centres[_off(centres, clearance, floor, walls)]
+        wall = find_wall(_some(free), clearance, rng) if len(free) >= 3 else None
         if wall is None:
             break
-        free = free[np.abs(wall.height(centres[free])) > clearance]
-    return free, floor
+        walls.append(wall)
+    return floor, walls
 
 
 def _some(points: np.ndarray) -> np.ndarray:

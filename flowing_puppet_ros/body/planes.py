@@ -7,9 +7,11 @@ to a low camera can win over the floor.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 TRIALS = (200, 3000)
 TRIALS_TIMES_POINTS = 2_000_000
@@ -27,6 +29,9 @@ CELL, COVERED = 0.25, 0.6
 """Metres, and the share of its sides' product that a plane's points must cover in cells of that size; slices through
 people and furniture cover less."""
 
+REFRESH, STILL_THERE = 10, 0.7
+"""Clouds after which planes are looked for anew, and the share of a plane's points that must still lie on it."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
@@ -43,6 +48,41 @@ class Plane:
     def height(self, points: np.ndarray) -> np.ndarray:
         """Signed distance (N,) of points (N, 3), metres, positive where the normal points."""
         return np.asarray(points @ self.normal - self.offset)
+
+    def moved(self, step: np.ndarray) -> Plane:
+        """The plane moved by `step` (3,) metres."""
+        return Plane(self.normal, self.offset + float(self.normal @ step))
+
+
+class PlaneMemory:
+    """The floor and walls of the last cloud of a stream: looked for anew only now and then, or when they are gone."""
+
+    def __init__(self) -> None:
+        """Know nothing."""
+        self._kept: list[tuple[Plane, float]] = []
+        self._has_floor = False
+        self._left = 0
+
+    def recall(self, points: np.ndarray, clearance: float) -> tuple[Plane | None, list[Plane]] | None:
+        """Return floor and walls moved to where points (N, 3) in metres have them; None when to look for them."""
+        self._left -= 1
+        moved = []
+        for plane, share in self._kept:
+            on = np.abs(plane.height(points)) < clearance
+            if self._left < 0 or on.mean() < STILL_THERE * share:
+                self._left = 0
+                return None
+            moved.append(_fitted(plane, points[on])[0])
+        if self._left < 0:
+            return None
+        floor = moved.pop(0) if self._has_floor else None
+        return floor, moved
+
+    def keep(self, points: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]) -> None:
+        """Remember what was found, and how much of the cloud (N, 3) it is."""
+        planes = [*([floor] if floor is not None else []), *walls]
+        self._kept = [(plane, float((np.abs(plane.height(points)) < clearance).mean())) for plane in planes]
+        self._has_floor, self._left = floor is not None, REFRESH
 
 
 def find_floor(points: np.ndarray, clearance: float, rng: np.random.Generator) -> Plane | None:
@@ -72,11 +112,9 @@ def find_wall(points: np.ndarray, thickness: float, rng: np.random.Generator) ->
 def _trials(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Normals (T, 3) and offsets (T,) of planes through three points each."""
     first = points[rng.integers(0, len(points), int(np.clip(TRIALS_TIMES_POINTS // len(points), *TRIALS)))]
-    others = []
-    for seed in first:
-        near = np.flatnonzero(np.abs(points - seed).max(axis=1) < NEIGHBOURHOOD)
-        others.append(points[near[rng.integers(0, len(near), 2)]])
-    second, third = np.stack(others, axis=1)
+    groups = cKDTree(points).query_ball_point(first, NEIGHBOURHOOD, p=np.inf, return_sorted=True)
+    others = [[near[k] for k in rng.integers(0, len(near), 2)] for near in groups]
+    second, third = points[np.array(others, np.int64).T]
     cross = np.cross(second - first, third - first)
     length = np.linalg.norm(cross, axis=1)
     kept = length > 1e-6
@@ -99,13 +137,18 @@ def _best(
     plane = Plane(normals[best], float(offsets[best]))
     for _ in range(2):
         on = points[np.abs(plane.height(points)) < thickness]
-        middle = on.mean(axis=0)
-        axes = np.linalg.svd((on - middle).T @ (on - middle))[0]
-        normal = axes[:, 2] * np.sign(axes[:, 2] @ plane.normal)
-        plane = Plane(normal, float(normal @ middle))
+        plane, middle, axes = _fitted(plane, on)
     # Percentiles, or single points far off would stretch a person's back to a wall.
     along = (on - middle) @ axes[:, :2]
     longer, shorter = np.ptp(np.percentile(along, (5, 95), axis=0), axis=0)
     covered = CELL**2 * len(np.unique(np.floor(along / CELL), axis=0))
     wide = longer >= size[0] and shorter >= size[1]
     return plane if wide and covered >= COVERED * longer * shorter else None
+
+
+def _fitted(plane: Plane, points: np.ndarray) -> tuple[Plane, np.ndarray, np.ndarray]:
+    """The plane of least squares through points (N, 3) that faces as `plane`, their middle, their axes by columns."""
+    middle = points.mean(axis=0)
+    axes = np.linalg.svd((points - middle).T @ (points - middle))[0]
+    normal = axes[:, 2] * np.sign(axes[:, 2] @ plane.normal)
+    return Plane(normal, float(normal @ middle)), middle, axes

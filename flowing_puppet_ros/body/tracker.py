@@ -8,6 +8,7 @@ tells when the track is lost.
 from __future__ import annotations
 
 from collections import Counter
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.body.correspondence import Cloud
 from flowing_puppet_ros.body.energy import JointTargets
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, checked_cloud
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress, checked_cloud
 from flowing_puppet_ros.body.normals import thinned
 from flowing_puppet_ros.body.refine import Refiner, RefineWeights
 from flowing_puppet_ros.model import rotation
@@ -69,6 +70,23 @@ class BodyTracker:
         self._last: _Seen | None = None
         self._best = np.inf
         self._frames = 0
+        self.lost = True
+
+    @property
+    def last(self) -> BodyFit | None:
+        """The body in the last cloud, None before the first."""
+        return None if self._last is None else self._last.fit
+
+    def fork(self) -> BodyTracker:
+        """A tracker that knows the same person so far and goes its own way from here."""
+        made = copy(self)
+        made.counters = self.counters.copy()
+        return made
+
+    def accept(self) -> None:
+        """Take the last body for the best there is: a search has found none that is closer."""
+        if self._last is not None:
+            self._best, self.lost = self._last.fit.two_way_distance, False
 
     def step(
         self,
@@ -77,8 +95,9 @@ class BodyTracker:
         stamp: int,
         viewpoint: np.ndarray | None = None,
         seed: int | None = None,
+        progress: Progress | None = None,
     ) -> BodyFit:
-        """Fit the next cloud of the person.
+        """Fit the next cloud of the person; a full fit when there is no track or it is lost.
 
         Args:
             points: (N, 3) metres, z up, in one frame through the stream.
@@ -86,22 +105,51 @@ class BodyTracker:
             stamp: nanoseconds; one that is not later than the last starts a new track.
             viewpoint: (3,) where the sensor stood when the cloud shows one side only.
             seed: of a full fit; overrides the fitter's.
+            progress: of a full fit, see `BodyFitter.fit`.
 
         Raises:
             InputError: when the cloud cannot be the surface of a person; the track goes on with the next one.
         """
+        with threadpool_limits(limits=1):
+            cloud = self._next_cloud(points, normals, stamp, viewpoint)
+            fit = self._followed(cloud, stamp)
+            if fit is None or self.lost:
+                fit = self._searched(fit, cloud, seed, progress)
+                self.lost = False
+        return self._noted(fit, cloud, stamp)
+
+    def follow(
+        self, points: np.ndarray, normals: np.ndarray | None, stamp: int, viewpoint: np.ndarray | None = None
+    ) -> BodyFit | None:
+        """Fit the next cloud as `step` does, but never by a full fit: None when there is no body to start from.
+
+        `lost` tells whether the body is not where the person is.
+        """
+        with threadpool_limits(limits=1):
+            cloud = self._next_cloud(points, normals, stamp, viewpoint)
+            fit = self._followed(cloud, stamp)
+        return None if fit is None else self._noted(fit, cloud, stamp)
+
+    def _next_cloud(
+        self, points: np.ndarray, normals: np.ndarray | None, stamp: int, viewpoint: np.ndarray | None
+    ) -> Cloud:
         points, normals = checked_cloud(points, normals)
         if viewpoint is None:
             points, normals = thinned(points, normals, self._settings.track_points)
         if self._last is not None and stamp <= self._last.stamp:
             self.reset()
-        with threadpool_limits(limits=1):
-            cloud = self._fitter.cloud(points, normals, viewpoint)
-            fit = None if self._last is None else self._tracked(self._predicted(self._last, cloud, stamp), cloud)
-            if fit is None or self._is_lost(fit):
-                fit = self._searched(fit, cloud, seed)
+        return self._fitter.cloud(points, normals, viewpoint)
+
+    def _followed(self, cloud: Cloud, stamp: int) -> BodyFit | None:
+        """The last body after a few steps on the new cloud, and whether it is lost."""
+        fit = None if self._last is None else self._tracked(self._predicted(self._last, cloud, stamp), cloud)
+        self.lost = fit is None or self._is_lost(fit)
+        return fit
+
+    def _noted(self, fit: BodyFit, cloud: Cloud, stamp: int) -> BodyFit:
         self._before, self._last = self._last, _Seen(fit, stamp, cloud.points.mean(axis=0))
-        self._best = min(self._best, fit.two_way_distance)
+        if not self.lost:
+            self._best = min(self._best, fit.two_way_distance)
         self._frames += 1
         return fit
 
@@ -115,10 +163,10 @@ class BodyTracker:
         wide = self._refined(start, cloud, WIDE, WIDE_STEPS)
         return min(fit, wide, key=lambda found: found.two_way_distance)
 
-    def _searched(self, tracked: BodyFit | None, cloud: Cloud, seed: int | None) -> BodyFit:
+    def _searched(self, tracked: BodyFit | None, cloud: Cloud, seed: int | None, progress: Progress | None) -> BodyFit:
         """The full fit, unless the tracked body is closer to the cloud; its distance is the new measure of lost."""
         self.counters["searched"] += 1
-        found = self._fitter.fit(cloud.points, cloud.normals, viewpoint=cloud.viewpoint, seed=seed)
+        found = self._fitter.fit(cloud.points, cloud.normals, viewpoint=cloud.viewpoint, seed=seed, progress=progress)
         # Without the surface of its own that a full fit may have, or it would come and go with the searches.
         fit = self._fitter.result(found.state, cloud)
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:

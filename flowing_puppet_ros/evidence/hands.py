@@ -228,7 +228,7 @@ class HandMaps:
         """Largest log odds (N,) over the orientations of a box at places (N,2) px, and the orientation (N,)."""
         turns = np.arange(ORIENTATIONS) * (2 * np.pi / ORIENTATIONS)
         odds = np.stack([self.log_odds(kind, places, np.full(len(places), turn)) for turn in turns])
-        return odds.max(axis=0), turns[odds.argmax(axis=0)]
+        return odds.max(axis=0), np.asarray(turns[odds.argmax(axis=0)], np.float64)
 
 
 def hand_score(maps: HandMaps, wrist: Floats, elbow: Floats, scale: float) -> Floats:

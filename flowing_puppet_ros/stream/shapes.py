@@ -67,3 +67,22 @@ def make_topology(factory: MessageFactory, model: StitchedPuppet) -> Any:
     ]
     vertices = [make_point(factory, vertex) for vertex in model.vertices(model.rest_state())]
     return factory.make("shape_msgs/msg/Mesh", triangles=triangles, vertices=vertices)
+
+
+def preview_faces(model: StitchedPuppet, triangles: int) -> NDArray[np.int64]:
+    """Return faces (F',3) over the model's own vertices, about `triangles` of them; all of the model's when 0.
+
+    Quadric edge collapses (Garland and Heckbert 1997) of the body at rest, every vertex that is left moved to the
+    nearest of the model's, so that the coarse mesh is posed and shaped as the fine one is.
+    """
+    if not 0 < triangles < len(model.faces):
+        return np.asarray(model.faces, np.int64)
+    import open3d as o3d
+    from scipy.spatial import cKDTree
+
+    vertices = model.vertices(model.rest_state())
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(model.faces))
+    coarse = mesh.simplify_quadric_decimation(triangles)
+    faces = cKDTree(vertices).query(np.asarray(coarse.vertices))[1][np.asarray(coarse.triangles)]
+    a, b, c = faces.T
+    return np.asarray(faces[(a != b) & (b != c) & (c != a)], np.int64)

@@ -106,6 +106,7 @@ def value(reports: list[Any], key: str) -> str | None:
 def test_time_that_jumps_back_starts_anew(start: Callable[..., Path], peer: Any) -> None:
     log = start("optical_flow", "-p", "use_sim_time:=true")
     clock = connected(peer, Clock, "/clock")
+    peer.spin_until(lambda: "ready" in log.read_text(), "the node")
     for seconds in (100, 101, 50):
         clock.publish(Clock(clock=clock_time(seconds)))
         peer.spin_for(0.3)
@@ -207,4 +208,4 @@ def test_help_lists_the_parameters() -> None:
     command = [str(Path(sys.executable).with_name("puppet_tracker")), "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
     assert "overlay_side [960]" in shown
-    assert "queue [4]" in shown
+    assert "queue [1]" in shown
