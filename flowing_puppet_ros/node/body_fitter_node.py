@@ -25,6 +25,7 @@ class BodyFitterNode(ComponentNode[BodyFitterComponent]):
     def __init__(self, name: str) -> None:
         """Open the topics and the action."""
         super().__init__(name)
+        self.component.search_in_background()
         self._action = ActionServer(
             self,
             FitBody,
