@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 from importlib import import_module
+from types import ModuleType
 
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.errors import PuppetError
@@ -25,6 +26,21 @@ VERBS = {
 }
 
 
+def verb_with_parser(verb: str, arguments: list[str]) -> tuple[ModuleType, argparse.ArgumentParser, list[str]]:
+    """Return the module of a verb, its parser, and what of its arguments is left to parse.
+
+    A module may name in `SUBVERBS` the modules of optional sub-verbs: a first argument that is one leads there.
+    """
+    module, name = import_module(f"flowing_puppet_ros.cli.{verb}"), verb
+    subverbs = getattr(module, "SUBVERBS", {})
+    if arguments and arguments[0] in subverbs:
+        name, arguments = f"{verb} {arguments[0]}", arguments[1:]
+        module = import_module(f"flowing_puppet_ros.cli.{subverbs[name.split()[1]]}")
+    parser = argparse.ArgumentParser(prog=f"flowing-puppet {name}", description=module.__doc__)
+    module.add_arguments(parser)
+    return module, parser, arguments
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return the exit status: 0 done, 1 the work failed, 2 unusable arguments or input."""
     parser = argparse.ArgumentParser(
@@ -37,11 +53,9 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("verb", choices=VERBS, metavar="VERB", help="what to do; VERB --help says more")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     chosen = parser.parse_args(argv)
-    module = import_module(f"flowing_puppet_ros.cli.{chosen.verb}")
-    verb_parser = argparse.ArgumentParser(prog=f"flowing-puppet {chosen.verb}", description=module.__doc__)
     try:
-        module.add_arguments(verb_parser)
-        return module.run(verb_parser.parse_args(chosen.arguments))
+        module, verb_parser, arguments = verb_with_parser(chosen.verb, chosen.arguments)
+        return module.run(verb_parser.parse_args(arguments))
     except PuppetError as error:
         print(f"flowing-puppet {chosen.verb}: {error}", file=sys.stderr)
         return error.exit_status

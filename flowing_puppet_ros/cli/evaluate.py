@@ -9,18 +9,22 @@ from flowing_puppet_ros.cli import (
     evaluate_bag,
     evaluate_bodies,
     evaluate_correspondence,
+    evaluate_hands,
     evaluate_joints,
     evaluate_likelihood,
     evaluate_pcp,
+    evaluate_video,
 )
 
 KINDS = {
     "pcp": evaluate_pcp,
     "joints": evaluate_joints,
+    "video": evaluate_video,
     "bodies": evaluate_bodies,
     "correspondence": evaluate_correspondence,
     "bag": evaluate_bag,
     "likelihood": evaluate_likelihood,
+    "hands": evaluate_hands,
 }
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learn the body models `ds` and `sp` from synthetic people, or `likelihood` and `detector` from annotated images."""
+"""Learn body models (`ds`, `sp`) from synthetic people; `likelihood`, `detector`, `hands` from annotated images."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from types import ModuleType
 
 from flowing_puppet_ros.errors import InputError
 
-MODULES = {"ds": "ds", "sp": "sp_command", "likelihood": "likelihood_command", "detector": "detector_command"}
+MODULES = {
+    "ds": "ds",
+    "sp": "sp_command",
+    "likelihood": "likelihood_command",
+    "detector": "detector_command",
+    "hands": "hands_command",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

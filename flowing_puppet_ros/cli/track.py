@@ -87,10 +87,15 @@ def _stepper(arguments: argparse.Namespace, tracker: FlowingPuppetTracker, given
         return lambda frame, detections: (tracker.step(frame.image, frame.stamp_ns, detections), None)
     likelihood, settings = PartLikelihood.load(arguments.parts), DetectionSettings.from_arguments(arguments)
     video = VideoTracker(tracker, PartDetector.load(), likelihood, settings)
+    if arguments.live:
+        return lambda frame, _: (video.step(frame.image, frame.stamp_ns)[0], None)
+    again = _open(arguments)
+    searched = tqdm(again.frames, "search", total=again.count or None, unit="frame", disable=None)
+    paths = video.search(frame.image for frame, _ in searched)
 
     def step(frame: Frame, detections: list[Keypoints] | None) -> Stepped:
-        result, found = video.step(frame.image, frame.stamp_ns)
-        return result, None if arguments.live else video.sights(frame.image, result, found)
+        result, found = video.step(frame.image, frame.stamp_ns, paths=paths)
+        return result, video.sights(frame.image, result, found)
 
     return step
 

@@ -71,7 +71,7 @@ class ImageFeatures:
     def level(self, number: int) -> OrientationMap:
         """Orientation map in which a cell is CELL * 2^(number / STEPS) image pixels wide."""
         if number not in self._levels:
-            self._levels[number] = _orientation_map(self.image, 2.0 ** (-number / STEPS))
+            self._levels[number] = orientation_map(self.image, 2.0 ** (-number / STEPS))
         return self._levels[number]
 
 
@@ -84,7 +84,8 @@ def as_rgb(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(image)
 
 
-def _orientation_map(image: NDArray[np.uint8], factor: float) -> OrientationMap:
+def orientation_map(image: Array, factor: float) -> OrientationMap:
+    """Orientation map of an image (H,W,3), grey levels of any type, that is first resized by a factor."""
     height, width = image.shape[:2]
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     method = cv2.INTER_AREA if factor < 1.0 else cv2.INTER_LINEAR

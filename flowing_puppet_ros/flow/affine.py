@@ -72,7 +72,7 @@ def fit_regions(labels: NDArray[np.unsignedinteger], count: int, forward: Flow, 
 
 
 @njit(cache=True)
-def _round_trip_weight(x: int, y: int, u: float, v: float, backward: Flow) -> float:
+def round_trip_weight(x: int, y: int, u: float, v: float, backward: Flow) -> float:
     """Weight in (0, 1] of a flow vector: 1 when the backward flow returns to where it came from."""
     height, width = backward.shape[:2]
     if height == 0:
@@ -124,7 +124,7 @@ def _gather(
             if seen[region] % step[region] == 0:
                 row = samples[starts[region] + seen[region] // step[region]]
                 row[0], row[1], row[2], row[3] = x, y, u, v
-                row[4] = row[5] = _round_trip_weight(x, y, u, v, backward)
+                row[4] = row[5] = round_trip_weight(x, y, u, v, backward)
             seen[region] += 1
     return samples, starts, pixels
 

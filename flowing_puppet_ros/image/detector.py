@@ -9,7 +9,7 @@ regression on both scores says how probable it is that somebody was found. The j
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -18,12 +18,15 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.colour import ColourImage, SkinColour
+from flowing_puppet_ros.evidence.region import RegionMap
 from flowing_puppet_ros.image.detector_forest import Forest
 from flowing_puppet_ros.image.detector_parts import PARTS, PartFilters, Window, window_at
-from flowing_puppet_ros.image.detector_person import FoundPose, PersonDetection
+from flowing_puppet_ros.image.detector_person import FoundPose, PersonDetection, Place
 from flowing_puppet_ros.image.detector_rank import SAME_PLACE, Ranking, agreed_scale, apart, best_places
 from flowing_puppet_ros.image.detector_root import Candidate, RootFilters, resize
 from flowing_puppet_ros.image.detector_search import choose, propose
+from flowing_puppet_ros.image.detector_skin import skin_measures
 from flowing_puppet_ros.image.detector_tree import PartTree, best_placement, upward
 from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.settings import Settings, setting
@@ -57,6 +60,7 @@ class PartDetector:
     root: RootFilters
     forest: Forest
     parts: PartFilters
+    skin: SkinColour
     ranking: Ranking
 
     @classmethod
@@ -73,7 +77,8 @@ class PartDetector:
         parents, first = (np.asarray(arrays[name], np.int64) for name in ("parents", "first"))
         tree = PartTree(parents, first, single["anchor"], single["spring"], single["type_bias"])
         rank = Ranking(*(np.asarray(arrays[name], np.float64) for name in ("rank_weight", "rank_scale", "rank_odds")))
-        return cls(root, forest, PartFilters(single["part_filters"], tree), rank)
+        skin = SkinColour(np.asarray(arrays["skin"], np.float64))
+        return cls(root, forest, PartFilters(single["part_filters"], tree), skin, rank)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays for an .npz file; filters in half precision."""
@@ -91,6 +96,7 @@ class PartDetector:
             "anchor": tree.anchor,
             "spring": tree.spring,
             "type_bias": tree.bias,
+            "skin": self.skin.log_ratio.astype(np.float32),
             "rank_weight": self.ranking.weight,
             "rank_scale": self.ranking.scale,
             "rank_odds": self.ranking.odds,
@@ -98,18 +104,45 @@ class PartDetector:
 
     def detect(self, image: NDArray[np.uint8], settings: DetectorSettings = DEFAULTS) -> list[PersonDetection]:
         """The people in an image (H, W, 3) RGB or (H, W) grey, uint8, the surest first; InputError for other arrays."""
-        pixels = checked(image)
-        longest = max(pixels.shape[:2])
-        if min(pixels.shape[:2]) < LEAST_SIDE:
+        small, factor = _shrunk(image, settings)
+        if small is None:
             return []
-        factor = min(1.0, settings.largest_side / longest)
-        small = resize(pixels, factor) if factor < 1 else pixels
-        if min(small.shape[:2]) < LEAST_SIDE:
-            return []
-        smallest = max(settings.smallest * factor, max(small.shape[:2]) / 20 if settings.smallest == 0 else 8.0)
         # Several BLAS threads would sum in another order, and people who run many nodes have no cores to spare.
         with threadpool_limits(1):
-            return self._people(small, smallest, factor, settings)
+            return self._people(small, _smallest(small, factor, settings), factor, settings)
+
+    def candidates(self, image: NDArray[np.uint8], settings: DetectorSettings = DEFAULTS) -> list[Place]:
+        """All places of an image in which a pose was sought, in no order, several for one person among them."""
+        small, factor = _shrunk(image, settings)
+        if small is None:
+            return []
+        with threadpool_limits(1):
+            poses = self.look(small, _smallest(small, factor, settings), settings.places)
+        scores = self.ranking.scores(poses)
+        found = []
+        for pose, score in zip(poses, scores, strict=True):
+            neck, face = ((pose.points[PARTS.index(name)] + 0.5) / factor - 0.5 for name in ("neck", "face"))
+            scale = self.ranking.corrected_scale(pose, pose.scale) / factor
+            found.append(Place(neck, face, scale, self.ranking.log_odds(float(score)), pose.score))
+        return found
+
+    def at(
+        self, image: NDArray[np.uint8], places: Sequence[Place], settings: DetectorSettings = DEFAULTS
+    ) -> list[PersonDetection]:
+        """The best poses at some places of an image, in their order, without those that nobody is seen at."""
+        small, factor = _shrunk(image, settings)
+        if small is None:
+            return []
+        found = []
+        with threadpool_limits(1):
+            for place in places:
+                neck, face = ((at + 0.5) * factor - 0.5 for at in (place.neck, place.face))
+                window = window_at(small, (neck[0], neck[1]), (face[0], face[1]), place.scale * factor)
+                pose = self.pose_in(window, np.zeros(0))
+                if pose.score >= place.least:
+                    confidence = 1 / (1 + float(np.exp(-place.log_odds)))
+                    found.append(PersonDetection(self.parts, pose, confidence, factor))
+        return found
 
     def _people(
         self, image: NDArray[np.uint8], smallest: float, factor: float, settings: DetectorSettings
@@ -134,21 +167,37 @@ class PartDetector:
     def look(self, image: NDArray[np.uint8], smallest: float, places: int) -> list[FoundPose]:
         """The best pose in each of the most promising places, in no order of quality."""
         chosen = choose(propose(image, self.root, smallest), self.forest, places)
-        return [self.pose_at(image, candidate, look) for candidate, look in chosen]
+        skin = self.skin.map(ColourImage.of(image))
+        return [self.pose_at(image, skin, candidate, look) for candidate, look in chosen]
 
-    def pose_at(self, image: NDArray[np.uint8], candidate: Candidate, look: float) -> FoundPose:
-        """The best pose around a candidate to which the trees gave the score `look`."""
+    def pose_at(self, image: NDArray[np.uint8], skin: RegionMap, candidate: Candidate, look: float) -> FoundPose:
+        """The best pose around a candidate to which the trees gave the score `look`; `skin` is the image's map."""
         window = window_at(image, candidate.neck, candidate.face, candidate.scale)
         relative = np.log(candidate.scale / max(image.shape[:2]))
         pose = self.pose_in(window, np.zeros(0))
-        layer, x, y = pose.placement[0]
-        measures = np.array([candidate.score, look, relative, pose.beliefs.up[layer, y, x], window.outside])
+        known = [candidate.score, look, relative, pose.score, window.outside]
+        neck, face = (pose.points[PARTS.index(name)] for name in ("neck", "face"))
+        measures = np.concatenate([known, skin_measures(skin, neck, face, candidate.scale)])
         return FoundPose(window, pose.beliefs, pose.placement, measures)
 
     def pose_in(self, window: Window, measures: Doubles) -> FoundPose:
         """The best pose in a window, with measures that are known already."""
         beliefs = upward(self.parts.tree, self.parts.unary(window))
         return FoundPose(window, beliefs, best_placement(self.parts.tree, beliefs), measures)
+
+
+def _shrunk(image: NDArray[np.uint8], settings: DetectorSettings) -> tuple[NDArray[np.uint8] | None, float]:
+    """The image as it is looked at, None when it is too small, and its size in units of the given one."""
+    pixels = checked(image)
+    factor = min(1.0, settings.largest_side / max(pixels.shape[:2]))
+    if min(pixels.shape[:2]) * factor < LEAST_SIDE:
+        return None, factor
+    return resize(pixels, factor) if factor < 1 else pixels, factor
+
+
+def _smallest(image: NDArray[np.uint8], factor: float, settings: DetectorSettings) -> float:
+    """Smallest shoulder width to look for, px of an image that is `factor` times as large as the given one."""
+    return max(settings.smallest * factor, max(image.shape[:2]) / 20 if settings.smallest == 0 else 8.0)
 
 
 def checked(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

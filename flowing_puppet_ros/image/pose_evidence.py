@@ -73,13 +73,28 @@ class Window:
             piece = cv2.resize(piece, (int(width), int(height)), interpolation=cv2.INTER_AREA)
         return cls(likelihood.scene(piece), low.astype(float), factor)
 
+    @property
+    def scene(self) -> Scene:
+        """The evidence of the piece, in its own pixels."""
+        return self._scene
+
+    @property
+    def corner(self) -> Array:
+        """Where (x, y) in the image the piece begins."""
+        return self._corner
+
+    @property
+    def factor(self) -> float:
+        """Pixels of the piece per pixel of the image."""
+        return self._factor
+
     def log_likelihood(self, part: int, contours: Array, scale: Array) -> Array:
         """Log likelihood (P,) of a part with contours (P,K,2) in pixels of the image at scale (P,) px/m."""
-        return self._scene.log_likelihood(part, self._inside(contours), scale * self._factor)
+        return self._scene.log_likelihood(part, self.inside(contours), scale * self._factor)
 
     def with_torso(self, torso: Array, head: Array) -> Window:
         """The window that also knows the colours inside the contours (K,2) of a torso and a head."""
-        scene = self._scene.with_torso(self._inside(torso), self._inside(head))
+        scene = self._scene.with_torso(self.inside(torso), self.inside(head))
         return Window(scene, self._corner, self._factor)
 
     def hands(self, places: Array, scale: float) -> Array:
@@ -87,12 +102,13 @@ class Window:
         if self._hands is None or self._hands[0] != scale:
             self._hands = scale, self._scene.hand_map(scale * self._factor)
         likely = self._hands[1]
-        x, y = np.rint(self._inside(places)).astype(np.int64).T
+        x, y = np.rint(self.inside(places)).astype(np.int64).T
         seen = (x >= 0) & (y >= 0) & (x < likely.shape[1]) & (y < likely.shape[0])
         value = np.where(seen, likely[np.where(seen, y, 0), np.where(seen, x, 0)], 0.0)
         return np.asarray(np.clip(value / max(float(likely.max(initial=0.0)), 1e-12), LEAST_HAND, 1.0))
 
-    def _inside(self, points: Array) -> Array:
+    def inside(self, points: Array) -> Array:
+        """Points (...,2) of the image in pixels of the piece."""
         return np.ascontiguousarray((points - self._corner) * self._factor)
 
 

@@ -48,12 +48,16 @@ class AnnotatedPerson:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnnotatedFrame:
-    """An image (H,W,3) RGB uint8 and its people. `file` is relative to the folder, `index` the frame of a video."""
+    """An image (H,W,3) RGB uint8 and its people. `file` is relative to the folder, `index` the frame of a video.
+
+    `before` is the image before it in the video, None of the first and of still images.
+    """
 
     file: str
     index: int
     image: NDArray[np.uint8]
     people: tuple[AnnotatedPerson, ...]
+    before: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,9 +109,11 @@ class Annotations:
             wanted = sorted(self.people[file])[::every]
             if not wanted:
                 continue
+            before = None
             for frame in open_frames(self.folder / file):
                 if frame.index in wanted:
-                    yield AnnotatedFrame(file, frame.index, frame.image, self.people[file][frame.index])
+                    yield AnnotatedFrame(file, frame.index, frame.image, self.people[file][frame.index], before)
+                before = frame.image
                 if frame.index >= wanted[-1]:
                     break
             else:

@@ -46,12 +46,16 @@ FAR_METRES = 0.4  # standard deviation, along each axis, of contours put anywher
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posed:
-    """A person in an image (H,W,3) RGB uint8 of `file`: the puppet, and the confidence (J,) of its joints."""
+    """A person in an image (H,W,3) RGB uint8 of `file`: the puppet, and the confidence (J,) of its joints.
+
+    `before` is the image before it in the video, None of the first, of still images and where it is not wanted.
+    """
 
     file: str
     image: NDArray[np.uint8]
     puppet: PuppetShape
     confidence: Array
+    before: NDArray[np.uint8] | None = None
 
     def shows(self, model: DeformableStructures, part: int) -> bool:
         """Tell whether a part is in the image and its joints are known well enough to learn from it."""
@@ -61,13 +65,15 @@ class Posed:
         return bool(sure and inside.all(axis=1).mean() >= _IN_IMAGE)
 
 
-def posed_people(annotations: Annotations, model: DeformableStructures, every: int) -> Iterator[Posed]:
+def posed_people(
+    annotations: Annotations, model: DeformableStructures, every: int, with_before: bool = False
+) -> Iterator[Posed]:
     """Yield the puppets of all people of whom a scale can be told, in the order of the frames."""
     for frame in annotations.frames(every):
         for person in frame.people:
             posed = _pose(model, person)
             if posed is not None:
-                yield Posed(frame.file, frame.image, *posed)
+                yield Posed(frame.file, frame.image, *posed, frame.before if with_before else None)
 
 
 def _pose(model: DeformableStructures, person: AnnotatedPerson) -> tuple[PuppetShape, Array] | None:

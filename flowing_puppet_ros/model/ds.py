@@ -7,7 +7,7 @@ point is `scale * model + offset` (Eqs. 8 and 9), scale in pixels per metre. Fro
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Self
 
@@ -162,6 +162,22 @@ class DeformableStructures:
         placed = tuple(contour * to_pixels + origin for contour in contours)
         return PuppetShape(joints.copy(), placed, coefficients, scale, view)
 
+    def puppets_from_joints(
+        self, joints: Array, scale: Array, view: View = "front", edges: Sequence[int] | None = None
+    ) -> tuple[tuple[Array, ...], Array]:
+        """The most probable puppets on P sets of joints (P,J,2) px at scales (P,) px/m, all known and positive.
+
+        Returns contours (P,K_i,2) px of every part, and the energies (P,) of `energy` up to a constant, of the whole
+        puppet or of some of the tree's `edges` (indices).
+        """
+        to_pixels = np.asarray(scale, np.float64)[:, None, None] * self._to_pixels(1.0, view)
+        origin = joints[:, :1]
+        local = (joints - origin) / to_pixels
+        contours, coefficients = self._shape_from_joints.many(local)
+        chosen = range(len(self.tree.edges)) if edges is None else edges
+        energy = self._energy.many(local, coefficients, chosen)
+        return tuple(contour * to_pixels + origin for contour in contours), energy
+
     def energy(self, shape: PuppetShape) -> float:
         """-log p(l) of Eq. 5 in nats, with Z = 1, of a puppet that stands on its joints; lower is more likely."""
         to_pixels = self._to_pixels(shape.scale, shape.view)
@@ -190,6 +206,12 @@ class DeformableStructures:
             weight = certainty * np.where(short > _HUBER, _HUBER / np.maximum(short, _HUBER), 1.0)
             log_scale = (weight * ratio).sum() / weight.sum()
         return float(np.exp(log_scale))
+
+    @property
+    def shoulder_width(self) -> float:
+        """Distance of the shoulders of the mean puppet, in metres."""
+        right, left = (self.mean_joints()[self.joint_names.index(f"{side}_shoulder")] for side in ("right", "left"))
+        return float(np.linalg.norm(right - left))
 
     def estimate_view(self, joints: Array, confidence: Array) -> View:
         """Which side the camera sees: "front" when the person's left shoulder and hip are on the right of the image."""

@@ -62,6 +62,27 @@ class PairwiseEnergy:
         whitened = np.einsum("ekl,el->ek", self._whiten, deviation)
         return float(0.5 * (whitened**2).sum() + self._constant)
 
+    def many(self, joints: Array, coefficients: Array, edges: Sequence[int]) -> Array:
+        """Energies (P,) of some of the `edges` alone, for joints (P,J,2) and coefficients (P,N,Z); model space, metres.
+
+        Up to the constant of these edges.
+        """
+        chosen = list(edges)
+        i, j = self._parent[chosen], self._child[chosen]
+        ends = joints[:, self._bone]
+        bone, center = ends[:, :, 1] - ends[:, :, 0], ends.mean(axis=2)
+        length = np.hypot(bone[..., 0], bone[..., 1])
+        angle = np.arctan2(bone[..., 1], bone[..., 0])
+        sine, cosine = np.sin(angle[:, j] - angle[:, i]), np.cos(angle[:, j] - angle[:, i])
+        step = rotate(center[:, j] - center[:, i], -np.sin(angle[:, i]), np.cos(angle[:, i]))
+        start = self._start_mean[chosen] + np.einsum("ecz,pez->pec", self._start_basis[chosen], coefficients[:, j])
+        end = self._end_mean[chosen] + np.einsum("ecz,pez->pec", self._end_basis[chosen], coefficients[:, i])
+        gap = step + rotate(start, sine, cosine) - end
+        turn, lengths = np.stack([sine, cosine], axis=2), [length[:, k, None] for k in (j, i)]
+        variables = np.concatenate([coefficients[:, j], turn, gap, lengths[0], coefficients[:, i], lengths[1]], axis=2)
+        whitened = np.einsum("ekl,pel->pek", self._whiten[chosen], variables - self._mean[chosen])
+        return np.asarray(0.5 * (whitened**2).sum(axis=(1, 2)))
+
 
 def _stacked(rows: Sequence[tuple[PartShape, int]]) -> tuple[Array, Array]:
     """Mean (E,2) and basis (E,2,Z) of one point of each of some parts."""

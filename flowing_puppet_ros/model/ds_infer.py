@@ -101,6 +101,42 @@ class ShapeFromJoints:
                 contours[index] = contours[index] + spread @ residual[self._flat_part == index]
         return tuple(contours), tuple(coefficients)
 
+    def many(self, joints: Array) -> tuple[tuple[Array, ...], Array]:
+        """What a call gives, for P sets of joints (P,J,2) at once: contours (P,K_i,2) a part, coefficients (P,N,Z)."""
+        ends = joints[:, self._bone]
+        bone = ends[:, :, 1] - ends[:, :, 0]
+        length = np.hypot(bone[..., 0], bone[..., 1])
+        direction = np.where(length[..., None] > _SHORTEST, bone / np.maximum(length, _SHORTEST)[..., None], (0.0, 1.0))
+        center = 0.5 * (ends[:, :, 0] + ends[:, :, 1])
+        seen = np.clip(length, self._shortest, self._longest)
+        part = self._flat_part
+        local = rotate(joints[:, self._flat_joints] - center[:, part], -direction[:, part, 1], direction[:, part, 0])
+        local[..., 0] *= (seen / np.maximum(length, _SHORTEST))[:, part]
+        first, second = direction[:, self._parent], direction[:, self._child]
+        sine = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+        pair = np.stack([sine, (first * second).sum(axis=2), seen[:, self._child]], axis=2)
+        observation = np.concatenate([local.reshape(len(joints), -1), pair.reshape(len(joints), -1)], axis=1)
+        posterior = (observation @ self._gain.T + self._offset).reshape(len(joints), -1, self._size)
+        coefficients = np.clip(posterior, -COEFFICIENT_LIMIT, COEFFICIENT_LIMIT)
+        contours = []
+        for index, (start, end) in enumerate(zip(self._start, self._start[1:], strict=False)):
+            count = self._contour_end[index] - start
+            points = self._mean[start:end] + np.tensordot(coefficients[:, index], self._basis[start:end], axes=(1, 2))
+            proximal = points[:, count, 0]
+            model_length = np.maximum(points[:, count + 1, 0] - proximal, self._shortest[index])
+            stretch = np.maximum(length[:, index] / model_length, LEAST_STRETCH)
+            along = points[..., 0] - proximal[:, None]
+            inside = np.clip(along, 0.0, model_length[:, None])
+            middle = 0.5 * (model_length * stretch)[:, None]
+            points[..., 0] = along + inside * (stretch[:, None] - 1.0) - middle
+            turned = rotate(points, direction[:, index, None, 1], direction[:, index, None, 0]) + center[:, None, index]
+            contour, spread = turned[:, :count], self._spread[index]
+            if spread is not None:
+                own = self._flat_joints[self._flat_part == index]
+                contour = contour + spread @ (joints[:, own] - turned[:, count:])
+            contours.append(contour)
+        return tuple(contours), coefficients
+
 
 def _spread(shape: PartShape) -> Array:
     """Shares (K,M) in which each contour point follows each joint: inverse squared distance in the mean shape."""

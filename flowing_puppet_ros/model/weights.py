@@ -10,7 +10,7 @@ import numpy as np
 
 from flowing_puppet_ros.errors import InputError
 
-Kind = Literal["sp", "ds", "likelihood", "detector"]
+Kind = Literal["sp", "ds", "likelihood", "detector", "hands"]
 FOLDER = "weights"
 
 
