@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # make venv   set everything up in .venv          make test   linter, type checker and tests
 # make demo   sample bag -> replay -> report      make lint   linter and type checker alone
-# make bench  speed as ratios taken in one run
+# make bench  speed as ratios taken in one run, and two minutes of live nodes
 
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
@@ -32,6 +32,7 @@ test: lint
 
 bench: venv
 	@$(CLEAN_ENV) .venv/bin/flowing-puppet bench
+	@$(CLEAN_ENV) .venv/bin/flowing-puppet bench live --seconds 60
 
 config: venv
 	@$(PYTHON) scripts/write_config.py

@@ -136,15 +136,16 @@ def _nothing_usable(topics: Mapping[str, str]) -> str:
 
 
 def _detection_notes(trackers: list[Instance], topics: Mapping[str, str]) -> list[str]:
-    """Say which cameras track nobody because no keypoints of people come with their images."""
+    """Say in which cameras the package's own detector finds the people though the recording seems to have them."""
     wanted = [tracker.topic("detections") for tracker in trackers]
     others = sorted(name for name, kind in topics.items() if kind == PUPPETS and name not in wanted)
     return [
-        f"nobody is tracked in {tracker.topic('image')}: it needs keypoints of people ({PUPPETS}) on {topic}"
+        f"the detector of this package finds the people in {tracker.topic('image')}: there are no keypoints "
+        f"({PUPPETS}) on {topic}"
         + (f", not {topics[topic]}" if topic in topics else "")
-        + (f"; --topic-map {others[0]}:={topic} renames what is there" if others else "")
+        + (f"; --topic-map {others[0]}:={topic} takes those that are there" if others else "")
         for tracker, topic in zip(trackers, wanted, strict=True)
-        if topics.get(topic) != PUPPETS
+        if topics.get(topic) != PUPPETS and (others or topic in topics)
     ]
 
 
@@ -218,7 +219,7 @@ def _hull_and_fitter(
     hull = VisualHullComponent(chosen, factory)  # type: ignore[arg-type]
     renamed = {f"{camera.name}/image": camera.image for camera in cameras}
     fitter = BodyFitterComponent(_settings(BodyFitterComponent, "body_fitter", settings), factory)  # type: ignore[arg-type]
-    joined = {"silhouettes": "/silhouettes", "points": "", "initial": ""}
+    joined = {"silhouettes": "/silhouettes", "points": "", "depth": "", "camera_info": "", "initial": ""}
     return [Instance("visual_hull", hull, "", renamed), Instance("body_fitter", fitter, "", joined)]
 
 
@@ -227,7 +228,8 @@ def _cloud_fitter(
 ) -> Instance:
     namespace = cloud.rpartition("/")[0]
     fitter = BodyFitterComponent(_settings(BodyFitterComponent, "body_fitter", settings), factory)  # type: ignore[arg-type]
-    instance = Instance(f"{cloud.lstrip('/')}/body_fitter", fitter, namespace, {"points": cloud, "silhouettes": ""})
+    renamed = {"points": cloud, "depth": "", "camera_info": "", "silhouettes": ""}
+    instance = Instance(f"{cloud.lstrip('/')}/body_fitter", fitter, namespace, renamed)
     fitter.expects("initial", topics.get(instance.topic("initial")) == BODIES)
     return instance
 

@@ -20,7 +20,7 @@ from ruamel.yaml.error import YAMLError
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.errors import InputError
 
-_OF_NODES_ONLY = ("queue", "use_sim_time")
+_OF_NODES_ONLY = ("queue", "autostart", "use_sim_time")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

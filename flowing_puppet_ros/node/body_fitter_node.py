@@ -7,11 +7,12 @@ from functools import partial
 from typing import Any
 
 from flowing_puppet_msgs.action import FitBody
-from rclpy.action import ActionServer, CancelResponse
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
 
 from flowing_puppet_ros.errors import PuppetError
 from flowing_puppet_ros.node.component_node import ComponentNode
+from flowing_puppet_ros.node.session import Session
 from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent
 
 
@@ -20,34 +21,50 @@ class _Cancelled(Exception):
 
 
 class BodyFitterNode(ComponentNode[BodyFitterComponent]):
-    """Fits the clouds on `points`, and the cloud of a `fit_body` goal between them."""
+    """Fits the clouds on `points`, and the cloud of a `fit_body` goal between them while it is active."""
 
-    def __init__(self, name: str) -> None:
-        """Open the topics and the action."""
-        super().__init__(name)
-        self.component.search_in_background()
+    _action: ActionServer | None = None
+
+    def _open(self) -> None:
+        super()._open()
+        assert self.session is not None
+        self.session.component.search_in_background()
         self._action = ActionServer(
             self,
             FitBody,
             "fit_body",
             _abort,
+            goal_callback=lambda _: GoalResponse.ACCEPT if self._serving() else GoalResponse.REJECT,
             # The worker executes a goal when its fit is done: a goal that waits or is fitted holds up no callback.
-            handle_accepted_callback=lambda goal: self.worker.call(partial(self._serve, goal)),
+            handle_accepted_callback=self._accept,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
-    def destroy_node(self) -> None:
-        """Close the action with the node."""
-        self._action.destroy()
-        super().destroy_node()
+    def _close(self) -> None:
+        """Close the action when no goal is fitted any more."""
+        super()._close()
+        action, self._action = self._action, None
+        if action is not None:
+            action.destroy()
 
-    def _serve(self, goal: ServerGoalHandle) -> None:
+    def _serving(self) -> Session[BodyFitterComponent] | None:
+        """The session, when it is active."""
+        return self.session if self.session is not None and self.session.active else None
+
+    def _accept(self, goal: ServerGoalHandle) -> None:
+        session = self._serving()
+        if session is None:
+            goal.execute(partial(_abort, message=f"the node is {self.state}"))
+        else:
+            session.worker.call(partial(self._serve, session, goal))
+
+    def _serve(self, session: Session[BodyFitterComponent], goal: ServerGoalHandle) -> None:
         """Fit the goal's cloud and end the goal (on the worker thread)."""
         try:
-            bodies = self._fit(goal)
+            bodies = self._fit(session, goal)
         except _Cancelled:
-            if self.context.ok():
-                goal.execute(_cancel)
+            if self.context.ok() and self._action is not None:
+                goal.execute(_cancel if goal.is_cancel_requested else partial(_abort, message="the node went inactive"))
         except PuppetError as error:
             goal.execute(partial(_abort, message=str(error)))
         except Exception as error:
@@ -56,18 +73,18 @@ class BodyFitterNode(ComponentNode[BodyFitterComponent]):
         else:
             goal.execute(partial(_succeed, bodies=bodies))
 
-    def _fit(self, goal: ServerGoalHandle) -> Any:
+    def _fit(self, session: Session[BodyFitterComponent], goal: ServerGoalHandle) -> Any:
         """Return the BodyArray of the goal's cloud and publish feedback; _Cancelled when the fit is to end."""
 
         def progress(fraction: float) -> None:
-            if goal.is_cancel_requested or not self.context.ok():
+            if goal.is_cancel_requested or not session.active or not self.context.ok():
                 raise _Cancelled
             goal.publish_feedback(FitBody.Feedback(stage="fit", progress=float(fraction)))
 
         progress(0.0)
         request = goal.request
         initial = request.initial if request.initial.bodies else None
-        return self.component.fit(request.cloud, initial, int(request.seed), progress)[0]
+        return session.component.fit(request.cloud, initial, int(request.seed), progress)[0]
 
 
 def _succeed(goal: ServerGoalHandle, bodies: Any) -> FitBody.Result:

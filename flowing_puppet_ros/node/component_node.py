@@ -1,175 +1,233 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node around a stream component: topics, parameters, a worker thread, diagnostics, reset."""
+"""The managed node around a stream component: lifecycle, parameters, diagnostics, reset, jumps of time."""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import Any, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType, JumpThreshold, TimeJump
 from rclpy.duration import Duration
-from rclpy.node import Node
-from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.exceptions import NameValidationException, ParameterException
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
-from flowing_puppet_ros.node.diagnostics import Diagnostics
-from flowing_puppet_ros.node.factory import RosMessageFactory, message_type
-from flowing_puppet_ros.node.parameters import declare
-from flowing_puppet_ros.node.registry import COMPONENTS, NodeSettings
-from flowing_puppet_ros.node.worker import Worker
-from flowing_puppet_ros.stream.component import COMPRESSED_IMAGE, Component, Port
-from flowing_puppet_ros.stream.images import compress
-from flowing_puppet_ros.stream.messages import header_ns
+from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.node.diagnostics import Condition, Diagnostics
+from flowing_puppet_ros.node.factory import RosMessageFactory
+from flowing_puppet_ros.node.parameters import changed, declare, with_floats
+from flowing_puppet_ros.node.registry import COMPONENTS, FIXED, node_settings
+from flowing_puppet_ros.node.session import Session
+from flowing_puppet_ros.stream.component import Component
 
 C = TypeVar("C", bound=Component)
-QUIET_SECONDS = 5.0
-"""Shortest time between two log lines about the same trouble."""
-_SUBSCRIPTION_QOS = {
-    "sensor": qos_profile_sensor_data,
-    "reliable": QoSProfile(depth=10),
-    "latched": QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL),
-}
-_PUBLISHER_QOS = {
-    "reliable": QoSProfile(depth=10),
-    "latched": QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
-}
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+_UNUSABLE = (PuppetError, ParameterException, NameValidationException, RuntimeError, ValueError)
+"""What components and rclpy raise for parameters, names and policies that cannot be used."""
 
 
-class ComponentNode[C: Component](Node):
-    """Runs one component on live topics.
+class ComponentNode[C: Component](LifecycleNode):
+    """A managed node: configuring loads the models, activating opens the inputs.
 
-    Callbacks only put messages in line; the worker thread hands them to the component in order of arrival and
-    publishes what comes out. Whatever a message does, the node goes on.
+    With the parameter `autostart` it activates itself when it is made; without, a lifecycle manager does. Parameters
+    may be changed in every state: a running component takes them over, or is made anew where it cannot.
     """
 
-    def __init__(self, name: str) -> None:
-        """Declare the parameters, load the component, open the topics; InputError when a parameter is unusable."""
-        super().__init__(name)
-        settings = declare(self, COMPONENTS[name].settings_type)
-        own = declare(self, NodeSettings)
-        self.component: C = COMPONENTS[name](settings, RosMessageFactory())  # type: ignore[call-arg, arg-type, assignment]
-        self.worker = Worker(own.queue, self._failed)
-        self._diagnostics = Diagnostics(self.get_fully_qualified_name(), name)
+    session: Session[C] | None = None
+
+    def __init__(self, component: str, node_name: str | None = None, **options: Any) -> None:
+        """Declare the parameters and start; InputError in one sentence when that cannot work.
+
+        `component` is a name in COMPONENTS, and the node's unless `node_name` is given; `options` are those of
+        rclpy.node.Node (namespace, parameter_overrides, ...).
+        """
+        super().__init__(node_name or component, **options)
+        self.problem = ""
+        self._component = component
+        self._settings = declare(self, COMPONENTS[component].settings_type, COMPONENTS[component].fixed)
+        self._own = declare(self, node_settings(component), FIXED)
+        self._diagnostics = Diagnostics(self.get_fully_qualified_name(), component)
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._reported = self._steady.now()
-        outputs = self.component.outputs
-        self._outputs = {port.name: self._open_output(port) for port in outputs if not port.per_person}
-        self._diagnostics_publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
-        self._optional = [port for port in self.component.inputs if port.optional]
-        self._lazy = [port for port in self.component.outputs if port.lazy]
-        for port in self.component.inputs:
-            self._subscribe(port)
-        self.create_service(Trigger, "~/reset", self._reset_requested)
+        self._publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_timer(1.0, self._report, clock=self._steady)
-        backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=True)
+        self.create_service(Trigger, "~/reset", self._reset_requested)
+        backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         # The handle keeps the callback registered.
         self._jump_handle = self.get_clock().create_jump_callback(backward, post_callback=self._time_jumped)
+        self.add_pre_set_parameters_callback(self._converted)
+        self.add_on_set_parameters_callback(self._check)
+        self.add_post_set_parameters_callback(self._apply)
+        self._answer_every_transition()
+        if self._own.autostart:
+            for transition in (self.trigger_configure, self.trigger_activate):
+                if transition() != SUCCESS:
+                    raise InputError(self.problem)
+
+    @property
+    def state(self) -> str:
+        """The lifecycle state: unconfigured, inactive, active, finalized, or a transition between them."""
+        return str(self._state_machine.current_state[1])
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Load the component and open its outputs."""
+        return self._attempt(self._open)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the inputs."""
+        return self._attempt(self._activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Close the inputs; the models stay, the people are forgotten."""
+        if self.session is not None:
+            self.session.deactivate()
+        return SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release the component."""
+        self._close()
+        return SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release the component for good."""
+        self._close()
+        return SUCCESS
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release the component; the node may be configured again."""
+        self._close()
+        return SUCCESS
 
     def destroy_node(self) -> None:
         """Let the running task end, then take the node down."""
-        self.worker.stop()
+        self._close()
         super().destroy_node()
 
-    def _subscribe(self, port: Port) -> None:
-        self._subscription(message_type(port.type), port.name, port)
-        if port.compressed:
-            self._subscription(message_type(COMPRESSED_IMAGE), self._compressed(port), port)
+    def _attempt(self, step: Callable[[], None]) -> TransitionCallbackReturn:
+        """Take a step of the lifecycle; what is unusable is said in one sentence and undone."""
+        self.problem = ""
+        try:
+            step()
+        except _UNUSABLE as error:
+            self._give_up(" ".join(str(error).split()))
+            return FAILURE
+        except Exception as error:
+            # rclpy would say nothing about it.
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            self._give_up(f"{type(error).__name__}: {error} ({where.filename}:{where.lineno})")
+            return TransitionCallbackReturn.ERROR
+        return SUCCESS
 
-    def _subscription(self, kind: Any, topic: str, port: Port) -> None:
-        received, qos = partial(self._received, port.name), _SUBSCRIPTION_QOS[port.qos]
-        options = QoSOverridingOptions.with_default_policies()
-        self.create_subscription(kind, topic, received, qos, qos_overriding_options=options)
+    def _give_up(self, problem: str) -> None:
+        self.problem = problem
+        self._diagnostics.complained(problem)
+        if not self._own.autostart:
+            self.get_logger().error(f"the node cannot work: {problem}")
+        if self.session is not None:
+            self.session.deactivate()
 
-    def _open_output(self, port: Port) -> list[tuple[Publisher, Callable[[Any], Any]]]:
-        """Return the publishers of a port, each with what makes its message out of the component's."""
-        made: list[tuple[Publisher, Callable[[Any], Any]]]
-        made = [(self._publisher(message_type(port.type), port.name, port.qos), _same)]
-        if port.compressed:
-            compressed = self._publisher(message_type(COMPRESSED_IMAGE), self._compressed(port), port.qos)
-            made.append((compressed, partial(compress, self.component.factory)))
-        return made
+    def _open(self) -> None:
+        """Make the component out of the settings as they are, and put it to work on the topics."""
+        kind: Any = COMPONENTS[self._component]
+        component: C = kind(self._settings, RosMessageFactory())
+        self.session = Session(self, component, self._own.queue, self._diagnostics)
 
-    def _compressed(self, port: Port) -> str:
-        """Return the topic of a port's compressed images: it follows the port when that is remapped."""
-        return f"{self.resolve_topic_name(port.name)}/compressed"
+    def _activate(self) -> None:
+        if self.session is None:
+            raise InputError(self.problem or "the node is not configured")
+        self.session.activate()
 
-    def _publisher(self, kind: Any, topic: str, qos: str) -> Publisher:
-        options = QoSOverridingOptions.with_default_policies()
-        return self.create_publisher(kind, topic, _PUBLISHER_QOS[qos], qos_overriding_options=options)
+    def _close(self) -> None:
+        session, self.session = self.session, None
+        if session is not None:
+            session.close()
 
-    def _received(self, port: str, message: Any) -> None:
-        self._diagnostics.passed(port)
-        self.worker.put(port, partial(self._handle, port, message))
+    def _converted(self, parameters: list[Parameter]) -> list[Parameter]:
+        return with_floats((type(self._settings), type(self._own)), parameters)
 
-    def _handle(self, port: str, message: Any) -> None:
-        """Hand one message to the component and publish what comes out (on the worker thread)."""
-        for optional in self._optional:
-            topic = self.resolve_topic_name(optional.name)
-            self.component.expects(optional.name, self.count_publishers(topic) > 0)
-        for lazy in self._lazy:
-            listened = any(publisher.get_subscription_count() for publisher, _ in self._outputs[lazy.name])
-            self.component.wants(lazy.name, listened)
-        for name, output in self.component.handle(port, message):
-            self._publish(name, output)
-        for warning in self.component.drain_warnings():
-            self.get_logger().warning(warning)
+    def _check(self, parameters: list[Parameter]) -> SetParametersResult:
+        """Say whether a change can be made, and make none."""
+        try:
+            changed(self._settings, parameters)
+            changed(self._own, parameters)
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
 
-    def _publish(self, name: str, message: Any) -> None:
-        """Publish on an output; that of a person is opened at the first message and closed at None."""
-        if message is None:
-            for publisher, _ in self._outputs.pop(name, []):
-                self.destroy_publisher(publisher)
+    def _apply(self, parameters: list[Parameter]) -> None:
+        """Make a change that was checked."""
+        before, self._settings = self._settings, changed(self._settings, parameters)
+        self._own = changed(self._own, parameters)
+        if self.session is None:
             return
-        port = self.component.output(name)
-        if name not in self._outputs:
-            self._outputs[name] = self._open_output(replace(port, name=name))
-        extra = len(self._outputs[name]) > 1
-        for publisher, converted in self._outputs[name]:
-            if not extra or publisher.get_subscription_count():
-                publisher.publish(converted(message))
-        self._diagnostics.passed(port.name)
-        if hasattr(message, "header"):
-            self._diagnostics.took((self.get_clock().now().nanoseconds - header_ns(message.header)) * 1e-9)
-
-    def _failed(self, error: Exception) -> None:
-        if not self.context.ok():
+        self.session.worker.limit = self._own.queue
+        names = {info.name for info in type(before).describe()}
+        different = {name for name in names if getattr(before, name) != getattr(self._settings, name)}
+        if not different:
             return
-        self._diagnostics.failed()
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        reason = " ".join(str(error).split())
-        text = f"a message failed: {type(error).__name__}: {reason} ({where.filename}:{where.lineno})"
-        self.get_logger().error(text, throttle_duration_sec=QUIET_SECONDS)
+        component, settings = self.session.component, self._settings
+        if different <= component.adoptable:
+            self.session.worker.call(lambda: component.adopt(settings))
+        else:
+            self._renew(", ".join(sorted(different)))
+
+    def _renew(self, names: str) -> None:
+        """Put a component with the changed settings in the place of the running one."""
+        active = self.state == "active"
+        self.get_logger().info(f"{names} changed: the models are loaded and everything starts anew")
+        self._close()
+        if self._attempt(self._open) == SUCCESS and active:
+            self._attempt(self._activate)
 
     def _report(self) -> None:
         now = self._steady.now()
         seconds, self._reported = (now - self._reported).nanoseconds * 1e-9, now
-        stamp = self.get_clock().now().to_msg()
-        report = self._diagnostics.report(stamp, seconds, dict(self.component.counters), dict(self.worker.dropped))
-        self._diagnostics_publisher.publish(report)
+        condition = Condition(self.state, self.problem)
+        if (session := self.session) is not None:
+            publishers = {topic: self.count_publishers(topic) for topic in session.topics}
+            counters, dropped = dict(session.component.counters), dict(session.worker.dropped)
+            condition = Condition(self.state, self.problem, counters, dropped, publishers)
+        report = self._diagnostics.report(self.get_clock().now().to_msg(), max(seconds, 1e-3), condition)
+        self._publisher.publish(report)
 
     def _reset_requested(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = self.session is not None
+        response.message = "the next message starts anew" if self.session else f"the node is {self.state}"
         self._reset()
-        response.success = True
-        response.message = "the next message starts anew"
         return response
 
     def _time_jumped(self, jump: TimeJump) -> None:
+        """Start anew, unless the messages have jumped back before the clock and the component has done so already."""
+        session = self.session
+        if session is None or (session.stamped and not session.behind(self.get_clock().now().nanoseconds)):
+            return
         self.get_logger().warning("the time jumped back: starting anew")
         self._reset()
 
     def _reset(self) -> None:
-        self.worker.clear()
-        self.worker.call(self.component.reset)
+        if self.session is not None:
+            self._diagnostics.resets += 1
+            self.session.reset()
 
+    def _answer_every_transition(self) -> None:
+        """Let a transition that the state does not allow fail: rclpy raises and leaves the caller without an answer."""
+        service = self._service_change_state
+        change = service.callback
 
-def _same(message: Any) -> Any:
-    return message
+        def answer(request: ChangeState.Request, response: ChangeState.Response) -> ChangeState.Response:
+            try:
+                return change(request, response)
+            except RuntimeError as error:
+                self.get_logger().warning(f"no such transition from {self.state}: {' '.join(str(error).split())}")
+                response.success = False
+                return response
+
+        service.callback = answer
 
 
 def make_node(name: str) -> ComponentNode[Any]:

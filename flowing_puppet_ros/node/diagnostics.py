@@ -1,21 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node says about itself on /diagnostics: rates, counters, drops and latency (REP-107)."""
+"""What a node says about itself on /diagnostics (REP-107): state, rates, latency, drops, counters, the last error."""
 
 from __future__ import annotations
 
+import statistics
 import threading
+import time
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+SILENCE = 5.0
+"""Seconds without an input after which an active node is stale."""
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """How a node is when it reports.
+
+    `state` is that of the lifecycle, `problem` why the node could not be configured, `counters` are the component's,
+    `dropped` the messages dropped so far of each input, `publishers` how many publish on each input topic.
+    """
+
+    state: str = "active"
+    problem: str = ""
+    counters: Mapping[str, float] = field(default_factory=dict)
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    publishers: Mapping[str, int] = field(default_factory=dict)
+
 
 class Diagnostics:
-    """Counts what passes and reports it, the rates over the time since the last report."""
+    """Counts what passes and reports it, the rates and latencies over the time since the last report.
+
+    The level is one that a supervisor can act on. OK: works, or is not active by somebody's will. WARN: it works, but
+    messages are dropped or cannot be used. ERROR: it could not be configured, or the processing of messages failed.
+    STALE: active, but nothing comes in.
+    """
 
     def __init__(self, node: str, component: str) -> None:
         """Make the diagnostics of `component` (a short name) in the node with the full name `node`."""
+        self.people: int | None = None
+        self.resets = 0
         self._name = f"{node.lstrip('/').replace('/', '.')}: {component}"
         self._hardware_id = node
         self._lock = threading.Lock()
@@ -24,9 +52,21 @@ class Diagnostics:
         self._dropped = 0
         self._unusable = 0
         self._failures = 0
+        self._last_error: tuple[float, str] | None = None
+        self._last_input = time.monotonic()
+        self._ever = False
+
+    def waits(self) -> None:
+        """Note that inputs may come from now on."""
+        self._last_input, self._ever, self.people = time.monotonic(), False, None
+
+    def received(self, topic: str) -> None:
+        """Count a message that came in."""
+        self._last_input, self._ever = time.monotonic(), True
+        self.passed(topic)
 
     def passed(self, topic: str) -> None:
-        """Count a message that came in or went out."""
+        """Count a message that went out."""
         with self._lock:
             self._passed[topic] += 1
 
@@ -35,42 +75,65 @@ class Diagnostics:
         with self._lock:
             self._latencies.append(seconds)
 
-    def failed(self) -> None:
+    def failed(self, sentence: str) -> None:
         """Count a message whose processing raised an unexpected error."""
         with self._lock:
             self._failures += 1
+            self._last_error = time.monotonic(), sentence
 
-    def report(self, stamp: Any, seconds: float, counters: Mapping[str, float], dropped: Mapping[str, int]) -> Any:
-        """Return the DiagnosticArray of the `seconds` since the last report.
+    def complained(self, sentence: str) -> None:
+        """Note what was wrong with an input, a parameter or the set-up."""
+        with self._lock:
+            self._last_error = time.monotonic(), sentence
 
-        `counters` are the component's, `dropped` the messages dropped so far of each input.
-        """
+    def report(self, stamp: Any, seconds: float, now: Condition) -> Any:
+        """Return the DiagnosticArray of the `seconds` since the last report."""
         with self._lock:
             passed, self._passed = self._passed, Counter(dict.fromkeys(self._passed, 0))
             latencies, self._latencies = self._latencies, []
             failures, self._failures = self._failures, 0
-        newly_dropped, self._dropped = sum(dropped.values()) - self._dropped, sum(dropped.values())
-        unusable = int(counters.get("unusable", 0))
-        newly_unusable, self._unusable = unusable - self._unusable, unusable
-        level, message = _verdict(failures, newly_unusable, newly_dropped, sum(passed.values()))
-        values = {f"{topic} (Hz)": f"{count / seconds:.1f}" for topic, count in sorted(passed.items())}
+            error = self._last_error
+        dropped = sum(now.dropped.values())
+        newly_dropped, self._dropped = max(0, dropped - self._dropped), dropped
+        unusable = int(now.counters.get("unusable", 0))
+        newly_unusable, self._unusable = max(0, unusable - self._unusable), unusable
+        if now.problem:
+            level, message = DiagnosticStatus.ERROR, f"the node cannot work: {now.problem}"
+        elif now.state != "active":
+            level, message = DiagnosticStatus.OK, f"{now.state}: nothing is processed until it is activated"
+        elif failures or newly_unusable or newly_dropped:
+            level, message = _trouble(failures, newly_unusable, newly_dropped)
+        else:
+            level, message = self._quiet(now.publishers)
+        values = {"state": now.state}
+        values |= {f"{topic} (Hz)": f"{count / seconds:.1f}" for topic, count in sorted(passed.items())}
         if latencies:
-            values["latency mean (s)"] = f"{sum(latencies) / len(latencies):.3f}"
+            values["latency median (s)"] = f"{statistics.median(latencies):.3f}"
             values["latency max (s)"] = f"{max(latencies):.3f}"
-        values |= {f"dropped {topic}": str(count) for topic, count in sorted(dropped.items())}
-        values |= {name: f"{value:g}" for name, value in sorted(counters.items())}
+        if self.people is not None:
+            values["people"] = str(self.people)
+        values |= {f"dropped {topic}": str(count) for topic, count in sorted(now.dropped.items())}
+        values |= {name: f"{value:g}" for name, value in sorted({**now.counters, "resets": self.resets}.items())}
+        if error is not None:
+            values["last error"] = error[1]
+            values["last error (s ago)"] = f"{time.monotonic() - error[0]:.0f}"
         status = DiagnosticStatus(level=level, name=self._name, message=message, hardware_id=self._hardware_id)
         status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
         array = DiagnosticArray(status=[status])
         array.header.stamp = stamp
         return array
 
+    def _quiet(self, publishers: Mapping[str, int]) -> tuple[bytes, str]:
+        silent = time.monotonic() - self._last_input
+        if silent > SILENCE:
+            who = ", ".join(f"{topic} ({count})" for topic, count in publishers.items())
+            return DiagnosticStatus.STALE, f"no message for {silent:.0f} s; topics and their publishers: {who}"
+        return DiagnosticStatus.OK, "running" if self._ever else "waiting for messages"
 
-def _verdict(failures: int, unusable: int, dropped: int, passed: int) -> tuple[bytes, str]:
+
+def _trouble(failures: int, unusable: int, dropped: int) -> tuple[bytes, str]:
     if failures:
-        return DiagnosticStatus.ERROR, f"{failures} messages failed; the log says why"
+        return DiagnosticStatus.ERROR, f"{failures} messages failed; the last error says why"
     if unusable:
-        return DiagnosticStatus.WARN, f"{unusable} messages could not be used; the log says why"
-    if dropped:
-        return DiagnosticStatus.WARN, f"too slow: {dropped} messages dropped"
-    return DiagnosticStatus.OK, "running" if passed else "waiting for messages"
+        return DiagnosticStatus.WARN, f"{unusable} messages could not be used; the last error says why"
+    return DiagnosticStatus.WARN, f"too slow for its input: {dropped} messages dropped"

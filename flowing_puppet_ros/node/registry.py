@@ -25,11 +25,31 @@ COMPONENTS: dict[str, type[Component]] = {
 """The component that each node runs."""
 
 
+QUEUE = "messages of one input that may wait; the oldest is dropped for a newer"
+
+
 @dataclass(frozen=True)
 class NodeSettings(Settings):
     """Settings that every node has beside those of its component."""
 
-    queue: int = setting(4, "messages of one input that may wait; the oldest is dropped for a newer", low=1, high=1000)
+    queue: int = setting(1, QUEUE, low=1, high=1000)
+    autostart: bool = setting(True, "configure and activate at the start; without, a lifecycle manager does")
+
+
+@dataclass(frozen=True)
+class HullNodeSettings(NodeSettings):
+    """Where many inputs make one set, those that come late must find the others still there."""
+
+    queue: int = setting(4, QUEUE, low=1, high=1000)
+
+
+FIXED = frozenset({"autostart"})
+"""Settings of every node that cannot be changed once it runs."""
+
+
+def node_settings(name: str) -> type[NodeSettings]:
+    """Return the settings that the node `name` has beside its component's."""
+    return HullNodeSettings if name == "visual_hull" else NodeSettings
 
 
 def parameter_yaml(name: str) -> str:
@@ -40,7 +60,7 @@ def parameter_yaml(name: str) -> str:
         f"/**/{name}:",
         "  ros__parameters:",
     ]
-    for settings_type in (COMPONENTS[name].settings_type, NodeSettings):
+    for settings_type in (COMPONENTS[name].settings_type, node_settings(name)):
         for info in settings_type.describe():
             lines += [f"    # {info.description}", f"    {info.name}: {_scalar(info.default)}"]
     return "\n".join(lines) + "\n"

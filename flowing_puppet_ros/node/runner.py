@@ -8,6 +8,8 @@ import sys
 from importlib import import_module
 from typing import Any
 
+from threadpoolctl import threadpool_limits
+
 from flowing_puppet_ros.errors import PuppetError
 
 
@@ -37,15 +39,17 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         rclpy.try_shutdown()
         return 2
+    # Workers of their own use the cores; threads of BLAS beside them would only stand in each other's way.
+    threadpool_limits(1)
     _spin(node)
     rclpy.try_shutdown()
     return 0
 
 
 def _parser(name: str, description: str | None) -> argparse.ArgumentParser:
-    from flowing_puppet_ros.node.registry import COMPONENTS, NodeSettings
+    from flowing_puppet_ros.node.registry import COMPONENTS, node_settings
 
-    infos = [*COMPONENTS[name].settings_type.describe(), *NodeSettings.describe()]
+    infos = [*COMPONENTS[name].settings_type.describe(), *node_settings(name).describe()]
     parameters = "\n".join(f"  {info.name} [{info.default}]: {info.description}" for info in infos)
     return argparse.ArgumentParser(
         prog=name,
@@ -61,7 +65,7 @@ def _spin(node: Any) -> None:
 
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    node.get_logger().info("ready")
+    node.get_logger().info("ready" if node.state == "active" else f"{node.state}: waits for a lifecycle manager")
     while rclpy.ok():
         try:
             executor.spin_once()

@@ -2,7 +2,8 @@
 """One thread that does the work of a node in order of arrival, while the node goes on receiving.
 
 Messages wait in bounded lines, one an input: when a line is full its oldest message is dropped for the newest, so a
-node that cannot keep up stays near the present instead of falling behind.
+node that cannot keep up stays near the present instead of falling behind, and a flood on one input drops nothing of
+another.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ Task = Callable[[], None]
 
 
 class Worker:
-    """Runs tasks one after the other on its own thread."""
+    """Runs tasks one after the other on its own thread; `limit` is the length of each line and may be changed."""
 
     def __init__(self, limit: int, on_error: Callable[[Exception], None]) -> None:
-        """Start the thread; `limit` is the length of each line, and `on_error` takes what a task raised."""
+        """Start the thread; `on_error` takes what a task raised."""
         self.dropped: Counter[str] = Counter()
-        self._limit = limit
+        self.limit = limit
         self._on_error = on_error
         self._tasks: deque[tuple[str | None, Task]] = deque()
         self._changed = threading.Condition()
@@ -29,11 +30,11 @@ class Worker:
         self._thread.start()
 
     def put(self, line: str, task: Task) -> None:
-        """Append a task to a bounded line, dropping the line's oldest waiting task when it is full."""
+        """Append a task to a bounded line, dropping the line's oldest waiting tasks when it is full."""
         with self._changed:
             waiting = [index for index, (name, _) in enumerate(self._tasks) if name == line]
-            if len(waiting) >= self._limit:
-                del self._tasks[waiting[0]]
+            for index in reversed(waiting[: max(0, len(waiting) + 1 - self.limit)]):
+                del self._tasks[index]
                 self.dropped[line] += 1
             self._tasks.append((line, task))
             self._changed.notify()
@@ -54,7 +55,8 @@ class Worker:
         with self._changed:
             self._stopping = True
             self._changed.notify()
-        self._thread.join(timeout)
+        if threading.current_thread() is not self._thread:
+            self._thread.join(timeout)
 
     def _run(self) -> None:
         while True:
@@ -67,3 +69,4 @@ class Worker:
                 task()
             except Exception as error:
                 self._on_error(error)
+            del task  # a message must not live on until the next one comes

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Point clouds or silhouettes in, fitted bodies out."""
+"""Point clouds, depth images or silhouettes in, fitted bodies out."""
 
 from __future__ import annotations
 
@@ -20,7 +20,17 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import setting
 from flowing_puppet_ros.stream.body_outputs import BodyOutputs, BodyOutputSettings, by_id
 from flowing_puppet_ros.stream.clouds import decode_cloud
-from flowing_puppet_ros.stream.component import BODIES, POINT_CLOUD, SILHOUETTES, Component, Output, Port
+from flowing_puppet_ros.stream.component import (
+    BODIES,
+    CAMERA_INFO,
+    IMAGE,
+    POINT_CLOUD,
+    SILHOUETTES,
+    Component,
+    Output,
+    Port,
+)
+from flowing_puppet_ros.stream.depth import DepthPairs, depth_cloud
 from flowing_puppet_ros.stream.messages import MessageFactory, stamp_ns
 from flowing_puppet_ros.stream.people import Joint, joints_of, make_bodies, make_body
 from flowing_puppet_ros.stream.scenes import RegionSettings, ScenePeople, View, within
@@ -62,6 +72,8 @@ class BodyFitterComponent(Component):
     settings_type = BodyFitterSettings
     inputs = (
         Port("points", POINT_CLOUD, "sensor"),
+        Port("depth", IMAGE, "sensor"),
+        Port("camera_info", CAMERA_INFO, "sensor"),
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),
     )
@@ -75,6 +87,7 @@ class BodyFitterComponent(Component):
         self._fitter = BodyFitter(self._model, settings)
         self._people = ScenePeople(self._fitter, settings)
         self._silhouettes = SilhouetteBodies(self._model, settings)
+        self._depth = DepthPairs()
         self._line = Line()
         self._initial = Shelf()
         self._outputs = BodyOutputs(settings, factory, self._model)
@@ -91,12 +104,13 @@ class BodyFitterComponent(Component):
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""
         self._silhouettes.reset()
         self._people.reset()
+        self._depth.reset()
         self._line.clear()
         self._initial.clear()
 
     def flush(self) -> Output:
         """Fit the clouds that still wait."""
-        return self._release(final=True)
+        return self._fit_depth(self._depth.flush()) + self._release(final=True)
 
     def fit(
         self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None
@@ -147,6 +161,8 @@ class BodyFitterComponent(Component):
     def _process(self, port: str, message: Any) -> Output:
         if port == "silhouettes":
             return self._fit_silhouettes(message)
+        if port in ("depth", "camera_info"):
+            return self._fit_depth(self._depth.add(port, message))
         stamp = stamp_ns(message)
         if port == "points":
             self._line.waiting.append((stamp, message))
@@ -155,6 +171,18 @@ class BodyFitterComponent(Component):
         else:
             self._initial.put(stamp, message)
         return self._release(final=False)
+
+    def _fit_depth(self, pairs: list[tuple[Any, Any]]) -> Output:
+        """Fit the clouds of depth images; they are in an optical frame, whatever its name, whose y axis points down."""
+        outputs: Output = []
+        for image, info in pairs:
+            if self._settings.up == "auto":
+                self._settings = replace(self._settings, up="-y")
+            try:
+                outputs += self._process("points", depth_cloud(self.factory, image, info))
+            except InputError as error:
+                self._unusable(error)
+        return outputs
 
     def _release(self, final: bool) -> Output:
         outputs: Output = []

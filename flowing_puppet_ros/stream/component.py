@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -21,6 +22,8 @@ from flowing_puppet_ros.stream.messages import MessageFactory
 Output = list[tuple[str, Any]]
 """Names of output ports, or of a person's topic of one (`Port.of`), each with a message; None closes such a topic."""
 _ID = "{id}"
+MOST_WARNINGS = 100
+"""Different sentences that a component logs in its life; what can be wrong with hostile input has no end."""
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -74,6 +77,12 @@ class Component:
     """Base of the stream components."""
 
     settings_type: ClassVar[type[Settings]]
+    fixed: ClassVar[frozenset[str]] = frozenset()
+    """Settings that stay as they were when the node was started."""
+    adoptable: ClassVar[frozenset[str]] = frozenset()
+    """Settings that `adopt` changes; a change of any other needs a new component."""
+    background: Executor | None = None
+    """Where a live node lets slow work run beside the messages; None: all work is done at once, as in a replay."""
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
 
@@ -102,6 +111,10 @@ class Component:
 
     def reset(self) -> None:
         """Forget the past: the next message starts a new recording."""
+
+    def adopt(self, settings: Settings) -> None:
+        """Go on with settings that differ from the present ones in `adoptable` ones only."""
+        self.settings = settings
 
     def expects(self, port: str, expected: bool) -> None:
         """Say whether anybody publishes on an optional input, so that the component knows what to wait for."""
@@ -140,7 +153,7 @@ class Component:
     def _warn(self, sentence: str) -> None:
         """Log `sentence` once in the component's life; sentences that differ in their numbers only are the same."""
         reason = re.sub(r"[0-9.]+", "#", sentence)
-        if reason not in self._warned:
+        if reason not in self._warned and len(self._warned) < MOST_WARNINGS:
             self._warned.add(reason)
             self.warnings.append(sentence)
 

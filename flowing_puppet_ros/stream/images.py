@@ -14,6 +14,12 @@ from flowing_puppet_ros.stream.messages import MessageFactory
 
 JPEG_QUALITY = 85
 
+LARGEST_PIXELS = 100_000_000
+"""Pixels of the largest image that is decoded; sizes beyond are lies or mistakes, and would take the memory."""
+
+FARTHEST_FLOW = 1e5
+"""Pixels; no flow leads farther than images are wide."""
+
 # encoding -> (channels, bytes a channel, OpenCV conversion to RGB)
 _RAW: dict[str, tuple[int, int, int | None]] = {
     "rgb8": (3, 1, None),
@@ -24,16 +30,23 @@ _RAW: dict[str, tuple[int, int, int | None]] = {
     "8uc4": (4, 1, cv2.COLOR_BGRA2RGB),
     "mono8": (1, 1, cv2.COLOR_GRAY2RGB),
     "8uc1": (1, 1, cv2.COLOR_GRAY2RGB),
+    "rgb16": (3, 2, None),
+    "bgr16": (3, 2, cv2.COLOR_BGR2RGB),
+    "rgba16": (4, 2, cv2.COLOR_RGBA2RGB),
+    "bgra16": (4, 2, cv2.COLOR_BGRA2RGB),
     "mono16": (1, 2, cv2.COLOR_GRAY2RGB),
     "yuv422": (2, 1, cv2.COLOR_YUV2RGB_UYVY),
     "uyvy": (2, 1, cv2.COLOR_YUV2RGB_UYVY),
     "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2RGB_YUY2),
     "yuyv": (2, 1, cv2.COLOR_YUV2RGB_YUY2),
-    "bayer_rggb8": (1, 1, cv2.COLOR_BayerRGGB2RGB),
-    "bayer_bggr8": (1, 1, cv2.COLOR_BayerBGGR2RGB),
-    "bayer_gbrg8": (1, 1, cv2.COLOR_BayerGBRG2RGB),
-    "bayer_grbg8": (1, 1, cv2.COLOR_BayerGRBG2RGB),
+    **{
+        f"bayer_{pattern.lower()}{8 * size}": (1, size, getattr(cv2, f"COLOR_Bayer{pattern}2RGB"))
+        for pattern in ("RGGB", "BGGR", "GBRG", "GRBG")
+        for size in (1, 2)
+    },
 }
+# encoding -> (type of a pixel, metres a unit); mono16 is how some drivers name millimetres (REP-118 has both others)
+_DEPTH = {"16uc1": ("u2", 0.001), "mono16": ("u2", 0.001), "32fc1": ("f4", 1.0)}
 
 
 def message_bytes(data: Any) -> NDArray[np.uint8]:
@@ -67,7 +80,10 @@ def _decode_compressed(message: Any) -> NDArray[np.uint8]:
     if "compresseddepth" in message.format.lower().replace(" ", ""):
         raise InputError(f"the compressed image format {message.format!r} is a depth image, not a picture")
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(data, flags) if len(data) else None
+    try:
+        image = cv2.imdecode(data, flags) if len(data) else None
+    except cv2.error:  # a header that names more pixels than OpenCV takes
+        image = None
     if image is None:
         raise InputError(f"a compressed image of format {message.format!r} and {len(data)} bytes cannot be decoded")
     return np.asarray(image, np.uint8)
@@ -76,6 +92,8 @@ def _decode_compressed(message: Any) -> NDArray[np.uint8]:
 def _rows(message: Any, channels: int, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return the pixels (H,W) or (H,W,channels) of a raw Image without the padding of its rows."""
     height, width, step = int(message.height), int(message.width), int(message.step)
+    if height * width > LARGEST_PIXELS:
+        raise InputError(f"an image of {width}x{height} is larger than {LARGEST_PIXELS // 1_000_000} million pixels")
     data = message_bytes(message.data)
     needed = width * channels * dtype.itemsize
     if height < 1 or width < 1 or step < needed or len(data) < step * (height - 1) + needed:
@@ -93,11 +111,27 @@ def decode_labels(message: Any) -> NDArray[np.uint8]:
 
 
 def decode_flow(message: Any) -> NDArray[np.float32]:
-    """Return the (H,W,2) flow of a 32FC2 Image: pixels, +x right, +y down, NaN where unknown."""
+    """Return the (H,W,2) flow of a 32FC2 Image: pixels, +x right, +y down, NaN where unknown or absurd."""
     if message.encoding.upper() != "32FC2":
         raise InputError(f"optical flow comes as 32FC2, not as {message.encoding!r}")
     pixels = _rows(message, 2, np.dtype(">f4" if message.is_bigendian else "<f4"))
-    return pixels.astype(np.float32, copy=False)
+    pixels = pixels.astype(np.float32, copy=False)
+    sane = np.abs(pixels) < FARTHEST_FLOW
+    return pixels if sane.all() else np.where(sane.all(axis=2, keepdims=True), pixels, np.float32(np.nan))
+
+
+def decode_depth(message: Any) -> NDArray[np.float32]:
+    """Return the (H,W) depth of a depth Image in metres along the optical axis (REP-118), NaN where unknown.
+
+    16UC1 is in millimetres and 0 is unknown, 32FC1 is in metres; what is not positive or not finite is unknown.
+    """
+    encoding = message.encoding.lower()
+    if encoding not in _DEPTH:
+        raise InputError(f"depth comes as 16UC1 (mm) or 32FC1 (m), not as {message.encoding!r}")
+    form, unit = _DEPTH[encoding]
+    raw = _rows(message, 1, np.dtype((">" if message.is_bigendian else "<") + form))
+    depth = raw.astype(np.float32) * np.float32(unit)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
 
 
 def make_image(factory: MessageFactory, header: Any, pixels: NDArray[Any], encoding: str) -> Any:

@@ -11,24 +11,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings
+from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, OpticalFlow
+from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.settings import setting
+from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import IMAGE, PUPPETS, Component, Output, Port
 from flowing_puppet_ros.stream.humans import Humans, HumansSettings, image_humans
 from flowing_puppet_ros.stream.images import decode_flow, decode_image, make_image
+from flowing_puppet_ros.stream.lookout import Lookout, LookoutSettings
 from flowing_puppet_ros.stream.messages import MessageFactory, header_ns, stamp_ns
 from flowing_puppet_ros.stream.optical_flow import flow_picture
+from flowing_puppet_ros.stream.pairing import BACKWARD_JUMP_NS
 from flowing_puppet_ros.stream.people import keypoints_of, make_puppets
 from flowing_puppet_ros.stream.waiting import Line, Shelf
 from flowing_puppet_ros.view.overlay import DrawnPuppet, draw_puppets
 
+_OF_A_NEW_TRACKER = {"model", "parts", "max_side", "seed", "humans", "humans_namespace"}
+
 
 @dataclass(frozen=True)
-class PuppetTrackerSettings(TrackerSettings, FlowSettings, HumansSettings):
-    """Settings of the tracker, of the flow it computes, and of what the component waits for, draws and publishes."""
+class PuppetTrackerSettings(TrackerSettings, FlowSettings, LookoutSettings, HumansSettings):
+    """Settings of the tracker, its flow and its detector, and of what it waits for, draws and publishes."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     parts: int = setting(14, "parts of the puppet: 10, or 14 with hands and feet", low=10, high=14)
@@ -40,10 +45,12 @@ class PuppetTrackerComponent(Component):
     """Tracks the people of one camera.
 
     An image waits for the detection and the flow of its stamp when somebody publishes them, but not longer than
-    `wait` newer images. Flow that is not published is computed here, and then shown on `flow/preview`.
+    `wait` newer images. Flow that is not published is computed here, and then shown on `flow/preview`. While nobody
+    publishes detections the package's own detector looks for people.
     """
 
     settings_type = PuppetTrackerSettings
+    adoptable = frozenset(info.name for info in PuppetTrackerSettings.describe()) - _OF_A_NEW_TRACKER
     inputs = (
         Port("image", IMAGE, "sensor", compressed=True),
         Port("flow/forward", IMAGE, optional=True),
@@ -64,6 +71,7 @@ class PuppetTrackerComponent(Component):
         self._settings = settings
         self._model = DeformableStructures.load(settings.model, settings.parts)
         self._tracker = FlowingPuppetTracker(self._model, settings, settings)
+        self._lookout = Lookout(settings, settings.most_people, self._tracker.optical_flow)
         self._line = Line()
         self._shelves = {port.name: Shelf() for port in self.inputs if port.optional}
         self._header: Any = None
@@ -73,10 +81,19 @@ class PuppetTrackerComponent(Component):
     def reset(self) -> None:
         """Forget the people and everything that waits."""
         self._tracker.reset()
+        self._lookout.reset()
         self._line.clear()
         for shelf in self._shelves.values():
             shelf.clear()
         self._header = None
+
+    def adopt(self, settings: Settings) -> None:
+        """Go on tracking the same people with other settings."""
+        assert isinstance(settings, PuppetTrackerSettings)
+        if settings.preset != self._settings.preset:
+            self._tracker.optical_flow = OpticalFlow(settings)
+        self.settings = self._settings = self._tracker.settings = settings
+        self._lookout.adopt(settings, settings.most_people, self._tracker.optical_flow)
 
     def flush(self) -> Output:
         """Process the images that still wait."""
@@ -85,12 +102,21 @@ class PuppetTrackerComponent(Component):
     def _process(self, port: str, message: Any) -> Output:
         stamp = stamp_ns(message)
         if port == "image":
-            self._line.waiting.append((stamp, message))
+            self._take(stamp, message)
         elif port != "flow/forward" and self._line.too_late(stamp):
             self.counters[f"late {port}"] += 1
         else:
             self._shelves[port].put(stamp, message)
         return self._release(final=False)
+
+    def _take(self, stamp: int, message: Any) -> None:
+        """Put an image in line; one that comes a little too late is left out, one from long before is a restart."""
+        last = self._line.waiting[-1][0] if self._line.waiting else self._line.left
+        if last is not None and 0 < last - stamp < BACKWARD_JUMP_NS:
+            self.counters["disordered images"] += 1
+            self._warn(f"an image is {(last - stamp) * 1e-6:.0f} ms older than the one before: it is left out")
+        else:
+            self._line.waiting.append((stamp, message))
 
     def _release(self, final: bool) -> Output:
         outputs: Output = []
@@ -114,21 +140,55 @@ class PuppetTrackerComponent(Component):
         return all(self._shelves[port].get(at) is not None for port, at in needs if port in self._expected)
 
     def _step(self, stamp: int, message: Any) -> Output:
-        image = decode_image(message)
-        detections = self._shelves["detections"].get(stamp)
-        if detections is None and "detections" in self._expected:
-            self.counters["images without detection"] += 1
-        people = None if detections is None else keypoints_of(detections)
-        result = self._tracker.step(image, stamp, people, self._flow(stamp))
+        image, flow = decode_image(message), self._flow(stamp)
+        people = self._detected(stamp)
+        if people is None and "detections" not in self._expected and self._settings.detect:
+            people, flow = self._found(image, stamp, flow)
+        else:
+            self._lookout.reset()
+        result = self._tracker.step(image, stamp, people, flow)
+        self._lookout.tracked(stamp, result.flow)
         for warning in result.warnings:
             self._warn(warning)
         earlier, self._header = self._header, message.header
-        self._shelves["detections"].forget_until(stamp)
-        self._shelves["flow/backward"].forget_until(stamp)
-        self._shelves["flow/forward"].forget_until(stamp - 1)
+        self._forget(stamp)
         self.counters["images"] += 1
         self.counters["puppets"] += len(result.puppets)
         return self._publish(message.header, earlier, image, result)
+
+    def _detected(self, stamp: int) -> list[Keypoints] | None:
+        """The people that somebody else found in the image of this stamp, None when nobody told."""
+        detections = self._shelves["detections"].get(stamp)
+        if detections is None:
+            if "detections" in self._expected:
+                self.counters["images without detection"] += 1
+            return None
+        self.counters["paired detections"] += 1
+        return keypoints_of(detections)
+
+    def _found(
+        self, image: NDArray[np.uint8], stamp: int, flow: FlowPair | None
+    ) -> tuple[list[Keypoints] | None, FlowPair | None]:
+        """The people that the own detector found, None when it says nothing, and the flow to track with."""
+        answer = self._lookout.ask(image, stamp, bool(self._tracker.people), flow, self.background)
+        if answer is None:
+            return None, flow
+        self.counters["looks with people"] += bool(answer.people)
+        if answer.seen_in is None:
+            return answer.people, answer.flow
+        # Nobody was tracked: the tracks begin in the image that was looked at, and one long flow leads from there here.
+        self._tracker.reset()
+        for warning in self._tracker.step(*answer.seen_in, answer.people).warnings:
+            self._warn(warning)
+        return None, None
+
+    def _forget(self, stamp: int) -> None:
+        """Drop what was for images up to this one; what no image has used is counted."""
+        unpaired = self._shelves["detections"].forget_until(stamp - 1)
+        self.counters["unpaired detections"] += unpaired
+        self._shelves["detections"].forget_until(stamp)
+        self._shelves["flow/backward"].forget_until(stamp)
+        self._shelves["flow/forward"].forget_until(stamp - 1)
 
     def _flow(self, stamp: int) -> FlowPair | None:
         if self._header is None or not {"flow/forward", "flow/backward"} <= self._expected:
@@ -138,7 +198,12 @@ class PuppetTrackerComponent(Component):
         if forward is None or backward is None:
             self.counters["images without flow"] += 1
             return None
-        return decode_flow(forward), decode_flow(backward)
+        self.counters["paired flows"] += 1
+        try:
+            return decode_flow(forward), decode_flow(backward)
+        except InputError as error:  # the image is good: its flow is computed here
+            self._unusable(error)
+            return None
 
     def _publish(self, header: Any, earlier: Any, image: NDArray[np.uint8], result: TrackResult) -> Output:
         puppets = make_puppets(self.factory, header, self._model, result.puppets)

@@ -50,6 +50,7 @@ class VisualHullComponent(Component):
     """Cuts one person out of the images and carves its hull; its joints are triangulated from the puppets."""
 
     settings_type = VisualHullSettings
+    fixed = frozenset({"cameras"})
     outputs = (
         Port("silhouettes", SILHOUETTES, lazy=True),
         Port("hull", POINT_CLOUD),

@@ -111,7 +111,7 @@ def test_cameras_without_detections_are_named_with_the_way_out(golden: Any, tmp_
     names = {"/cam1/image/compressed": "/robot/front/color/image_raw/compressed", "/cam1/detections": "/robot/people"}
     bag = excerpt(golden.source, tmp_path / "in.mcap", names)
     (warning,) = replay(bag, tmp_path / "out.mcap", QUIET)["warnings"]
-    assert warning.startswith("nobody is tracked in /robot/front/color/image_raw: ")
+    assert warning.startswith("the detector of this package finds the people in /robot/front/color/image_raw: ")
     rule = warning.partition("--topic-map ")[2].split()[0]
     old, new = rule.split(":=")
     again = replay(bag, tmp_path / "out.mcap", ReplayOptions(topic_map={old: new}, progress=False))

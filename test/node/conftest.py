@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -53,10 +54,17 @@ def peer() -> Iterator[Peer]:
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Path]]:
     """Return a function that starts an installed node and returns the file of its log; all must end cleanly."""
+    with running_nodes(tmp_path) as run:
+        yield run
+
+
+@contextmanager
+def running_nodes(folder: Path) -> Iterator[Callable[..., Path]]:
+    """Yield a function that starts an installed node with its log in `folder`; all must end cleanly."""
     running: list[tuple[str, subprocess.Popen[bytes], Path]] = []
 
     def run(name: str, *ros_arguments: str) -> Path:
-        log = tmp_path / f"{len(running)}_{name}.log"
+        log = folder / f"{len(running)}_{name}.log"
         command = [str(Path(sys.executable).with_name(name)), "--ros-args", *ros_arguments]
         with log.open("wb") as output:
             process = subprocess.Popen(command, stdout=output, stderr=output, stdin=subprocess.DEVNULL)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from flowing_puppet_ros.node.registry import COMPONENTS, NodeSettings, parameter_yaml
+from flowing_puppet_ros.node.registry import COMPONENTS, node_settings, parameter_yaml
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
@@ -23,7 +23,7 @@ def test_file_is_generated_from_the_settings(name: str) -> None:
 @pytest.mark.parametrize("name", COMPONENTS)
 def test_values_survive_the_file(name: str) -> None:
     read = YAML(typ="safe").load(parameter_yaml(name))[f"/**/{name}"]["ros__parameters"]
-    infos = [*COMPONENTS[name].settings_type.describe(), *NodeSettings.describe()]
+    infos = [*COMPONENTS[name].settings_type.describe(), *node_settings(name).describe()]
     assert [(key, type(value), value) for key, value in read.items()] == [
         (info.name, info.type, info.default) for info in infos
     ]

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """What /diagnostics says: rates over the period, new drops and failures set the level."""
 
+from typing import Any
+
 import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from flowing_puppet_ros.node.diagnostics import Diagnostics
+from flowing_puppet_ros.node.diagnostics import SILENCE, Condition, Diagnostics
 
 pytestmark = pytest.mark.ros
 
@@ -18,27 +20,54 @@ def values(report: object) -> dict[str, str]:
 def test_rates_latency_and_counters() -> None:
     diagnostics = Diagnostics("/cam01/puppet_tracker", "puppet_tracker")
     for _ in range(30):
-        diagnostics.passed("image")
-    diagnostics.took(0.1)
-    diagnostics.took(0.3)
-    report = diagnostics.report(Time(sec=5), 2.0, {"images": 30}, {})
+        diagnostics.received("image")
+    for seconds in (0.1, 0.1, 0.4):
+        diagnostics.took(seconds)
+    diagnostics.people = 2
+    report = diagnostics.report(Time(sec=5), 2.0, Condition(counters={"images": 30}))
     assert report.header.stamp.sec == 5
     assert report.status[0].name == "cam01.puppet_tracker: puppet_tracker"
     assert report.status[0].level == DiagnosticStatus.OK
     assert values(report) == {
-        "image (Hz)": "15.0", "latency mean (s)": "0.200", "latency max (s)": "0.300", "images": "30",
+        "state": "active", "image (Hz)": "15.0", "latency median (s)": "0.100", "latency max (s)": "0.400",
+        "people": "2", "images": "30", "resets": "0",
     }  # fmt: skip
-    silent = diagnostics.report(Time(), 1.0, {}, {})
-    assert values(silent) == {"image (Hz)": "0.0"}
-    assert silent.status[0].message == "waiting for messages"
+    quiet = values(diagnostics.report(Time(), 1.0, Condition()))
+    assert quiet["image (Hz)"] == "0.0" and "latency median (s)" not in quiet
+
+
+def level(diagnostics: Diagnostics, **condition: Any) -> tuple[bytes, str]:
+    """Return level and message of a report."""
+    status = diagnostics.report(Time(), 1.0, Condition(**condition)).status[0]
+    return status.level, status.message
 
 
 def test_level_follows_what_is_new() -> None:
     diagnostics = Diagnostics("/a", "a")
-    assert diagnostics.report(Time(), 1.0, {}, {"image": 3}).status[0].level == DiagnosticStatus.WARN
-    assert diagnostics.report(Time(), 1.0, {}, {"image": 3}).status[0].level == DiagnosticStatus.OK
-    unusable = diagnostics.report(Time(), 1.0, {"unusable": 2}, {"image": 3}).status[0]
-    assert (unusable.level, unusable.message[:1]) == (DiagnosticStatus.WARN, "2")
-    assert diagnostics.report(Time(), 1.0, {"unusable": 2}, {"image": 3}).status[0].level == DiagnosticStatus.OK
-    diagnostics.failed()
-    assert diagnostics.report(Time(), 1.0, {}, {"image": 3}).status[0].level == DiagnosticStatus.ERROR
+    assert level(diagnostics) == (DiagnosticStatus.OK, "waiting for messages")
+    assert level(diagnostics, dropped={"image": 3})[0] == DiagnosticStatus.WARN
+    assert level(diagnostics, dropped={"image": 3})[0] == DiagnosticStatus.OK
+    unusable = level(diagnostics, counters={"unusable": 2}, dropped={"image": 3})
+    assert (unusable[0], unusable[1][:1]) == (DiagnosticStatus.WARN, "2")
+    assert level(diagnostics, counters={"unusable": 2}, dropped={"image": 3})[0] == DiagnosticStatus.OK
+    diagnostics.failed("ZeroDivisionError: it broke")
+    report = diagnostics.report(Time(), 1.0, Condition())
+    assert report.status[0].level == DiagnosticStatus.ERROR
+    assert values(report)["last error"] == "ZeroDivisionError: it broke"
+    # A component that was made anew counts from zero.
+    assert level(diagnostics, counters={"unusable": 0})[0] == DiagnosticStatus.OK
+
+
+def test_states_and_silence_have_their_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr("flowing_puppet_ros.node.diagnostics.time.monotonic", lambda: now[0])
+    diagnostics = Diagnostics("/a", "a")
+    diagnostics.received("image")
+    now[0] += 2 * SILENCE
+    stale = level(diagnostics, publishers={"/camera/image": 0})
+    assert stale == (DiagnosticStatus.STALE, "no message for 10 s; topics and their publishers: /camera/image (0)")
+    assert level(diagnostics, state="inactive")[0] == DiagnosticStatus.OK
+    diagnostics.waits()
+    assert level(diagnostics) == (DiagnosticStatus.OK, "waiting for messages")
+    broken = level(diagnostics, state="unconfigured", problem="cameras is empty")
+    assert broken == (DiagnosticStatus.ERROR, "the node cannot work: cameras is empty")

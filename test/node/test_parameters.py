@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.node.parameters import declare
+from flowing_puppet_ros.node.parameters import changed, declare, with_floats
 from flowing_puppet_ros.settings import Settings, setting
 
 pytestmark = pytest.mark.ros
@@ -47,13 +47,13 @@ def test_defaults_and_overrides() -> None:
 
 def test_descriptors_show_help_range_and_choices() -> None:
     made = node()
-    declare(made, Sample)
+    declare(made, Sample, fixed={"mode"})
     count, ratio, mode = (made.describe_parameter(name) for name in ("count", "ratio", "mode"))
     assert count.description == "how many (1 to 9)"
     assert (count.integer_range[0].from_value, count.integer_range[0].to_value) == (1, 9)
     assert ratio.floating_point_range[0].from_value == 0.0
     assert mode.additional_constraints == "one of a, b"
-    assert count.read_only
+    assert (count.read_only, mode.read_only) == (False, True)
 
 
 @pytest.mark.parametrize(("name", "value"), [("count", 0), ("count", 1.5), ("ratio", -0.1), ("mode", "c")])
@@ -62,3 +62,19 @@ def test_bad_values_are_one_sentence_with_the_name(name: str, value: object) -> 
         declare(node(**{name: value}), Sample)
     assert str(value) in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_a_change_is_checked_as_a_whole_and_changes_nothing_itself() -> None:
+    before = Sample()
+    after = changed(before, [Parameter("count", value=7), Parameter("use_sim_time", value=True)])
+    assert (before, after) == (Sample(), Sample(count=7))
+    with pytest.raises(InputError, match="mode is 'c', which is not one of a, b"):
+        changed(before, [Parameter("count", value=8), Parameter("mode", value="c")])
+
+
+def test_whole_numbers_are_taken_for_floating_point_settings() -> None:
+    given = [Parameter("ratio", value=2), Parameter("count", value=2), Parameter("mode", value="b")]
+    taken = {parameter.name: parameter.value for parameter in with_floats([Sample], given)}
+    assert {name: (type(value), value) for name, value in taken.items()} == {
+        "ratio": (float, 2.0), "count": (int, 2), "mode": (str, "b"),
+    }  # fmt: skip

@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A component at work on the topics of a node, from configuring to cleaning up."""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from functools import cache, partial
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import NameValidationException
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_policy_name_from_kind, qos_profile_sensor_data
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.node.diagnostics import Diagnostics
+from flowing_puppet_ros.node.factory import message_type
+from flowing_puppet_ros.node.worker import Worker
+from flowing_puppet_ros.stream.component import COMPRESSED_IMAGE, Component, Output, Port
+from flowing_puppet_ros.stream.images import compress
+from flowing_puppet_ros.stream.messages import NANOSECONDS, header_ns
+from flowing_puppet_ros.stream.pairing import BACKWARD_JUMP_NS
+
+QUIET_SECONDS = 5.0
+"""Shortest time between two log lines about the same trouble."""
+FUTURE_NS = NANOSECONDS
+"""A stamp this much ahead of the node's clock comes from another clock."""
+_SUBSCRIPTION_QOS = {
+    "sensor": qos_profile_sensor_data,
+    "reliable": QoSProfile(depth=10),
+    "latched": QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+}
+_PUBLISHER_QOS = {
+    "reliable": QoSProfile(depth=10),
+    "latched": QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
+}
+_PEOPLE = {"puppets": "puppets", "bodies": "bodies"}
+"""Output ports whose messages list the people, and the field that does."""
+
+
+class Session[C: Component]:
+    """Runs one component on live topics.
+
+    Callbacks only put messages in line; the worker thread hands them to the component in order of arrival and
+    publishes what comes out. Whatever a message does, the session goes on. What the worker still computes when the
+    session is deactivated or closed is not published.
+    """
+
+    def __init__(self, node: Node, component: C, queue: int, diagnostics: Diagnostics) -> None:
+        """Open the outputs and start the worker; the inputs are opened by `activate`."""
+        self.component = component
+        self.active = False
+        self._node = node
+        self._diagnostics = diagnostics
+        self._publishing = threading.Lock()
+        self._last_stamp: int | None = None
+        self._said: set[str] = set()
+        self._subscriptions: list[Subscription] = []
+        topics = {port.name: _resolved(node, port.name) for port in component.inputs}
+        self._optional = {port.name: topics[port.name] for port in component.inputs if port.optional}
+        self.topics = [topic for name, topic in topics.items() if name not in self._optional]
+        self._lazy = [port for port in component.outputs if port.lazy]
+        self._outputs: dict[str, list[tuple[Publisher, Callable[[Any], Any]]]] = {}
+        try:
+            for port in component.outputs:
+                if not port.per_person:
+                    self._outputs[port.name] = self._open_output(port)
+        except Exception:
+            self._close_outputs()
+            raise
+        component.background = _background()
+        self.worker = Worker(queue, self._failed)
+
+    def activate(self) -> None:
+        """Open the inputs."""
+        self._diagnostics.waits()
+        self.active = True
+        for port in self.component.inputs:
+            self._subscribe(port, message_type(port.type), port.name)
+            if port.compressed:
+                self._subscribe(port, message_type(COMPRESSED_IMAGE), self._compressed(port))
+
+    def deactivate(self) -> None:
+        """Close the inputs and forget what waits; the outputs stay open and silent."""
+        with self._publishing:
+            self.active = False
+        for subscription in self._subscriptions:
+            self._node.destroy_subscription(subscription)
+        self._subscriptions.clear()
+        self.reset()
+
+    def close(self) -> None:
+        """Let the running task end, then close the outputs."""
+        self.deactivate()
+        self.worker.stop()
+        self._close_outputs()
+
+    def _close_output(self, name: str) -> None:
+        for publisher, _ in self._outputs.pop(name, []):
+            self._node.destroy_publisher(publisher)
+
+    def _close_outputs(self, kept: Collection[str] = ()) -> None:
+        for name in set(self._outputs) - set(kept):
+            self._close_output(name)
+
+    def reset(self) -> None:
+        """Drop the messages that wait and let the next one start anew."""
+        self.worker.clear()
+        self.worker.call(self._reset)
+
+    def _reset(self) -> None:
+        self.component.reset()
+        self._last_stamp = None
+        with self._publishing:
+            self._close_outputs(kept=[port.name for port in self.component.outputs])
+
+    @property
+    def stamped(self) -> bool:
+        """Whether a message with a stamp has come since the last reset."""
+        return self._last_stamp is not None
+
+    def behind(self, now_ns: int) -> bool:
+        """Whether the newest input is stamped later than `now_ns`, so that the time must have jumped back since."""
+        last = self._last_stamp
+        return last is not None and last > now_ns + BACKWARD_JUMP_NS
+
+    def _subscribe(self, port: Port, kind: Any, topic: str) -> None:
+        name = self._node.resolve_topic_name(topic)
+        made = self._node.create_subscription(
+            kind,
+            topic,
+            partial(self._received, port.name, name),
+            _SUBSCRIPTION_QOS[port.qos],
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+            event_callbacks=SubscriptionEventCallbacks(
+                incompatible_qos=partial(self._incompatible, name, "subscription"),
+                incompatible_type=partial(self._other_type, name),
+                message_lost=partial(self._lost, port.name, name),
+            ),
+        )
+        self._subscriptions.append(made)
+
+    def _open_output(self, port: Port, person: bool = False) -> list[tuple[Publisher, Callable[[Any], Any]]]:
+        """Return the publishers of a port, each with what makes its message out of the component's."""
+        made: list[tuple[Publisher, Callable[[Any], Any]]]
+        made = [(self._publisher(message_type(port.type), port.name, port.qos, person), _same)]
+        if port.compressed:
+            compressed = self._publisher(message_type(COMPRESSED_IMAGE), self._compressed(port), port.qos, person)
+            made.append((compressed, partial(compress, self.component.factory)))
+        return made
+
+    def _compressed(self, port: Port) -> str:
+        """Return the topic of a port's compressed images: it follows the port when that is remapped."""
+        return f"{self._node.resolve_topic_name(port.name)}/compressed"
+
+    def _publisher(self, kind: Any, topic: str, qos: str, person: bool) -> Publisher:
+        name = self._node.resolve_topic_name(topic)
+        # Overriding options are parameters; for every person who ever came they would be without end.
+        options = None if person else QoSOverridingOptions.with_default_policies()
+        events = PublisherEventCallbacks(incompatible_qos=partial(self._incompatible, name, "publisher"))
+        return self._node.create_publisher(
+            kind, topic, _PUBLISHER_QOS[qos], qos_overriding_options=options, event_callbacks=events
+        )
+
+    def _incompatible(self, topic: str, side: str, event: Any) -> None:
+        policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
+        other = "publisher offers" if side == "subscription" else "subscriber wants"
+        cure = f"set qos_overrides.{topic}.{side}.{policy} of this node, or the {policy} of the other, to fit"
+        self._complain(f"{topic}: a {other} another {policy}, so nothing passes between the two; {cure}")
+
+    def _other_type(self, topic: str, _: Any) -> None:
+        self._complain(f"{topic}: somebody uses another message type; remap that topic or this node's")
+
+    def _lost(self, port: str, topic: str, event: Any) -> None:
+        """Count what the middleware lost on the way; the first time say what helps."""
+        self.component.counters[f"lost {port}"] = event.total_count
+        self._complain_once(
+            f"{topic}: messages are lost on the way; large ones need qos_overrides.{topic}.subscription.reliability "
+            "reliable (and a reliable publisher), or compressed images"
+        )
+
+    def _complain(self, sentence: str) -> None:
+        self._diagnostics.complained(sentence)
+        self._node.get_logger().warning(sentence)
+
+    def _complain_once(self, sentence: str) -> None:
+        if sentence not in self._said:
+            self._said.add(sentence)
+            self._complain(sentence)
+
+    def _received(self, port: str, topic: str, message: Any) -> None:
+        self._diagnostics.received(port)
+        self.worker.put(port, partial(self._handle, port, topic, message))
+
+    def _handle(self, port: str, topic: str, message: Any) -> None:
+        """Hand one message to the component and publish what comes out (on the worker thread)."""
+        if not self.active:
+            return
+        for name, optional in self._optional.items():
+            self.component.expects(name, self._node.count_publishers(optional) > 0)
+        for lazy in self._lazy:
+            listened = any(publisher.get_subscription_count() for publisher, _ in self._outputs.get(lazy.name, []))
+            self.component.wants(lazy.name, listened)
+        if hasattr(message, "header"):
+            self._look_at_stamp(topic, header_ns(message.header))
+        self.publish(self.component.handle(port, message))
+        for warning in self.component.drain_warnings():
+            self._complain(f"{topic}: {warning}")
+
+    def _look_at_stamp(self, topic: str, stamp: int) -> None:
+        self._last_stamp = stamp
+        now = self._node.get_clock().now().nanoseconds
+        if stamp == 0:
+            self.component.counters["stamps of zero"] += 1
+            self._complain_once(f"{topic} has stamps of zero: results carry them, latency means nothing; set the stamp")
+        elif stamp > now + FUTURE_NS:
+            self.component.counters["stamps from the future"] += 1
+            self._complain_once(
+                f"{topic} has stamps from the future; set use_sim_time when a bag is played, or synchronise the clocks"
+            )
+
+    def publish(self, outputs: Output) -> None:
+        """Publish what the component made, unless the session has ended meanwhile."""
+        for name, message in outputs:
+            port = self.component.output(name)
+            with self._publishing:
+                if not self.active:
+                    return
+                if message is None:
+                    self._close_output(name)
+                    continue
+                if name not in self._outputs:
+                    self._outputs[name] = self._open_output(replace(port, name=name), person=True)
+                publishers = self._outputs[name]
+                for publisher, converted in publishers:
+                    if len(publishers) == 1 or publisher.get_subscription_count():
+                        publisher.publish(converted(message))
+            self._count(port, message)
+
+    def _count(self, port: Port, message: Any) -> None:
+        self._diagnostics.passed(port.name)
+        if port.name in _PEOPLE:
+            self._diagnostics.people = len(getattr(message, _PEOPLE[port.name]))
+        if hasattr(message, "header"):
+            age = self._node.get_clock().now().nanoseconds - header_ns(message.header)
+            self._diagnostics.took(age * 1e-9)
+
+    def _failed(self, error: Exception) -> None:
+        if not self.active or not self._node.context.ok():
+            return
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        reason = " ".join(str(error).split())
+        text = f"a message failed: {type(error).__name__}: {reason} ({where.filename}:{where.lineno})"
+        self._diagnostics.failed(text)
+        self._node.get_logger().error(text, throttle_duration_sec=QUIET_SECONDS)
+
+
+def _resolved(node: Node, topic: str) -> str:
+    """Return the topic's full name after remapping; InputError that names it when it is none."""
+    try:
+        return str(node.resolve_topic_name(topic))
+    except (RuntimeError, ValueError, NameValidationException) as error:
+        raise InputError(f"{topic!r} is no name for a topic: {' '.join(str(error).split())}") from error
+
+
+@cache
+def _background() -> ThreadPoolExecutor:
+    """One thread for the slow work of all components of this process: the workers need the other cores."""
+    return ThreadPoolExecutor(1, thread_name_prefix="background")
+
+
+def _same(message: Any) -> Any:
+    return message
