@@ -134,6 +134,7 @@ class PuppetTrackerComponent(Component):
         backward = self._shelves["flow/backward"].get(stamp)
         if forward is None or backward is None:
             self.counters["images without flow"] += 1
+            self._warn("an image came without the flow that others had: it is computed here")
             return None
         return decode_flow(forward), decode_flow(backward)
 
