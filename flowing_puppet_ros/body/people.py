@@ -202,15 +202,10 @@ def _without_planes(
 
     `centres` are relative to `origin`, which may differ from cloud to cloud.
     """
-    known = memory.recall(centres + origin, clearance) if memory else None
-    if known is None:
-        floor, walls = _found_planes(centres, clearance)
-        if memory:
-            memory.keep(
-                centres + origin, clearance, *((floor and floor.moved(origin)), [w.moved(origin) for w in walls])
-            )
-    else:
-        floor, walls = known[0] and known[0].moved(-origin), [wall.moved(-origin) for wall in known[1]]
+    known = memory.recall(centres, clearance, origin) if memory else None
+    floor, walls = known or _found_planes(centres, clearance)
+    if memory and known is None:
+        memory.keep(centres, clearance, floor, walls, origin)
     return np.flatnonzero(_off(centres, clearance, floor, walls)), floor
 
 

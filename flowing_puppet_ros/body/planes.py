@@ -63,11 +63,17 @@ class PlaneMemory:
         self._has_floor = False
         self._left = 0
 
-    def recall(self, points: np.ndarray, clearance: float) -> tuple[Plane | None, list[Plane]] | None:
-        """Return floor and walls moved to where points (N, 3) in metres have them; None when to look for them."""
+    def recall(
+        self, points: np.ndarray, clearance: float, origin: np.ndarray
+    ) -> tuple[Plane | None, list[Plane]] | None:
+        """Return floor and walls moved to where points (N, 3) in metres have them; None when to look for them.
+
+        Points and planes are relative to `origin` (3,), which may differ from cloud to cloud.
+        """
         self._left -= 1
         moved = []
-        for plane, share in self._kept:
+        for kept, share in self._kept:
+            plane = kept.moved(-origin)
             on = np.abs(plane.height(points)) < clearance
             if self._left < 0 or on.mean() < STILL_THERE * share:
                 self._left = 0
@@ -78,10 +84,13 @@ class PlaneMemory:
         floor = moved.pop(0) if self._has_floor else None
         return floor, moved
 
-    def keep(self, points: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]) -> None:
+    def keep(
+        self, points: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane], origin: np.ndarray
+    ) -> None:
         """Remember what was found, and how much of the cloud (N, 3) it is."""
         planes = [*([floor] if floor is not None else []), *walls]
-        self._kept = [(plane, float((np.abs(plane.height(points)) < clearance).mean())) for plane in planes]
+        shares = [float((np.abs(plane.height(points)) < clearance).mean()) for plane in planes]
+        self._kept = [(plane.moved(origin), share) for plane, share in zip(planes, shares, strict=True)]
         self._has_floor, self._left = floor is not None, REFRESH
 
 

@@ -50,11 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
     bench, figures = Bench(arguments.seed), {}
     for part in arguments.parts or PARTS:
         print(f"measuring {part}", file=sys.stderr)
-        if part == LIVE:
-            figures[part], what = bench_live.run(arguments.seconds, arguments.seed), bench_live.__doc__
-        else:
-            figures[part], what = PARTS[part](bench), PARTS[part].__doc__
+        live = part == LIVE
+        figures[part] = bench_live.run(arguments.seconds, arguments.seed) if live else PARTS[part](bench)
         if not arguments.json:
+            what = bench_live.__doc__ if live else PARTS[part].__doc__
             print(f"{part}: {what}\n{text_table(figures[part])}\n", flush=True)
     if arguments.json:
         print(json.dumps(figures))

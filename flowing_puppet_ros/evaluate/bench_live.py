@@ -60,7 +60,8 @@ def run(seconds: float, seed: int = 0) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "input.npz"
         for node, array, rate in (("puppet_tracker", "images", IMAGE_RATE), ("body_fitter", "clouds", CLOUD_RATE)):
-            np.savez(file, **{array: images() if array == "images" else clouds(seed)})
+            arrays: Any = {array: images() if array == "images" else clouds(seed)}
+            np.savez(file, **arrays)
             rows.append(_measured(node, file, rate, seconds) | {"target": TARGETS[node]})
     return rows
 

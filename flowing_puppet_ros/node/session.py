@@ -13,12 +13,14 @@ from functools import cache, partial
 from typing import Any
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_policy_name_from_kind, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
+from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.diagnostics import Diagnostics
 from flowing_puppet_ros.node.factory import message_type
 from flowing_puppet_ros.node.worker import Worker
@@ -62,7 +64,9 @@ class Session[C: Component]:
         self._last_stamp: int | None = None
         self._said: set[str] = set()
         self._subscriptions: list[Subscription] = []
-        self._optional = {port.name: node.resolve_topic_name(port.name) for port in component.inputs if port.optional}
+        topics = {port.name: _resolved(node, port.name) for port in component.inputs}
+        self._optional = {port.name: topics[port.name] for port in component.inputs if port.optional}
+        self.topics = [topic for name, topic in topics.items() if name not in self._optional]
         self._lazy = [port for port in component.outputs if port.lazy]
         self._outputs: dict[str, list[tuple[Publisher, Callable[[Any], Any]]]] = {}
         try:
@@ -72,7 +76,6 @@ class Session[C: Component]:
         except Exception:
             self._close_outputs()
             raise
-        self.topics = [node.resolve_topic_name(port.name) for port in component.inputs if not port.optional]
         component.background = _background()
         self.worker = Worker(queue, self._failed)
 
@@ -260,6 +263,14 @@ class Session[C: Component]:
         text = f"a message failed: {type(error).__name__}: {reason} ({where.filename}:{where.lineno})"
         self._diagnostics.failed(text)
         self._node.get_logger().error(text, throttle_duration_sec=QUIET_SECONDS)
+
+
+def _resolved(node: Node, topic: str) -> str:
+    """Return the topic's full name after remapping; InputError that names it when it is none."""
+    try:
+        return str(node.resolve_topic_name(topic))
+    except (RuntimeError, ValueError, NameValidationException) as error:
+        raise InputError(f"{topic!r} is no name for a topic: {' '.join(str(error).split())}") from error
 
 
 @cache

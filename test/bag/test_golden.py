@@ -154,9 +154,10 @@ def test_markers_poses_and_labels_say_the_same(golden: Any) -> None:
     out = golden.replays[0]
     mesh, _ = decode_cloud(records(out, "/body_vertices")[0].message)
     (marker,) = records(out, "/body_meshes")[0].message.markers
-    triangles = np.array([t.vertex_indices for t in records(out, "/body_topology")[0].message.triangles])
     corners = np.array([[p.x, p.y, p.z] for p in marker.points])
-    np.testing.assert_allclose(corners, mesh[triangles].reshape(-1, 3), atol=1e-6)
+    assert 3 * 1500 < len(corners) <= 3 * 2000, "a preview"
+    apart = np.abs(corners[::50, None] - mesh[None]).max(axis=2).min(axis=1)
+    np.testing.assert_allclose(apart, 0, atol=1e-5, err_msg="on the body's own vertices")
     (body,) = records(out, "/bodies")[0].message.bodies
     assert [part.pose for part in body.parts] == records(out, "/part_poses")[0].message.poses
     for name in CAMERAS:

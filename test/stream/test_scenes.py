@@ -3,66 +3,194 @@
 
 from __future__ import annotations
 
+import threading
+from typing import Any
+
 import numpy as np
 import pytest
 
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
-from flowing_puppet_ros.body.people import ExtractionSettings
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.clouds import make_cloud
-from flowing_puppet_ros.stream.scenes import FORGOTTEN, ScenePeople
+from flowing_puppet_ros.stream.messages import make_header
+
+FACTORY = BagMessageFactory()
+TENTH = 100_000_000
+Place = tuple[float, float]
 
 
 @pytest.fixture(scope="module")
 def person() -> np.ndarray:
     model = StitchedPuppet.load("neutral")
     vertices = model.vertices(model.rest_state())
-    return vertices - [0, 0, vertices[:, 2].min()]
+    return np.asarray(vertices - [0, 0, vertices[:, 2].min()])
 
 
 @pytest.fixture(scope="module")
 def floor() -> np.ndarray:
-    return np.pad(np.random.default_rng(0).uniform(-4, 4, (9000, 2)), ((0, 0), (0, 1)))
+    return np.pad(np.random.default_rng(0).uniform(-4, 4, (3000, 2)), ((0, 0), (0, 1)))
 
 
-def test_ids_follow_people_who_move_leave_and_come(person: np.ndarray, floor: np.ndarray) -> None:
-    scene = ScenePeople(ExtractionSettings())
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+    """The middles of all clouds that had a full fit, each of which finds a standing person at once."""
+    middles: list[np.ndarray] = []
 
-    def ids(*places: tuple[float, float]) -> dict[tuple[float, float], str]:
-        cloud = np.concatenate([floor, *(person + np.array([x, y, 0.0]) for x, y in places)])
-        found = scene.find(cloud, None, None)
-        middles = {identity: cloud.points[:, :2].mean(axis=0) for identity, cloud in found}
-        return {place: min(middles, key=lambda one: float(np.linalg.norm(middles[one] - place))) for place in places}
+    def fit(fitter: BodyFitter, points: Any, normals: Any, *, viewpoint: Any = None, **_: Any) -> BodyFit:
+        middles.append(points.mean(axis=0))
+        state = fitter.model.rest_state()
+        lowest = fitter.model.vertices(state)[:, 2].min()
+        middle = fitter.model.vertices(state).mean(axis=0)
+        state.center[:] += [*(points.mean(axis=0) - middle)[:2], points[:, 2].min() - lowest]
+        return fitter.result(state, fitter.cloud(points, normals, viewpoint))
 
-    first = ids((0, 0), (2, 0))
-    assert set(first.values()) == {"b1", "b2"}
-    second = ids((0.4, 0.3), (2.4, -0.2))
-    assert list(second.values()) == list(first.values())
-    assert ids((2.6, -0.2)) == {(2.6, -0.2): first[2, 0]}
-    assert ids((0.5, 0.3), (-2.5, -2)) == {(0.5, 0.3): first[0, 0], (-2.5, -2): "b3"}
-    for _ in range(FORGOTTEN + 1):
-        ids((-2.5, -2))
-    assert ids((0.5, 0.3)) == {(0.5, 0.3): "b4"}
-    scene.reset()
-    assert ids((0.5, 0.3)) == {(0.5, 0.3): "b1"}
+    monkeypatch.setattr(BodyFitter, "fit", fit)
+    return middles
 
 
-def test_the_component_fits_everybody_or_nobody(person: np.ndarray, floor: np.ndarray) -> None:
-    quick = BodyFitterSettings(
-        scene=True, particles=4, iterations=1, local_particles=4, local_iterations=0, restarts=0, lm_steps=1,
-        refine_iterations=3, cloud_points=1000, surface_finish=False, limb_rounds=0,
-    )  # fmt: skip
-    factory = BagMessageFactory()
-    component = BodyFitterComponent(quick, factory)
-    header = factory.make("std_msgs/msg/Header", frame_id="map")
-    cloud = np.concatenate([floor, person, person + np.array([2.0, 1.0, 0.0])])
-    message, fits = component.fit(make_cloud(factory, header, cloud), None, seed=0)
-    assert sorted(body.id for body in message.bodies) == ["b1", "b2"]
-    middles = sorted(tuple(np.round(fit.vertices[:, :2].mean(axis=0))) for _, fit in fits)
-    assert middles == [(0.0, 0.0), (2.0, 1.0)]
-    message, fits = component.fit(make_cloud(factory, header, floor), None, seed=0)
-    assert not message.bodies and not fits
-    with pytest.raises(InputError):
-        BodyFitterComponent(BodyFitterSettings(), factory).fit(make_cloud(factory, header, floor[:3]), None, seed=0)
+class Stage:
+    """A component, and people who stand on a floor before it."""
+
+    def __init__(self, person: np.ndarray, floor: np.ndarray, **settings: Any) -> None:
+        self.person, self.floor = person, floor
+        self.component = BodyFitterComponent(
+            BodyFitterSettings(view="full", cloud_points=1000, track_points=500, track_steps=2, threads=1, **settings),
+            FACTORY,
+        )
+        self.component.wants("body_meshes", True)
+        self.tenths = 0
+        self.made: dict[str, Any] = {}
+
+    def cloud(self, *places: Place) -> Any:
+        self.tenths += 1
+        points = np.concatenate([self.floor, *(self.person + np.array([x, y, 0.0]) for x, y in places)])
+        return make_cloud(FACTORY, make_header(FACTORY, self.tenths * TENTH, "map"), points)
+
+    def show(self, *places: Place) -> dict[Place, str]:
+        """Return the id of the body at each place."""
+        self.made = dict(self.component.handle("points", self.cloud(*places)))
+        middles = {}
+        for body in self.made["bodies"].bodies:
+            pelvis = next(joint.position for joint in body.joints if joint.name == "pelvis")
+            middles[body.id] = np.array([pelvis.x, pelvis.y])
+        assert [body.id for body in self.made["bodies"].bodies] == sorted(middles, key=lambda i: (len(i), i))
+        close = {place: [i for i, m in middles.items() if np.linalg.norm(m - place) < 0.2] for place in places}
+        return {place: ids[0] for place, ids in close.items() if ids}
+
+
+def test_new_people_are_searched_one_at_a_time_and_the_others_followed(
+    person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
+) -> None:
+    stage = Stage(person, floor)
+    crowd = [(0.0, 2.0 * k - 4) for k in range(5)]
+    for seen in range(1, 6):
+        assert len(stage.show(*crowd)) == seen
+        assert len(fits) == seen
+    everybody = stage.show(*crowd)
+    assert sorted(everybody.values()) == ["b1", "b2", "b3", "b4", "b5"] and len(fits) == 5
+    moved = stage.show(*[(x + 0.1, y) for x, y in crowd])
+    assert list(moved.values()) == list(everybody.values())
+    assert stage.component.drain_warnings() == []
+
+
+def test_who_is_hidden_for_a_while_keeps_the_id_and_who_is_gone_does_not(
+    person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
+) -> None:
+    stage = Stage(person, floor, hold=0.5, mesh_rate=0.0)
+    stage.show((0, 0), (2, 0))
+    first = stage.show((0, 0), (2, 0))
+    for _ in range(3):
+        assert stage.show((2, 0)) == {(2, 0): first[2, 0]}
+        assert [marker.action for marker in stage.made["body_meshes"].markers] == [0], "hidden is not lost"
+    assert stage.show((0.1, 0), (2, 0)) == {(0.1, 0): first[0, 0], (2, 0): first[2, 0]}
+    assert len(fits) == 2, "a person who comes back is followed from the last body"
+    actions = []
+    for _ in range(6):
+        stage.show((2, 0))
+        actions += [marker.action for marker in stage.made["body_meshes"].markers]
+    assert sorted(actions) == [0, 0, 0, 0, 0, 0, 2]
+    frames = [frame.child_frame_id for frame in stage.made["/tf"].transforms]
+    assert [name for name in frames if name.startswith("body_")] == [f"body_{first[2, 0]}"]
+    assert stage.show((0.1, 0), (2, 0))[0.1, 0] == "b3"
+    stage.component.reset()
+    assert stage.show((2, 0)) == {(2, 0): "b4"}
+
+
+def test_people_who_touch_stay_two(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
+    stage = Stage(person, floor)
+    apart = [(0.0, -0.9), (0.0, 0.9)]
+    stage.show(*apart)
+    ids = list(stage.show(*apart).values())
+    for near in (0.8, 0.7, 0.6, 0.5, 0.45, 0.5, 0.6):
+        found = stage.show((0.0, -near), (0.0, near))
+        assert list(found.values()) == ids, near
+    assert len(fits) == 2
+
+
+def test_seeds_begin_ids(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
+    assert list(Stage(person, floor, seed=2).show((0, 0)).values()) == ["bc1"]
+
+
+def test_the_region_of_interest_leaves_people_out(
+    person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
+) -> None:
+    stage = Stage(person, floor, region_x_min=-1.0, region_x_max=1.0)
+    assert list(stage.show((0, 0), (2, 0))) == [(0, 0)]
+
+
+def test_in_the_background_a_search_holds_nobody_up(
+    person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage, quick, gate = Stage(person, floor), BodyFitter.fit, threading.Event()
+
+    def slow(fitter: BodyFitter, *arguments: Any, **keywords: Any) -> BodyFit:
+        assert gate.wait(60)
+        return quick(fitter, *arguments, **keywords)
+
+    monkeypatch.setattr(BodyFitter, "fit", slow)
+    stage.component.search_in_background()
+
+    def wait() -> None:
+        for thread in threading.enumerate():
+            if thread.name == "full fit":
+                thread.join(60)
+
+    gate.set()
+    assert stage.show((0, 0)) == {}, "the search runs beside"
+    wait()
+    assert stage.show((0.05, 0)) == {(0.05, 0): "b1"}
+    gate.clear()
+    for step in range(3):
+        there = (0.05 * step, 0.0)
+        assert stage.show(there, (2 + 0.1 * step, 0)) == {there: "b1"}, "the other is followed meanwhile"
+    gate.set()
+    wait()
+    # The new body has followed the person through the clouds that came while it was searched.
+    assert stage.show((0.15, 0), (2.3, 0)) == {(0.15, 0): "b1", (2.3, 0): "b2"}
+    assert len(fits) == 2
+
+
+def test_goals_fit_everybody_and_touch_no_track(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
+    stage = Stage(person, floor)
+    message, found = stage.component.fit(stage.cloud((0, 0), (2, 1)), None, seed=0)
+    assert [body.id for body in message.bodies] == ["b1", "b2"] == [identity for identity, _ in found]
+    assert stage.show((0, 0)) == {(0, 0): "b1"}
+    alone = make_cloud(FACTORY, make_header(FACTORY, 1, "map"), person[person[:, 2] > 1.2])
+    assert len(stage.component.fit(alone, None, seed=0)[1]) == 1, "a cloud of a person's size is one"
+    with pytest.raises(InputError, match="there is nobody in the cloud"):
+        stage.component.fit(stage.cloud(), None, seed=0)
+
+
+def test_clouds_that_cannot_show_people_are_one_sentence(person: np.ndarray, floor: np.ndarray) -> None:
+    stage = Stage(person, floor)
+    for points, sentence in (
+        (person * 1000 + 90_000, "beyond the reach of 30 m; check the unit"),
+        (person[:0], "no finite"),
+    ):
+        made = dict(stage.component.handle("points", make_cloud(FACTORY, make_header(FACTORY, 1, "map"), points)))
+        assert made["bodies"].bodies == []
+        (warning,) = stage.component.drain_warnings()
+        assert sentence in warning
