@@ -178,11 +178,3 @@ class ThesisLoop:
             agreed.append(np.minimum((weight[:, None] * near).sum(axis=0) / weight.sum(), 1.0))
             energies.append(float(swarm.energy[best]))
         return np.array(joints), np.array(agreed), np.array(energies)
-
-
-def median_of_three(joints: Floats) -> Floats:
-    """The median over three images of every joint (T,J,2); the ends stay (thesis, "Experiments" of video)."""
-    if len(joints) < 3:
-        return joints
-    middle = np.median(np.stack([joints[:-2], joints[1:-1], joints[2:]]), axis=0)
-    return np.concatenate([joints[:1], middle, joints[-1:]])

@@ -152,9 +152,7 @@ class FlowingPuppetTracker:
         self.people = [person for person in self.people if self._lives(person, size)]
         for person in self.people:
             person.settle(self.model)
-        hidden = hidden_joints(self.model, self.people, grid)
-        puppets = [self._puppet(person, size, covered) for person, covered in zip(self.people, hidden, strict=True)]
-        return TrackResult(puppets, pair, warnings, self.model, grid, carriage)
+        return TrackResult(self._puppets(grid), pair, warnings, self.model, grid, carriage)
 
     def redirected(self, result: TrackResult, places: Mapping[str, Mapping[int, tuple[Floats, float]]]) -> TrackResult:
         """The last result with some joints moved: by id and joint the place (2,) px and how sure it is (0 to 1)."""
@@ -163,7 +161,7 @@ class FlowingPuppetTracker:
                 person.redirect(joint, place, confidence, self.settings)
             if places.get(person.id):
                 person.settle(self.model)
-        return replace(result, puppets=[self._puppet(person, result.grid.image) for person in self.people])
+        return replace(result, puppets=self._puppets(result.grid))
 
     def _restart_if_broken(self, stamp_ns: int, size: tuple[int, int]) -> list[str]:
         previous = self._previous
@@ -236,6 +234,10 @@ class FlowingPuppetTracker:
             return False
         low, high = known.min(axis=0), known.max(axis=0)
         return not ((high < 0).any() or (low > np.array(size) - 1).any())
+
+    def _puppets(self, grid: Grid) -> list[TrackedPuppet]:
+        hidden = hidden_joints(self.model, self.people, grid)
+        return [self._puppet(one, grid.image, covered) for one, covered in zip(self.people, hidden, strict=True)]
 
     def _puppet(self, person: Person, size: tuple[int, int], hidden: NDArray[np.bool_]) -> TrackedPuppet:
         shape = person.shape

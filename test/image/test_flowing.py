@@ -11,7 +11,7 @@ import pytest
 from flowing_puppet_ros.flow.affine import transform
 from flowing_puppet_ros.image.carry import Grid
 from flowing_puppet_ros.image.flow_moments import FlowMoments
-from flowing_puppet_ros.image.flowing import LoopSettings, Start, ThesisLoop, median_of_three
+from flowing_puppet_ros.image.flowing import LoopSettings, Start, ThesisLoop
 from flowing_puppet_ros.image.flowing_energy import EnergySettings, FlowingEnergy, FrameEvidence, carried
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.pose_evidence import GivenPerson
@@ -205,10 +205,3 @@ def test_wrists_go_where_hands_are_and_arms_follow() -> None:
     assert reached.any(axis=1).all()
     trunk = [NAMES.index(name) for name in ("neck", "belly", "face")]
     np.testing.assert_allclose(after[:, trunk], np.repeat(FRONT.joints(vectors[:1], legs)[0][:, trunk], 50, axis=0))
-
-
-def test_the_median_of_three_mends_one_image() -> None:
-    joints = np.zeros((5, 2, 2))
-    joints[2] = 40.0
-    assert not median_of_three(joints).any()
-    assert median_of_three(joints[:2]) is not None
