@@ -14,7 +14,7 @@ from pathlib import Path
 import yaml
 
 from flowing_puppet_ros.cli import verb_with_parser
-from flowing_puppet_ros.node.registry import COMPONENTS, NodeSettings
+from flowing_puppet_ros.node.registry import COMPONENTS, node_settings
 
 ROOT = Path(__file__).resolve().parent.parent
 FENCE = re.compile(r"^```(bash(?: test)?|python(?: test)?)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -83,7 +83,7 @@ def _check_verb(given: list[str]) -> None:
 
 def _check_node(name: str, given: list[str]) -> None:
     component = COMPONENTS[name]
-    infos = {info.name: info for kind in (component.settings_type, NodeSettings) for info in kind.describe()}
+    infos = {info.name: info for kind in (component.settings_type, node_settings(name)) for info in kind.describe()}
     ports = {port.name for port in (*getattr(component, "inputs", ()), *component.outputs)}
     if given[:1] not in ([], ["--ros-args"], ["--help"]):
         raise WrongCommand(f"{name} takes no {given[0]!r} before --ros-args")

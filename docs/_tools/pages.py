@@ -11,10 +11,10 @@ from pathlib import Path
 import commands
 import interfaces
 
-from flowing_puppet_ros.node.registry import COMPONENTS, NodeSettings
+from flowing_puppet_ros.bag.typestore import BagMessageFactory
+from flowing_puppet_ros.node.registry import COMPONENTS, node_settings
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.component import Component, Port
-from flowing_puppet_ros.stream.visual_hull import VisualHullComponent
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PACKAGE = ROOT / "flowing_puppet_ros"
@@ -34,6 +34,8 @@ API = {
     "annotate": "The annotation tool",
     "view": "Pictures and reports",
 }
+# Settings that open every topic of a component.
+EVERYTHING = {"cameras": "CAMERA,other", "humans": True}
 QOS = {
     "sensor": "sensor data: best effort, keep last 5",
     "reliable": "reliable, keep last 10",
@@ -68,21 +70,23 @@ def node_tables() -> Iterator[tuple[str, str]]:
     """Yield the tables of topics and parameters that the nodes' pages include."""
     for name, component in COMPONENTS.items():
         inputs, outputs = ports(component)
-        yield f"nodes/{name}-inputs.md", table(["topic", "type", "QoS", ""], (port_row(port) for port in inputs))
-        yield f"nodes/{name}-outputs.md", table(["topic", "type", "QoS", ""], (port_row(port) for port in outputs))
-        yield f"nodes/{name}-parameters.md", parameter_table(component.settings_type, NodeSettings)
+        always = getattr(component, "outputs", outputs)
+        rows = [port_row(port) for port in inputs], [port_row(port, port not in always) for port in outputs]
+        for kind, lines in zip(("inputs", "outputs"), rows, strict=True):
+            yield f"nodes/{name}-{kind}.md", table(["topic", "type", "QoS", ""], lines)
+        yield f"nodes/{name}-parameters.md", parameter_table(component.settings_type, node_settings(name))
 
 
 def ports(component: type[Component]) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
-    """Return the inputs and outputs of a component; those of one camera stand for those of all."""
-    if component is not VisualHullComponent:
-        return component.inputs, component.outputs
-    made = component(component.settings_type(cameras="CAMERA,other"), None)  # type: ignore[call-arg, arg-type]
+    """Return the inputs and outputs of a component that publishes all it can; one camera stands for all."""
+    known = {info.name for info in component.settings_type.describe()}
+    settings = component.settings_type(**{name: value for name, value in EVERYTHING.items() if name in known})
+    made = component(settings, BagMessageFactory())
     return tuple(port for port in made.inputs if not port.name.startswith("other/")), made.outputs
 
 
-def port_row(port: Port) -> list[str]:
-    """Return one line of a table of topics."""
+def port_row(port: Port, humans: bool = False) -> list[str]:
+    """Return one line of a table of topics; `humans` are those that are published only on request."""
     package, _, message = port.type.split("/")
     notes = []
     if port.compressed:
@@ -91,11 +95,12 @@ def port_row(port: Port) -> list[str]:
         notes.append("optional")
     if port.lazy:
         notes.append("made only while somebody listens")
-    shown = (
-        f"[`{package}/{message}`](/generated/messages.md)"
-        if package == "flowing_puppet_msgs"
-        else f"`{package}/{message}`"
-    )
+    if humans:
+        notes.append("with `humans:=true`")
+    if port.per_person:
+        notes.append("one topic a person")
+    linked = package == "flowing_puppet_msgs"
+    shown = f"[`{package}/{message}`](/generated/messages.md)" if linked else f"`{package}/{message}`"
     return [f"`{port.name}`", shown, QOS[port.qos], ", ".join(notes)]
 
 

@@ -35,6 +35,8 @@ class Opener:
 
     def __call__(self, context: BrowserContext) -> Page:
         page = context.new_page()
+        # Where a busy machine draws in 3D without a graphics card everything takes its time.
+        page.set_default_timeout(180_000)
         page.on("pageerror", lambda error: self.errors.append(str(error)))
         page.on("console", lambda said: self.errors.append(said.text) if said.type in ("error", "warning") else None)
         page.on("request", lambda asked: self.errors.append(asked.url) if self.outside(asked.url) else None)
