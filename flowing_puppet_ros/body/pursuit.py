@@ -4,16 +4,12 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
 
 from flowing_puppet_ros.body.tracker import BodyTracker
 from flowing_puppet_ros.errors import InputError
-
-LONGEST_QUEUE = 40
-"""Clouds that wait for the fit; of more every other is left out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,38 +33,48 @@ class _Run:
     def __init__(self, number: int, tracker: BodyTracker, task: Task) -> None:
         self.number = number
         self.tracker = tracker
-        self.queue: deque[Task] = deque([task])
+        self.first = task
+        self.newest: Task | None = None
         self.lock = threading.Lock()
         self.stopped = False
         self.done = False
 
     def add(self, task: Task) -> bool:
-        """Queue the next cloud; False when the run is through."""
+        """Keep the newest cloud for when the fit is made; False when the run is through."""
         with self.lock:
             if self.done:
                 return False
-            self.queue.append(task)
-            if len(self.queue) > LONGEST_QUEUE:
-                self.queue = deque(list(self.queue)[::-2][::-1])
+            self.newest = task
             return True
 
     def run(self) -> None:
-        """Fit the first cloud, follow the others; `done` once nothing waits."""
-        first = True
-        while True:
+        """Fit the first cloud that can be, then follow to the newest, from where whoever takes the body goes on.
+
+        A stream may be faster than the tracker, so to follow every cloud might never come to an end.
+        """
+        fitted = self._took(self.first, search=True)
+        while not self.stopped:
             with self.lock:
-                if not self.queue or self.stopped:
-                    self.done = True
-                    return
-                task = self.queue.popleft()
-            try:
-                self._take(task, first)
-            except _Stopped:
-                self.stopped = True
-            except InputError:
-                pass  # the next cloud may do
-            else:
-                first = False
+                task, self.newest = self.newest, None
+                self.done = task is None
+            if task is None:
+                return
+            followed = self._took(task, search=not fitted)
+            if fitted:
+                self.done = True
+                return
+            fitted = followed
+        self.done = True
+
+    def _took(self, task: Task, search: bool) -> bool:
+        """Whether this cloud could be used."""
+        try:
+            self._take(task, search)
+        except _Stopped:
+            self.stopped = True
+        except InputError:
+            return False  # the next cloud may do
+        return not self.stopped
 
     def _take(self, task: Task, search: bool) -> None:
         if search:
