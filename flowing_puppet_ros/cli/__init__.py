@@ -29,7 +29,7 @@ VERBS = {
 def verb_with_parser(verb: str, arguments: list[str]) -> tuple[ModuleType, argparse.ArgumentParser, list[str]]:
     """Return the module of a verb, its parser, and what of its arguments is left to parse.
 
-    A module may name in `SUBVERBS` the modules of optional sub-verbs: a first argument that is one of these leads there.
+    A module may name in `SUBVERBS` the modules of optional sub-verbs: a first argument that is one leads there.
     """
     module, name = import_module(f"flowing_puppet_ros.cli.{verb}"), verb
     subverbs = getattr(module, "SUBVERBS", {})

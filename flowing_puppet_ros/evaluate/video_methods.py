@@ -138,7 +138,7 @@ def _keypoints(run: ClipRun, video: VideoTracker, frame: Frame) -> Sequence[Keyp
 def _steps(
     run: ClipRun, still: bool = False, whole: bool = True
 ) -> Iterator[tuple[TrackResult, dict[str, Sight] | None]]:
-    """Step through the clip; `still` tells the tracker that nothing moves, `whole` searches the clip for people first."""
+    """Step through the clip; `still`: nothing is said to move; `whole`: it is searched for people first."""
     video, tracker = run.video(), run.tracker()
     paths = video.search(frame.image for frame in run.frames) if whole and run.given is None else None
     for frame in run.frames:

@@ -26,9 +26,9 @@ class PathSettings(Settings):
     """How the hypotheses of an arm are joined over time."""
 
     modes: int = setting(8, "hypotheses of an arm that the detector gives", low=1, high=100)
-    detector_weight: float = setting(2.5, "weight of the detector's score of elbow and wrist", low=0.0, high=100.0)
-    evidence_weight: float = setting(1.0, "weight of contour and colour", low=0.0, high=100.0)
-    flow_strength: float = setting(8.0, "cost of a step that leaves the flow by a shoulder width", low=0.0, high=1e4)
+    detector_weight: float = setting(8.0, "weight of the detector's score of elbow and wrist", low=0.0, high=100.0)
+    evidence_weight: float = setting(0.5, "weight of contour and colour", low=0.0, high=100.0)
+    flow_strength: float = setting(60.0, "cost of a step that leaves the flow by a shoulder width", low=0.0, high=1e4)
     longest_step: float = setting(1.0, "distance from the flow, in shoulder widths, beyond which a step costs no more",
                                   low=0.01, high=100.0)  # fmt: skip
 
@@ -51,7 +51,7 @@ def best_path(arms: Sequence[ArmHypotheses], width: float, settings: PathSetting
 
     The path of least cost goes through the least of each image. `width` is the shoulder width in pixels.
     """
-    steps = [_step_costs(a, b, width, settings) for a, b in pairwise(arms)]
+    steps = [step_costs(a, b, width, settings) for a, b in pairwise(arms)]
     forward = [-arms[0].score]
     for arm, step in zip(arms[1:], steps, strict=True):
         forward.append((forward[-1][:, None] + step).min(axis=0) - arm.score)
@@ -61,7 +61,7 @@ def best_path(arms: Sequence[ArmHypotheses], width: float, settings: PathSetting
     return [there + back for there, back in zip(forward, backward[::-1], strict=True)]
 
 
-def _step_costs(before: ArmHypotheses, after: ArmHypotheses, width: float, settings: PathSettings) -> Floats:
+def step_costs(before: ArmHypotheses, after: ArmHypotheses, width: float, settings: PathSettings) -> Floats:
     """Costs (K, K') of the steps between the hypotheses of two images."""
     expected = before.places + before.motion
     distance = np.linalg.norm(expected[:, None] - after.places[None], axis=3) @ (JOINT_SHARE / JOINT_SHARE.sum())

@@ -8,13 +8,13 @@ decided at the end of the clip, by `arm_path`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.flow.estimate import FlowPair
-from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_path
+from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_path, step_costs
 from flowing_puppet_ros.image.carry import Grid
 from flowing_puppet_ros.image.detector_person import PersonDetection
 from flowing_puppet_ros.image.pose_evidence import Window
@@ -126,18 +126,59 @@ class ArmHistory:
         return {side: _resolved(arms, width, self.settings) for side, arms in self._arms.items() if arms}
 
 
+@dataclass(slots=True, eq=False)
+class ArmFilter:
+    """The arms of one person live: of every hypothesis the cost of the best path that leads there, nothing older."""
+
+    settings: PathSettings
+    _arms: dict[str, ArmHypotheses] = field(default_factory=dict)
+
+    def step(self, sight: Sight, flow: FlowPair | None, grid: Grid, width: float) -> dict[str, tuple[Floats, float]]:
+        """Elbow and wrist (2, 2) px of each arm in the next image, and how sure they are (0 to 1).
+
+        `flow` (forward, backward) leads to this image from the one before, on the working grid; `width` is the shoulder
+        width in px.
+        """
+        return {side: self._side(side, sight, flow, grid, width) for side in SIDES}
+
+    def carry(self, flow: FlowPair | None, grid: Grid) -> None:
+        """Go on to an image in which nobody looks; `flow` as in `step`."""
+        if flow is not None:
+            for side, arm in self._arms.items():
+                self._arms[side] = replace(arm, places=arm.places + _motion(flow, grid, arm.places))
+
+    def _side(self, side: str, sight: Sight, flow: FlowPair | None, grid: Grid, width: float) -> tuple[Floats, float]:
+        before, places = self._arms.get(side), sight.hypotheses(side, self.settings.modes)
+        if before is not None and flow is not None:
+            before = replace(before, motion=_motion(flow, grid, before.places))
+            places = np.concatenate([places, _best(before)])
+        score = sight.judged(side, places, self.settings)
+        if before is not None and flow is not None:
+            now = ArmHypotheses(places, score, np.zeros_like(places))
+            score = score + (before.score[:, None] - step_costs(before, now, width, self.settings)).max(axis=0)
+        arm = ArmHypotheses(places, score - score.max(), np.zeros_like(places))
+        self._arms[side] = arm
+        best, sure = _surest(arm, -arm.score, width)
+        return arm.places[best], sure
+
+
 def _resolved(arms: Sequence[ArmHypotheses], width: float, settings: PathSettings) -> ResolvedArm:
     places, motion, sure = [], [], []
     for arm, cost in zip(arms, best_path(arms, width, settings), strict=True):
-        best = int(cost.argmin())
-        weight = np.exp((cost[best] - cost) / DOUBT)
-        near = np.linalg.norm(arm.places[:, 1] - arm.places[best, 1], axis=1) < NEAR * width
-        # Hypotheses in one place are one: of each place the best counts.
-        other = weight[~near].max(initial=0.0)
+        best, certainty = _surest(arm, cost, width)
         places.append(arm.places[best])
         motion.append(arm.motion[best])
-        sure.append(1.0 / (1.0 + other))
+        sure.append(certainty)
     return ResolvedArm(np.array(places), np.array(motion), np.array(sure))
+
+
+def _surest(arm: ArmHypotheses, cost: Floats, width: float) -> tuple[int, float]:
+    """The hypothesis of least cost (K,), and how sure it is (0 to 1)."""
+    best = int(cost.argmin())
+    weight = np.exp((cost[best] - cost) / DOUBT)
+    near = np.linalg.norm(arm.places[:, 1] - arm.places[best, 1], axis=1) < NEAR * width
+    # Hypotheses in one place are one: of each place the best counts.
+    return best, 1.0 / (1.0 + float(weight[~near].max(initial=0.0)))
 
 
 def _best(arm: ArmHypotheses) -> Floats:

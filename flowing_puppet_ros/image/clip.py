@@ -16,12 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.image.arm_path import PathSettings
-from flowing_puppet_ros.image.arms import ENDS, SIDES, ArmHistory, Sight
+from flowing_puppet_ros.image.arms import ENDS, ArmHistory, Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings, joint_motion, smoothed
 from flowing_puppet_ros.image.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds import DeformableStructures
 
 type Floats = NDArray[np.float64]
+
+DETECTOR_TRUST = 1 / 16
+"""Weight of a joint of our detector against one of given keypoints: it errs more, and the flow must hold against it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -85,6 +88,7 @@ class Clip:
         motion, trust = np.array([m.motion for m in track[1:]]), np.array([m.trust for m in track[1:]])
         if identity in self._arms:
             self._resolve_arms(self._arms[identity], detected, motion, scale)
+            detected[..., 2] *= DETECTOR_TRUST
         confidence = np.where(np.isfinite(detected).all(axis=2), detected[..., 2], 0.0)
         if len(track) < 2 or not (confidence > 0).any():
             return start
@@ -97,10 +101,7 @@ class Clip:
 
     def _resolve_arms(self, arms: ArmHistory, detected: Floats, motion: Floats, scale: float) -> None:
         """Put the arms of the best path into the detected joints (T, J, 3) and their motion (T-1, J, 2)."""
-        mean = self.model.mean_joints()
-        ends = [self.model.joint_names.index(f"{side}_shoulder") for side in SIDES]
-        width = scale * float(np.linalg.norm(mean[ends[0]] - mean[ends[1]]))
-        for side, arm in arms.resolved(width).items():
+        for side, arm in arms.resolved(scale * self.model.shoulder_width).items():
             for k, name in enumerate(ENDS):
                 joint = self.model.joint_names.index(f"{side}_{name}")
                 detected[:, joint, :2] = arm.places[:, k]

@@ -21,7 +21,9 @@ type Floats = NDArray[np.float64]
 
 MOVE, FASTEST = 3.0, 1.2  # cost of a move by S from look to look, and the farthest that anybody moves
 GROW = 2.0  # cost of an octave of change in scale
-LONGEST_GAP = 4  # looks from one place of a path to the next
+LONGEST_GAP = 12  # looks from one place of a path to the next
+SUPPOSED = 15  # looks before and after a path through which the person is supposed to stand where it begins and ends
+LOSS = 1.5  # score that a pose may lack where a person is only supposed to be, in units of the margin
 ABSENT = 0.5  # cost of a look in which a person is missed
 SURE, LEAST_ODDS = 4.0, -3.5  # log-odds above which a place counts no more, and from which it counts
 SPAN = 15  # looks before and after one over which the scale is averaged
@@ -35,16 +37,21 @@ class PersonPath:
     step: int
 
     def at(self, image: int) -> Place | None:
-        """The place in an image, between two looks the mean of both; None where the person is not there."""
+        """The place in an image; between two looks the mean of both, and for some time before and after all of them.
+
+        Where no look found the person nearby, the place is only supposed. None long before and after.
+        """
         numbers = np.array(list(self.places))
-        if not numbers[0] - self.step < image < numbers[-1] + self.step:
+        reach = SUPPOSED * self.step
+        if not numbers[0] - reach <= image <= numbers[-1] + reach:
             return None
         inside = int(np.clip(image, numbers[0], numbers[-1]))
         after = int(np.searchsorted(numbers, inside))
-        if numbers[after] == inside:
-            return self.places[inside]
-        low, high = int(numbers[after - 1]), int(numbers[after])
-        return self.places[low].mixed(self.places[high], (inside - low) / (high - low))
+        low, high = int(numbers[max(after - 1, 0)]), int(numbers[after])
+        share = 1.0 if low == high else (inside - low) / (high - low)
+        place = self.places[low].mixed(self.places[high], share)
+        away = min(abs(image - number) for number in (low, high))
+        return place if away < self.step else replace(place, least=place.score - LOSS)
 
 
 @dataclass(slots=True, eq=False)
@@ -79,14 +86,15 @@ class ClipPeople:
 
 
 def _steady(path: Sequence[Place], log_odds: float) -> list[Place]:
-    """The same places with the scale that most looks around agree on, all as sure as the whole path is."""
+    """The same places with the scale that most looks around agree on, as sure as the whole path and of its score."""
     logs = np.log([place.scale for place in path])
+    score = float(np.median([place.score for place in path]))
     weight = np.exp(np.minimum([place.log_odds for place in path], 0.0))
     steady = []
     for k, place in enumerate(path):
         around = slice(max(0, k - SPAN), k + SPAN + 1)
         scale = float(np.exp(_weighted_median(logs[around], weight[around])))
-        steady.append(replace(place.resized(scale), log_odds=log_odds))
+        steady.append(replace(place.resized(scale), log_odds=log_odds, score=score))
     return steady
 
 

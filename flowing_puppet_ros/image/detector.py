@@ -18,12 +18,15 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.colour import ColourImage, SkinColour
+from flowing_puppet_ros.evidence.region import RegionMap
 from flowing_puppet_ros.image.detector_forest import Forest
 from flowing_puppet_ros.image.detector_parts import PARTS, PartFilters, Window, window_at
 from flowing_puppet_ros.image.detector_person import FoundPose, PersonDetection, Place
 from flowing_puppet_ros.image.detector_rank import SAME_PLACE, Ranking, agreed_scale, apart, best_places
 from flowing_puppet_ros.image.detector_root import Candidate, RootFilters, resize
 from flowing_puppet_ros.image.detector_search import choose, propose
+from flowing_puppet_ros.image.detector_skin import skin_measures
 from flowing_puppet_ros.image.detector_tree import PartTree, best_placement, upward
 from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.settings import Settings, setting
@@ -57,6 +60,7 @@ class PartDetector:
     root: RootFilters
     forest: Forest
     parts: PartFilters
+    skin: SkinColour
     ranking: Ranking
 
     @classmethod
@@ -73,7 +77,8 @@ class PartDetector:
         parents, first = (np.asarray(arrays[name], np.int64) for name in ("parents", "first"))
         tree = PartTree(parents, first, single["anchor"], single["spring"], single["type_bias"])
         rank = Ranking(*(np.asarray(arrays[name], np.float64) for name in ("rank_weight", "rank_scale", "rank_odds")))
-        return cls(root, forest, PartFilters(single["part_filters"], tree), rank)
+        skin = SkinColour(np.asarray(arrays["skin"], np.float64))
+        return cls(root, forest, PartFilters(single["part_filters"], tree), skin, rank)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """Arrays for an .npz file; filters in half precision."""
@@ -91,6 +96,7 @@ class PartDetector:
             "anchor": tree.anchor,
             "spring": tree.spring,
             "type_bias": tree.bias,
+            "skin": self.skin.log_ratio.astype(np.float32),
             "rank_weight": self.ranking.weight,
             "rank_scale": self.ranking.scale,
             "rank_odds": self.ranking.odds,
@@ -117,13 +123,13 @@ class PartDetector:
         for pose, score in zip(poses, scores, strict=True):
             neck, face = ((pose.points[PARTS.index(name)] + 0.5) / factor - 0.5 for name in ("neck", "face"))
             scale = self.ranking.corrected_scale(pose, pose.scale) / factor
-            found.append(Place(neck, face, scale, self.ranking.log_odds(float(score))))
+            found.append(Place(neck, face, scale, self.ranking.log_odds(float(score)), pose.score))
         return found
 
     def at(
         self, image: NDArray[np.uint8], places: Sequence[Place], settings: DetectorSettings = DEFAULTS
     ) -> list[PersonDetection]:
-        """The best pose at each of some places of an image, in their order; none where the image is too small."""
+        """The best poses at some places of an image, in their order, without those that nobody is seen at."""
         small, factor = _shrunk(image, settings)
         if small is None:
             return []
@@ -132,8 +138,10 @@ class PartDetector:
             for place in places:
                 neck, face = ((at + 0.5) * factor - 0.5 for at in (place.neck, place.face))
                 window = window_at(small, (neck[0], neck[1]), (face[0], face[1]), place.scale * factor)
-                confidence = 1 / (1 + float(np.exp(-place.log_odds)))
-                found.append(PersonDetection(self.parts, self.pose_in(window, np.zeros(0)), confidence, factor))
+                pose = self.pose_in(window, np.zeros(0))
+                if pose.score >= place.least:
+                    confidence = 1 / (1 + float(np.exp(-place.log_odds)))
+                    found.append(PersonDetection(self.parts, pose, confidence, factor))
         return found
 
     def _people(
@@ -159,15 +167,17 @@ class PartDetector:
     def look(self, image: NDArray[np.uint8], smallest: float, places: int) -> list[FoundPose]:
         """The best pose in each of the most promising places, in no order of quality."""
         chosen = choose(propose(image, self.root, smallest), self.forest, places)
-        return [self.pose_at(image, candidate, look) for candidate, look in chosen]
+        skin = self.skin.map(ColourImage.of(image))
+        return [self.pose_at(image, skin, candidate, look) for candidate, look in chosen]
 
-    def pose_at(self, image: NDArray[np.uint8], candidate: Candidate, look: float) -> FoundPose:
-        """The best pose around a candidate to which the trees gave the score `look`."""
+    def pose_at(self, image: NDArray[np.uint8], skin: RegionMap, candidate: Candidate, look: float) -> FoundPose:
+        """The best pose around a candidate to which the trees gave the score `look`; `skin` is the image's map."""
         window = window_at(image, candidate.neck, candidate.face, candidate.scale)
         relative = np.log(candidate.scale / max(image.shape[:2]))
         pose = self.pose_in(window, np.zeros(0))
-        layer, x, y = pose.placement[0]
-        measures = np.array([candidate.score, look, relative, pose.beliefs.up[layer, y, x], window.outside])
+        known = [candidate.score, look, relative, pose.score, window.outside]
+        neck, face = (pose.points[PARTS.index(name)] for name in ("neck", "face"))
+        measures = np.concatenate([known, skin_measures(skin, neck, face, candidate.scale)])
         return FoundPose(window, pose.beliefs, pose.placement, measures)
 
     def pose_in(self, window: Window, measures: Doubles) -> FoundPose:

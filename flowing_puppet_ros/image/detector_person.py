@@ -27,7 +27,7 @@ NEAR = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoundPose:
-    """The best placement (P, 3) in a window, the upward beliefs, and the measures (5,) of how sure it is."""
+    """The best placement (P, 3) in a window, the upward beliefs, and the MEASURES of how sure it is."""
 
     window: Window
     beliefs: Beliefs
@@ -40,6 +40,12 @@ class FoundPose:
         return CELLS_PER_SCALE * self.window.cell
 
     @property
+    def score(self) -> float:
+        """Score of the pose in its window, in units of the margin."""
+        layer, x, y = self.placement[0]
+        return float(self.beliefs.up[layer, y, x])
+
+    @property
     def points(self) -> Doubles:
         """The parts (P, 2) px of the image that was looked at."""
         return self.window.points_of(self.placement[:, 1:].astype(np.float64))
@@ -47,12 +53,18 @@ class FoundPose:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Place:
-    """Where a person may stand: `neck` and `face` (2,) px of the given image, scale S in px, log-odds that one does."""
+    """Where a person may stand: `neck` and `face` (2,) px of the given image, scale S in px, log-odds that one does.
+
+    `score` is the pose's that was found there. Of a place that is only supposed, `least` is the score that a pose must
+    have there for anybody to be seen.
+    """
 
     neck: Doubles
     face: Doubles
     scale: float
     log_odds: float
+    score: float = 0.0
+    least: float = -np.inf
 
     def apart(self, other: Place) -> float:
         """Distance of the necks in units of the larger S."""
@@ -65,8 +77,7 @@ class Place:
     def mixed(self, other: Place, share: float) -> Place:
         """A place between two: 0 this one, 1 the other."""
         neck, face = ((1 - share) * a + share * b for a, b in ((self.neck, other.neck), (self.face, other.face)))
-        scale = self.scale ** (1 - share) * other.scale**share
-        return Place(neck, face, scale, (1 - share) * self.log_odds + share * other.log_odds)
+        return replace(self, neck=neck, face=face, scale=self.scale ** (1 - share) * other.scale**share)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,7 @@ from flowing_puppet_ros.image.detector_person import FoundPose
 
 type Doubles = NDArray[np.float64]
 
+MEASURES = 8  # of a pose: root filter, trees, relative scale, pose, share outside of the image, and three of skin
 SAME_PLACE = 0.5  # units of S between necks of which only the better is kept
 SAME_HEAD = 0.35  # units of S between necks of poses that tell the scale of one person together
 
@@ -22,7 +23,7 @@ SAME_HEAD = 0.35  # units of S between necks of poses that tell the scale of one
 class Ranking:
     """What was learned from poses on images that the filters had not seen.
 
-    `weight` (5,) of the measures of a pose gives its score; `scale` (4,) the logarithm of the correction of S from
+    `weight` (MEASURES,) of a pose's measures gives its score; `scale` (4,) the logarithm of the correction of S from
     those of three lengths and 1; `odds` (2,) slope and offset of the log-odds that a pose is right, from its score.
     """
 

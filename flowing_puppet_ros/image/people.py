@@ -19,6 +19,7 @@ CONFIDENT_DEVIATION = 0.1  # m; confidence halves at this standard deviation
 VIEW_VOTES = 5.0  # the view's evidence saturates here ...
 VIEW_TURNS = 3.0  # ... and must reach this on the other side to turn the puppet round
 SCALE_GAIN = 0.1  # share of the new scale estimate taken at each detection
+ELSEWHERE = 0.06  # m; a joint that is known to be farther off than this is moved at once
 
 
 @dataclass(frozen=True)
@@ -125,6 +126,16 @@ class Person:
             self.view = "front"
         elif self.votes <= -VIEW_TURNS:
             self.view = "back"
+
+    def redirect(self, joint: int, place: Floats, confidence: float, settings: TrackerSettings) -> None:
+        """Move a joint to where it is known to be, (2,) px, unless it is about there already."""
+        if float(np.hypot(*(place - self.mean[joint]))) <= ELSEWHERE * self.scale:
+            return
+        self.mean[joint] = place
+        self.variance[joint] = float(detection_variance(np.array(confidence), self.scale, settings))
+        self.quality[joint] = confidence
+        self.age[joint] = self.doubts[joint] = 0
+        self.doubted[joint] = np.nan
 
     def fuse(self, joints: Floats, confidence: Floats, settings: TrackerSettings) -> None:
         """Fuse detected joints (J, 2), NaN unknown: precision-weighted means, behind a gate with patience.

@@ -104,7 +104,6 @@ class PoseEstimator:
             found = self._detector.detect(np.ascontiguousarray(image))
             return [one for turn, one in enumerate(found) if turn == 0 or one.confidence >= self._settings.others]
         model = self._front[0]
-        width = np.ptp(model.mean_joints()[[model.joint_names.index(f"{s}_shoulder") for s in ("left", "right")], 0])
         people: list[Found] = []
         for one in keypoints:
             placed = replace(one, xy=(one.xy + 0.5) * factor - 0.5)
@@ -115,7 +114,7 @@ class PoseEstimator:
                 scale = model.estimate_scale(joints, confidence)
             except InputError:
                 continue
-            people.append(GivenPerson(Keypoints(model.joint_names, joints, confidence), width * scale))
+            people.append(GivenPerson(Keypoints(model.joint_names, joints, confidence), model.shoulder_width * scale))
         return people
 
     def _pose(self, image: Array, found: Found, index: int, factor: float) -> PosedPuppet | None:

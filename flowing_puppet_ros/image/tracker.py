@@ -7,8 +7,8 @@ state of a person is the location of the joints, a scale and a view; the puppet 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,6 +147,15 @@ class FlowingPuppetTracker:
             person.settle(self.model)
         puppets = [self._puppet(person, size) for person in self.people]
         return TrackResult(puppets, pair, warnings, self.model, grid, carriage)
+
+    def redirected(self, result: TrackResult, places: Mapping[str, Mapping[int, tuple[Floats, float]]]) -> TrackResult:
+        """The last result with some joints moved: by id and joint the place (2,) px and how sure it is (0 to 1)."""
+        for person in self.people:
+            for joint, (place, confidence) in places.get(person.id, {}).items():
+                person.redirect(joint, place, confidence, self.settings)
+            if places.get(person.id):
+                person.settle(self.model)
+        return replace(result, puppets=[self._puppet(person, result.grid.image) for person in self.people])
 
     def _restart_if_broken(self, stamp_ns: int, size: tuple[int, int]) -> list[str]:
         previous = self._previous

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import contextlib
+from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -14,7 +15,8 @@ from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowPair
-from flowing_puppet_ros.image.arms import Sight
+from flowing_puppet_ros.image.arm_path import PathSettings
+from flowing_puppet_ros.image.arms import ENDS, ArmFilter, Sight
 from flowing_puppet_ros.image.clip_people import ClipPeople, PersonPath
 from flowing_puppet_ros.image.detector import DetectorSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
@@ -22,15 +24,22 @@ from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.settings import Settings, setting
 
+SURE_SIZES, SIZES = 3, 9
+"""Searches that must have found a person before only their place is looked at; those whose median tells the size."""
+LEAST_ODDS = 1e-6
+
 
 @dataclass(frozen=True)
 class DetectionSettings(Settings):
     """When the detector looks at an image of a video."""
 
-    detect_every: int = setting(1, "images from one run of the detector to the next", low=1, high=10000)
+    detect_every: int = setting(1, "images from one look of the detector to the next", low=1, high=10000)
     least_person: float = setting(0.3, "probability from which a detected person is tracked", low=0.0, high=1.0)
     search_every: int = setting(
         2, "images from one search for people to the next where a whole clip is known", low=1, high=10000
+    )
+    renew_every: int = setting(
+        10, "images from one search for people to the next while some are tracked live", low=1, high=10000
     )
 
 
@@ -58,7 +67,10 @@ class VideoTracker:
     detector: Detector
     likelihood: Likelihood
     settings: DetectionSettings
+    path: PathSettings = field(default_factory=PathSettings)
     images: int = 0
+    _sizes: dict[str, deque[tuple[float, float]]] = field(default_factory=dict)
+    _arms: dict[str, ArmFilter] = field(default_factory=dict)
 
     def step(
         self,
@@ -74,13 +86,79 @@ class VideoTracker:
         """
         number = self.images
         self.images += 1
-        look = paths is not None or number % self.settings.detect_every == 0
-        if paths is None:
-            found = self.detect(image) if look else []
-        else:
+        if paths is not None:
             found = self.detector.at(image, [place for path in paths if (place := path.at(number)) is not None])
-        keypoints = [person.keypoints for person in found] if look else None
-        return self.tracker.step(image, stamp_ns, keypoints, flow), found
+            return self._tracked(image, stamp_ns, flow, found), found
+        if number % self.settings.detect_every:
+            result = self._tracked(image, stamp_ns, flow, None)
+            for arms in self._arms.values():
+                arms.carry(result.flow, result.grid)
+            return result, []
+        places = self._known_places()
+        search = places is None or number % self.settings.renew_every == 0
+        found = self.detect(image) if search or places is None else self.detector.at(image, places)
+        result = self._with_arms(self._tracked(image, stamp_ns, flow, found), image, found)
+        if search:
+            self._learn_sizes(result, found)
+        return result, found
+
+    def _tracked(
+        self,
+        image: NDArray[np.uint8],
+        stamp_ns: int,
+        flow: FlowPair | None,
+        found: Sequence[PersonDetection] | None,
+    ) -> TrackResult:
+        keypoints = None if found is None else [person.keypoints for person in found]
+        return self.tracker.step(image, stamp_ns, keypoints, flow)
+
+    def _with_arms(
+        self, result: TrackResult, image: NDArray[np.uint8], found: Sequence[PersonDetection]
+    ) -> TrackResult:
+        """The result of a live step with the arms where the best paths of their hypotheses lead."""
+        model = self.tracker.model
+        sights = self.sights(image, result, found)
+        self._arms = {identity: self._arms.get(identity, ArmFilter(self.path)) for identity in sights}
+        places: dict[str, dict[int, tuple[NDArray[np.float64], float]]] = {}
+        for puppet in result.puppets:
+            arms = self._arms[puppet.id].step(
+                sights[puppet.id], result.flow, result.grid, puppet.scale * model.shoulder_width
+            )
+            places[puppet.id] = {
+                model.joint_names.index(f"{side}_{name}"): (ends[k], sure)
+                for side, (ends, sure) in arms.items()
+                for k, name in enumerate(ENDS)
+            }
+        return self.tracker.redirected(result, places)
+
+    def _known_places(self) -> list[Place] | None:
+        """Where the tracked people stand; None when nobody, or somebody too new, is tracked."""
+        places = []
+        names = self.tracker.model.joint_names
+        for person in self.tracker.people:
+            sizes = self._sizes.get(person.id, ())
+            if len(sizes) < SURE_SIZES:
+                return None
+            neck, face = (person.mean[names.index(name)] for name in ("neck", "face"))
+            scale, log_odds = np.median(np.array(sizes), axis=0)
+            places.append(Place(neck, face, float(np.exp(scale)), float(log_odds)))
+        return places or None
+
+    def _learn_sizes(self, result: TrackResult, found: Sequence[PersonDetection]) -> None:
+        """Remember how large the people of a step were found to be, and how surely; forget those who are gone.
+
+        Whom a search does not find loses one memory, and with the last of them the look at the place alone.
+        """
+        kept = {puppet.id: self._sizes.get(puppet.id, deque(maxlen=SIZES)) for puppet in result.puppets}
+        for puppet in result.puppets:
+            sizes = kept[puppet.id]
+            if puppet.detection is not None:
+                person = found[puppet.detection]
+                odds = np.clip(person.confidence, LEAST_ODDS, 1 - LEAST_ODDS)
+                sizes.append((float(np.log(person.scale)), float(np.log(odds / (1 - odds)))))
+            elif sizes:
+                sizes.popleft()
+        self._sizes = kept
 
     def search(self, images: Iterable[NDArray[np.uint8]]) -> list[PersonPath]:
         """Look for the people of a whole clip before it is tracked; images that cannot be used are passed over."""

@@ -5,14 +5,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.image.detector import PartDetector
-from flowing_puppet_ros.image.detector_rank import Ranking
+from flowing_puppet_ros.image.detector_rank import MEASURES, Ranking
 from flowing_puppet_ros.learn.detector_data import Example
 from flowing_puppet_ros.learn.detector_forest import learn_forest
 from flowing_puppet_ros.learn.detector_parts import learn_parts
@@ -23,7 +24,7 @@ from flowing_puppet_ros.settings import Settings, setting
 type Array = np.ndarray[Any, Any]
 
 PLACES = 12
-RANKED = 60  # held-out people, about, that the ranking is learned on
+RANKED = 220  # held-out people, about, that the ranking is learned on
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +61,10 @@ def learn(examples: Sequence[Example], settings: LearnDetectorSettings, report: 
     root = learn_root(kept, settings.seed, report)
     forest = learn_forest(kept, root, settings.trees, settings.seed + 1, report)
     parts = learn_parts(kept, settings.steps, settings.seed + 2, report)
-    detector = PartDetector(root, forest, parts, Ranking(np.zeros(5), np.zeros(4), np.zeros(2)))
+    skin = PartLikelihood.load().skin
+    detector = PartDetector(root, forest, parts, skin, Ranking(np.zeros(MEASURES), np.zeros(4), np.zeros(2)))
     ranking, found = rank(detector, others)
-    return Learned(PartDetector(root, forest, parts, ranking), len(kept), len(others), found)
+    return Learned(replace(detector, ranking=ranking), len(kept), len(others), found)
 
 
 def rank(detector: PartDetector, examples: Sequence[Example]) -> tuple[Ranking, float]:

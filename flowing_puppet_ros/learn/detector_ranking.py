@@ -64,7 +64,7 @@ def _right(example: Example, pose: FoundPose, scale: float) -> bool:
 
 
 def _conditional_logit(found: Sequence[tuple[Example, list[FoundPose]]]) -> Array:
-    """Weights (5,) under which softmax over an image's poses agrees best with how well they fit the person."""
+    """Weights (MEASURES,) under which softmax over an image's poses agrees best with how well they fit the person."""
     measures = [np.stack([pose.measures for pose in poses]) for _, poses in found]
     every = np.concatenate(measures)
     mean, deviation = every.mean(axis=0), np.maximum(every.std(axis=0), 1e-9)

@@ -207,6 +207,12 @@ class DeformableStructures:
             log_scale = (weight * ratio).sum() / weight.sum()
         return float(np.exp(log_scale))
 
+    @property
+    def shoulder_width(self) -> float:
+        """Distance of the shoulders of the mean puppet, in metres."""
+        right, left = (self.mean_joints()[self.joint_names.index(f"{side}_shoulder")] for side in ("right", "left"))
+        return float(np.linalg.norm(right - left))
+
     def estimate_view(self, joints: Array, confidence: Array) -> View:
         """Which side the camera sees: "front" when the person's left shoulder and hip are on the right of the image."""
         joints, known = self._checked(joints), self._known(joints, confidence)

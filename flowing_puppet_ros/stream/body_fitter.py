@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowing_puppet_ros.body.crowd import CrowdSettings
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.frames import axis_of, upright
-from flowing_puppet_ros.body.people import ExtractionSettings
 from flowing_puppet_ros.body.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -33,7 +31,7 @@ from flowing_puppet_ros.stream.component import (
 from flowing_puppet_ros.stream.depth import DepthPairs, depth_cloud
 from flowing_puppet_ros.stream.messages import MessageFactory, stamp_ns
 from flowing_puppet_ros.stream.people import Joint, joints_of, make_bodies, make_body
-from flowing_puppet_ros.stream.scenes import RegionSettings, ScenePeople, View, within
+from flowing_puppet_ros.stream.scenes import ScenePeople, SceneSettings, View, within
 from flowing_puppet_ros.stream.silhouettes import SilhouetteBodies
 from flowing_puppet_ros.stream.waiting import Line, Shelf
 
@@ -42,20 +40,12 @@ OPTICAL = re.compile(r"optical(_frame)?$")
 
 
 @dataclass(frozen=True)
-class BodyFitterSettings(
-    FitterSettings, SilhouetteFitterSettings, CrowdSettings, ExtractionSettings, RegionSettings, BodyOutputSettings
-):
+class BodyFitterSettings(SceneSettings, SilhouetteFitterSettings, BodyOutputSettings):
     """Settings of the fits, and of what the component reads, waits for and publishes."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     up: str = setting("auto", "axis of the cloud's frame that points up; auto: -y in frames named *optical or"
                               " *optical_frame, else z", choices=("auto", "z", "y", "-y"))  # fmt: skip
-    view: str = setting("auto", "people are seen from all sides (full) or from one sensor at the frame's origin"
-                                " (single); auto: as their first points look",
-                        choices=("auto", "full", "single"))  # fmt: skip
-    track: bool = setting(True, "follow people through the clouds that come without initial joints")
-    scene: bool = setting(True, "find the people among floor, walls and furniture in clouds that come without initial"
-                                " joints; off: all of a cloud is one person")  # fmt: skip
     wait: int = setting(1, "newer clouds that may come before a cloud goes on without its initial joints",
                         low=0, high=50)  # fmt: skip
 
@@ -77,7 +67,7 @@ class BodyFitterComponent(Component):
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),
     )
-    outputs = BodyOutputs.ports
+    outputs: tuple[Port, ...] = BodyOutputs.ports
 
     def __init__(self, settings: BodyFitterSettings, factory: MessageFactory) -> None:
         """Load the body model."""
@@ -213,8 +203,8 @@ class BodyFitterComponent(Component):
         self.counters["bodies"] += len(fits)
         counted, errors = self._people.drain()
         self.counters.update(counted)
-        for error in errors:
-            self._unusable(error)
+        for reason in errors:
+            self._unusable(reason)
         return self._outputs.make(cloud.header, fits, held, self._wanted)
 
     def _fit_silhouettes(self, message: Any) -> Output:

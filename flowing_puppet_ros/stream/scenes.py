@@ -5,21 +5,17 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from flowing_puppet_ros.body.crowd import Crowd
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
-from flowing_puppet_ros.body.people import PersonCloud, extract_people
+from flowing_puppet_ros.body.crowd import Crowd, CrowdSettings
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
+from flowing_puppet_ros.body.people import ExtractionSettings, PersonCloud, extract_people
 from flowing_puppet_ros.body.planes import PlaneMemory
 from flowing_puppet_ros.body.viewpoint import one_sided
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
-
-if TYPE_CHECKING:
-    from flowing_puppet_ros.stream.body_fitter import BodyFitterSettings
 
 _FAR = 10_000.0
 TALLEST = 2.6
@@ -38,6 +34,18 @@ class RegionSettings(Settings):
     region_y_max: float = setting(_FAR, "largest y of points that are used", unit="m", low=-_FAR, high=_FAR)
     region_z_min: float = setting(-_FAR, "least z of points that are used", unit="m", low=-_FAR, high=_FAR)
     region_z_max: float = setting(_FAR, "largest z of points that are used", unit="m", low=-_FAR, high=_FAR)
+
+
+@dataclass(frozen=True)
+class SceneSettings(FitterSettings, CrowdSettings, ExtractionSettings, RegionSettings):
+    """How people are found in clouds, fitted and followed."""
+
+    view: str = setting("auto", "people are seen from all sides (full) or from one sensor at the frame's origin"
+                                " (single); auto: as their first points look",
+                        choices=("auto", "full", "single"))  # fmt: skip
+    track: bool = setting(True, "follow people through the clouds that come without initial joints")
+    scene: bool = setting(True, "find the people among floor, walls and furniture in clouds that come without initial"
+                                " joints; off: all of a cloud is one person")  # fmt: skip
 
 
 def within(points: NDArray[np.float64], region: RegionSettings) -> NDArray[np.bool_]:
@@ -60,7 +68,7 @@ class View:
 class ScenePeople:
     """Finds the people in clouds and fits a body to each: tracked, or every cloud for itself."""
 
-    def __init__(self, fitter: BodyFitter, settings: BodyFitterSettings, background: bool = False) -> None:
+    def __init__(self, fitter: BodyFitter, settings: SceneSettings, background: bool = False) -> None:
         """Fit with `fitter`; `background` is what `Crowd` says of it."""
         self._fitter = fitter
         self._settings = settings
@@ -121,10 +129,10 @@ class ScenePeople:
         ]
 
     def _check(self, view: View) -> None:
-        distance = np.linalg.norm(view.points, axis=1)
-        if not len(distance):
+        if not len(view.points):
             raise InputError("the cloud has no finite point in the region of interest")
-        if distance.min() > self._settings.reach:
+        distance = np.linalg.norm(view.points, axis=1)
+        if self._sensor() is not None and distance.min() > self._settings.reach:
             raise InputError(
                 f"the nearest point of the cloud is {distance.min():.3g} m from the origin of its frame, beyond the"
                 f" reach of {self._settings.reach:g} m; check the unit, or widen reach"

@@ -59,6 +59,10 @@ class CapsuleModel:
     part_joints = tuple(tuple(list(MEAN).index(joint) for joint in joints) for joints in PARTS.values())
     bone = np.array([joints[:2] for joints in part_joints])
 
+    @property
+    def shoulder_width(self) -> float:
+        return float(np.ptp(self.mean_joints()[[NAMES.index("left_shoulder"), NAMES.index("right_shoulder")], 0]))
+
     def mean_joints(self) -> Floats:
         """The upright person of `MEAN`."""
         return np.array(list(MEAN.values()))

@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_path
-from flowing_puppet_ros.image.arms import ArmHistory, Sight
+from flowing_puppet_ros.image.arms import CARRIED, ArmFilter, ArmHistory, Sight
 from flowing_puppet_ros.image.carry import Grid
 from flowing_puppet_ros.image.clip import Clip
+from flowing_puppet_ros.image.detector_person import Place
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.video_tracker import DetectionSettings, VideoTracker
@@ -57,6 +58,7 @@ class Guesser:
     guesses: dict[str, np.ndarray]
     scores: np.ndarray
     confidence: float = 0.9
+    scale: float = 50.0
 
     @property
     def keypoints(self) -> Keypoints:
@@ -126,9 +128,18 @@ class Finder:
     """A detector that finds the walking person of `pose`, and every third time takes the left arm for another."""
 
     def __init__(self) -> None:
-        self.images = 0
+        self.images = self.searches = 0
 
     def detect(self, image: np.ndarray, settings: Any) -> list[Guesser]:
+        self.searches += 1
+        return self.found()
+
+    def at(self, image: np.ndarray, places: list[Place]) -> list[Guesser]:
+        neck = pose(self.images)[NAMES.index("neck")]
+        assert len(places) == 1 and np.linalg.norm(places[0].neck - neck) < 20
+        return self.found()
+
+    def found(self) -> list[Guesser]:
         truth = pose(self.images)
         rows = {side: [NAMES.index(f"{side}_{name}") for name in ("elbow", "wrist")] for side in ("left", "right")}
         right = truth[rows["right"]][None]
@@ -182,3 +193,55 @@ def test_between_runs_of_the_detector_people_are_carried() -> None:
         assert [puppet.id for puppet in result.puppets] == ["a1"] == list(sights)
         assert (sights["a1"].detection is None) == (t % 4 > 0)
     assert finder.images == 2
+
+
+def test_live_arms_follow_the_guesses_that_move_with_the_person() -> None:
+    finder = Finder()
+    video = VideoTracker(tracker(), finder, NoEvidence(), DetectionSettings())  # type: ignore[arg-type]
+    wrist = NAMES.index("left_wrist")
+    for t in range(9):
+        result, _ = video.step(draw(pose(t)), t)
+        assert np.linalg.norm(result.puppets[0].joints[wrist] - pose(t)[wrist]) < 8, t
+
+
+def test_live_only_the_place_of_a_known_person_is_looked_at_between_searches() -> None:
+    finder = Finder()
+    settings = DetectionSettings(renew_every=5)
+    video = VideoTracker(tracker(), finder, NoEvidence(), settings)  # type: ignore[arg-type]
+    searches = []
+    for t in range(11):
+        video.step(draw(pose(t)), t)
+        searches.append(finder.searches)
+    assert searches == [1, 2, 3, 3, 3, 4, 4, 4, 4, 4, 5]
+
+
+def test_a_filter_agrees_with_the_best_path_that_ends_now() -> None:
+    joints = np.full((15, 2), 20.0)
+    rng = np.random.default_rng(3)
+    arms = ArmFilter(SETTINGS)
+    history: list[ArmHypotheses] = []
+    for t in range(5):
+        guesses = rng.uniform(10, 40, (3, 2, 2))
+        person = sight(Guesser(joints, {"left": guesses, "right": guesses}, rng.normal(0, 0.3, 3)), joints)
+        found, sure = arms.step(person, still() if t else None, GRID, 40.0)["left"]
+        if t:
+            before = np.argsort(best_path(history, 40.0, SETTINGS)[-1], kind="stable")[:CARRIED]
+            guesses = np.concatenate([guesses, history[-1].places[before]])
+        history.append(ArmHypotheses(guesses, person.judged("left", guesses, SETTINGS), np.zeros_like(guesses)))
+        cost = best_path(history, 40.0, SETTINGS)[-1]
+        np.testing.assert_allclose(found, guesses[cost.argmin()])
+        assert 0.0 < sure <= 1.0
+
+
+def test_a_filter_is_carried_through_images_without_a_look() -> None:
+    joints, forth = np.full((15, 2), 20.0), np.full((48, 64, 2), (3.0, 0.0), np.float32)
+    start = np.array([[20.0, 20.0], [24.0, 28.0]])
+    arms = ArmFilter(SETTINGS)
+    for t in (0, 2):
+        guesses = np.array([start + np.array([3.0 * t, 0.0]), start + np.array([0.0, 15.0])])
+        scores = np.array([0.0, -0.1]) if t == 0 else np.array([-0.2, 0.0])
+        person = sight(Guesser(joints, {"left": guesses, "right": guesses}, scores), joints)
+        found, _ = arms.step(person, (forth, -forth) if t else None, GRID, 40.0)["right"]
+        if t == 0:
+            arms.carry((forth, -forth), GRID)
+    np.testing.assert_allclose(found, start + np.array([6.0, 0.0]), atol=1e-5)

@@ -31,9 +31,12 @@ VERSION = "cyclonedds==11.0.1"
 DOMAIN = 77
 # The ROS wheels leave these two in their children; with them another environment's Python would load their libraries.
 FOREIGN = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
+# Discovery as ROS does it on one machine: no multicast, the ports of the first participants on the loopback.
 LOOPBACK = (
-    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo' multicast='true'/></Interfaces>"
-    "<AllowMulticast>true</AllowMulticast></General></Domain></CycloneDDS>"
+    "<CycloneDDS><Domain><General><Interfaces><NetworkInterface name='lo'/></Interfaces>"
+    "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
+    "<MaxAutoParticipantIndex>32</MaxAutoParticipantIndex><Peers><Peer address='127.0.0.1'/></Peers></Discovery>"
+    "</Domain></CycloneDDS>"
 )
 
 

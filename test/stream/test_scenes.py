@@ -184,13 +184,11 @@ def test_goals_fit_everybody_and_touch_no_track(person: np.ndarray, floor: np.nd
         stage.component.fit(stage.cloud(), None, seed=0)
 
 
-def test_clouds_that_cannot_show_people_are_one_sentence(person: np.ndarray, floor: np.ndarray) -> None:
-    stage = Stage(person, floor)
-    for points, sentence in (
-        (person * 1000 + 90_000, "beyond the reach of 30 m; check the unit"),
-        (person[:0], "no finite"),
-    ):
-        made = dict(stage.component.handle("points", make_cloud(FACTORY, make_header(FACTORY, 1, "map"), points)))
+def test_clouds_that_cannot_show_people_are_one_sentence(person: np.ndarray) -> None:
+    component = BodyFitterComponent(BodyFitterSettings(), FACTORY)
+    millimetres = person * 1000 + 3000
+    for points, sentence in ((millimetres, "beyond the reach of 30 m; check the unit"), (person[:0], "no finite")):
+        made = dict(component.handle("points", make_cloud(FACTORY, make_header(FACTORY, 1, "map"), points)))
         assert made["bodies"].bodies == []
-        (warning,) = stage.component.drain_warnings()
+        (warning,) = component.drain_warnings()
         assert sentence in warning
