@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 # make venv   set everything up in .venv          make test   linter, type checker and tests
 # make demo   sample bag -> replay -> report      make lint   linter and type checker alone
-# make bench  speed as ratios taken in one run, and two minutes of live nodes
+# make bench  speed as ratios, and live nodes     make docs   the documentation site, into out/site
+# make coverage, make release-check, make figures, make config, make lock: see CONTRIBUTING.md
 
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
@@ -9,7 +10,7 @@ SAMPLE := bags/cache/sample
 # The two variables that the ROS wheels leave in their children would keep another environment's Python from starting.
 CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE
 
-.PHONY: venv demo sample-bag test lint bench config lock clean
+.PHONY: venv demo sample-bag test coverage lint bench docs figures config lock release-check clean
 
 venv:
 	@python=$$(sh scripts/find_python.sh) && $(CLEAN_ENV) "$$python" -I scripts/make_venv.py
@@ -29,6 +30,20 @@ lint: venv
 test: lint
 	@$(PYTHON) scripts/ensure_browser.py
 	@$(CLEAN_ENV) $(PYTHON) -m pytest
+
+# Coverage sees no line of a compiled kernel run: those are covered where their tests are, not in the table.
+coverage: venv
+	@$(CLEAN_ENV) $(PYTHON) -m pytest --cov=flowing_puppet_ros --cov-report=term:skip-covered --cov-report=html:out/coverage
+
+docs: venv
+	@$(CLEAN_ENV) $(PYTHON) -m sphinx --quiet --fail-on-warning --keep-going --jobs auto -b html docs out/site
+	@echo "The site is out/site/index.html."
+
+figures: venv
+	@$(PYTHON) docs/_tools/figures.py
+
+release-check: venv
+	@$(PYTHON) scripts/release_check.py
 
 bench: venv
 	@$(CLEAN_ENV) .venv/bin/flowing-puppet bench

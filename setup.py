@@ -35,6 +35,7 @@ setup(
         NAME: [
             "py.typed",
             "annotate/page/*",
+            "view/web/*",
             "weights/*.npz",
             "weights/*.md",
             "interfaces/*/*/*.msg",
@@ -45,11 +46,15 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", files("launch/*.launch.py")),
-        (f"share/{NAME}/config", files("config/*.yaml")),
+        (f"share/{NAME}/config", files("config/*.*")),
     ],
     python_requires=">=3.12",
     install_requires=requirements("runtime"),
-    extras_require={"learn": requirements("learn") + requirements("learn-assets")},
+    extras_require={
+        "learn": requirements("learn") + requirements("learn-assets"),
+        "cluster": requirements("cluster"),
+        "rerun": requirements("rerun"),
+    },
     entry_points={
         "console_scripts": [
             "flowing-puppet = flowing_puppet_ros.cli:main",

@@ -14,9 +14,8 @@ HEADER = """# SPDX-License-Identifier: Apache-2.0
 
 def main() -> None:
     """Ask pip what it would install into an empty environment and write that down."""
-    lists = [
-        part for name in ("runtime", "learn", "dev", "build", "ros") for part in ("-r", str(FOLDER / f"{name}.txt"))
-    ]
+    names = ("runtime", "learn", "cluster", "dev", "docs", "build", "ros")
+    lists = [part for name in names for part in ("-r", str(FOLDER / f"{name}.txt"))]
     command = [sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", "--ignore-installed", "--report", "-"]
     report = json.loads(subprocess.run([*command, *lists], check=True, capture_output=True, text=True).stdout)
     pins = sorted(f"{item['metadata']['name'].lower()}=={item['metadata']['version']}" for item in report["install"])

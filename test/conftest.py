@@ -3,7 +3,7 @@
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import pytest
 from playwright.sync_api import Browser, sync_playwright
@@ -23,13 +23,34 @@ BROWSER_FLAGS = (
 )
 
 
+# Drawn in 3D by the processor, since a test machine may have no graphics card.
+DRAWING_FLAGS = (
+    *(flag for flag in BROWSER_FLAGS if flag != "--disable-gpu"),
+    *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
+)
+
+
 @pytest.fixture(scope="session")
-def browser() -> Iterator[Browser]:
-    """Return a headless Chromium."""
+def chromium() -> Iterator[Callable[[Sequence[str]], Browser]]:
+    """Return what starts a headless Chromium with some flags."""
     program = next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
         pytest.skip("no Chromium on this machine")
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=program, args=list(BROWSER_FLAGS))
-        yield chromium
-        chromium.close()
+        yield lambda flags: playwright.chromium.launch(executable_path=program, args=list(flags))
+
+
+@pytest.fixture(scope="session")
+def browser(chromium: Callable[[Sequence[str]], Browser]) -> Iterator[Browser]:
+    """Return a headless Chromium."""
+    started = chromium(BROWSER_FLAGS)
+    yield started
+    started.close()
+
+
+@pytest.fixture(scope="session")
+def drawing_browser(chromium: Callable[[Sequence[str]], Browser]) -> Iterator[Browser]:
+    """Return a headless Chromium that has WebGL."""
+    started = chromium(DRAWING_FLAGS)
+    yield started
+    started.close()

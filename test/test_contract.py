@@ -19,6 +19,9 @@ NAME = PACKAGE.name
 MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
 FOUNDATION = {"errors", "settings"}
+OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "rerun"}
+OPTIONAL = {"learn": "learn", "cli.cluster": "cluster", "view.rerun_file": "rerun"}
+"""Where what a requirements file other than runtime.txt lists may be imported."""
 BELOW_STREAM = {"model", "evidence", "inference", "flow", "image", "body"}
 MAY_IMPORT = {
     "model": set(),
@@ -82,14 +85,14 @@ def test_no_import_cycles() -> None:
 
 
 def test_all_but_node_imports_without_ros() -> None:
-    """Every other module imports where rclpy, the message packages and what only `learn` needs are absent."""
+    """Every other module imports where rclpy, the message packages and what is optional are absent."""
     names = [module_name(path) for path in MODULES if subpackage(module_name(path)) not in ("node", "__main__")]
     code = f"""
 import importlib, sys
 class Absent:
     def find_spec(self, name, path=None, target=None):
         top = name.split(".")[0]
-        if top in {sorted(ROS_PACKAGES | {"anny", "body_models"})} or top.endswith("_msgs") and name == top:
+        if top in {sorted(ROS_PACKAGES | OPTIONAL_PACKAGES)} or top.endswith("_msgs") and name == top:
             raise ModuleNotFoundError(f"{{name}} is absent in this test", name=name)
 sys.meta_path.insert(0, Absent())
 for name in {names}:
@@ -100,19 +103,21 @@ for name in {names}:
 
 
 def test_third_party_imports_are_required() -> None:
-    """What the package imports stands in requirements/runtime.txt, or in learn.txt where only `learn` imports it."""
-    distributions = importlib.metadata.packages_distributions()
+    """What the package imports stands in requirements/runtime.txt, or in another file where only a part imports it."""
+    distributions = {"rerun": ["rerun-sdk"]} | dict(importlib.metadata.packages_distributions())
     listed = {
         name: {
             re.split(r"[=<>\[]", line)[0].lower()
             for line in (ROOT / "requirements" / f"{name}.txt").read_text().splitlines()
             if not line.startswith("#")
         }
-        for name in ("runtime", "learn")
+        for name in ("runtime", *OPTIONAL.values())
     }
     for path in MODULES:
         own = subpackage(module_name(path))
-        allowed = listed["runtime"] | (listed["learn"] if own == "learn" else set())
+        dotted = module_name(path).removeprefix(f"{NAME}.")
+        optional = next((name for place, name in OPTIONAL.items() if f"{dotted}.".startswith(f"{place}.")), "runtime")
+        allowed = listed["runtime"] | listed[optional]
         for top in {name.split(".")[0] for name in imports(path)} - set(sys.stdlib_module_names) - {NAME}:
             if own == "node" and (top in ROS_PACKAGES or top.endswith("_msgs")):
                 continue
@@ -123,7 +128,7 @@ def test_third_party_imports_are_required() -> None:
 def test_locked_versions_cover_the_requirements() -> None:
     folder = ROOT / "requirements"
     locked = {line.split("==")[0] for line in (folder / "lock.txt").read_text().splitlines()}
-    for name in ("runtime", "learn", "dev", "build", "ros"):
+    for name in ("runtime", "learn", "cluster", "dev", "docs", "build", "ros"):
         for line in (folder / f"{name}.txt").read_text().splitlines():
             if not line.startswith("#"):
                 assert re.split(r"[=<>\[]", line)[0].lower().replace("_", "-") in {

@@ -11,6 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Protocol, Self
 
+from mcap.reader import make_reader
 from rosbags.interfaces import Qos
 from rosbags.rosbag2 import Reader
 from ruamel.yaml import YAML
@@ -184,6 +185,17 @@ class Bag:
         """Yield the messages of `topics` (all by default) in the order of their log times."""
         chosen = set(self.details if topics is None else topics)
         yield from heapq.merge(*(part.messages(chosen) for part in self._parts), key=lambda record: record.log_time)
+
+    def note(self, name: str) -> dict[str, str]:
+        """The texts that `BagWriter.note` put into the file's metadata under this name; empty without any."""
+        path = next(iter(sorted(self.path.glob("*.mcap"))), self.path) if self.path.is_dir() else self.path
+        if path.suffix != ".mcap":
+            return {}
+        try:
+            with path.open("rb") as stream:
+                return next((m.metadata for m in make_reader(stream).iter_metadata() if m.name == name), {})
+        except Exception:  # a damaged file fails in the library in any way; its messages may be whole
+            return {}
 
     @property
     def count(self) -> int:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
 from collections import deque
@@ -14,6 +15,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from flowing_puppet_ros import __version__
 from flowing_puppet_ros.bag.graph import Instance, build_graph, info_topics
 from flowing_puppet_ros.bag.reader import Bag, Record, open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
@@ -24,6 +26,8 @@ from flowing_puppet_ros.stream.images import compress
 from flowing_puppet_ros.stream.messages import FrameTree
 
 STATIC = "/tf_static"
+NOTE = "flowing_puppet_ros"
+"""Name of the output bag's metadata whose "replay" is JSON of the version, settings and counters of the replay."""
 _CARRIED = (CAMERA_INFO, PUPPETS, TRANSFORMS)
 """Types of input topics that go into the output bag too, so that a viewer needs no other bag for frames and cameras."""
 _COMPONENTS = ("optical_flow", "puppet_tracker", "visual_hull", "body_fitter")
@@ -60,6 +64,7 @@ def replay(source: Path, target: Path, options: ReplayOptions | None = None) -> 
         run = _Replay(bag, options)
         with BagWriter(target) as writer:
             run.write_to(writer)
+            writer.note(NOTE, {"replay": json.dumps(run.record())})
             counts = writer.counts
     return run.summary(source, target, time.perf_counter() - begin, counts)
 
@@ -211,6 +216,18 @@ class _Replay:
         elif port.name not in _TOO_LARGE:
             writer.write(topic, log_time, message)
 
+    def record(self) -> dict[str, Any]:
+        """Return what made the results and what was counted, which the same input and options make the same."""
+        instances = self._graph.instances
+        return {
+            "version": __version__,
+            "seed": self._options.seed,
+            "topic_map": dict(self._options.topic_map),
+            "settings": {instance.name: _values(instance) for instance in instances},
+            "counters": {instance.name: dict(sorted(instance.component.counters.items())) for instance in instances},
+            "warnings": self.warnings,
+        }
+
     def summary(self, source: Path, target: Path, seconds: float, counts: Mapping[str, int]) -> dict[str, Any]:
         """Return what happened, for people and for JSON."""
         instances = self._graph.instances
@@ -222,12 +239,9 @@ class _Replay:
             "bodies": sum(instance.component.counters["bodies"] for instance in instances),
             "seconds": round(seconds, 2),
             "frames_per_second": round(frames / seconds, 2),
-            "seed": self._options.seed,
             "seconds_of": {instance.name: round(instance.seconds, 2) for instance in instances},
-            "counters": {instance.name: dict(sorted(instance.component.counters.items())) for instance in instances},
             "messages": dict(counts),
-            "settings": {instance.name: _values(instance) for instance in instances},
-            "warnings": self.warnings,
+            **self.record(),
         }
 
 

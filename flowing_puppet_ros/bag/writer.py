@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -110,6 +110,10 @@ class BagWriter:
         self._counts[topic] = count + 1
         self._first = log_time if self._first is None else min(self._first, log_time)
         self._last = max(self._last, log_time)
+
+    def note(self, name: str, values: Mapping[str, str]) -> None:
+        """Put texts by name into the file's metadata, which says how the bag was made."""
+        self._writer.add_metadata(name, dict(values))
 
     @property
     def counts(self) -> dict[str, int]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -70,11 +71,11 @@ class Crowd:
     `counters` counts tracked people, searches and lost people, `errors` collects why people could not be used.
 
     In line (the default) the full fit is made in the cloud that needs it, at most one a cloud: the same clouds give
-    the same bodies. In the background it runs on a thread of its own, and catches up with the clouds that came in the
-    meantime before its body is shown: what a live node needs.
+    the same bodies. On the executor `background` it runs beside the clouds, and catches up with those that came in the
+    meantime before its body is shown: what a live node needs. Which cloud shows it first depends on the time it took.
     """
 
-    def __init__(self, fitter: BodyFitter, settings: CrowdSettings, seed: int, background: bool = False) -> None:
+    def __init__(self, fitter: BodyFitter, settings: CrowdSettings, seed: int) -> None:
         """Fit with `fitter`; the first ids begin with b, and with more letters for seeds above 0."""
         self._fitter = fitter
         self._settings = settings
@@ -82,7 +83,7 @@ class Crowd:
         self._prefix = "b" + (letters(seed) if seed else "")
         self._started = 0
         self._members: list[_Member] = []
-        self._pursuit = Pursuit(background)
+        self._pursuit = Pursuit()
         self.counters: Counter[str] = Counter()
         self.errors: list[InputError] = []
         self._stamp: int | None = None
@@ -107,7 +108,12 @@ class Crowd:
         return found
 
     def step(
-        self, people: Sequence[PersonCloud], stamp: int, viewpoint: np.ndarray | None, seed: int
+        self,
+        people: Sequence[PersonCloud],
+        stamp: int,
+        viewpoint: np.ndarray | None,
+        seed: int,
+        background: Executor | None = None,
     ) -> list[tuple[str, BodyFit]]:
         """Track everybody to the people of the next cloud.
 
@@ -116,6 +122,7 @@ class Crowd:
             stamp: nanoseconds; one before the last starts anew.
             viewpoint: (3,) where the sensor stood when the cloud shows one side only.
             seed: of what is random in this cloud.
+            background: where full fits run; None: in line.
 
         Returns:
             (id, fit) of everybody who is seen and has a body.
@@ -144,16 +151,21 @@ class Crowd:
                 wanting.append((member, task))
         self.counters["tracked people"] += len(fits)
         self._forget(stamp)
-        fits += self._search(wanting)
+        fits += self._search(wanting, background)
         return sorted(fits, key=lambda pair: (len(pair[0]), pair[0]))
 
     def step_one(
-        self, person: PersonCloud, stamp: int, viewpoint: np.ndarray | None, seed: int
+        self,
+        person: PersonCloud,
+        stamp: int,
+        viewpoint: np.ndarray | None,
+        seed: int,
+        background: Executor | None = None,
     ) -> list[tuple[str, BodyFit]]:
         """As `step`, for clouds that all show one and the same person, wherever they are."""
         for member in self._members:
             member.middle, member.velocity = np.median(person.points, axis=0), np.zeros(3)
-        return self.step([person], stamp, viewpoint, seed)
+        return self.step([person], stamp, viewpoint, seed, background)
 
     def named(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[str, PersonCloud]]:
         """Say who the people of the next cloud are, without tracking their bodies."""
@@ -164,7 +176,7 @@ class Crowd:
         self._forget(stamp)
         return named
 
-    def _search(self, wanting: list[tuple[_Member, Task]]) -> list[tuple[str, BodyFit]]:
+    def _search(self, wanting: list[tuple[_Member, Task]], background: Executor | None) -> list[tuple[str, BodyFit]]:
         """Start a full fit of the person who needs it most; in line it is finished when this returns."""
         if not wanting or self._pursuit.busy:
             return []
@@ -175,7 +187,7 @@ class Crowd:
         member.searches += 1
         self.counters["searches"] += 1
         known = member.tracker.last
-        self._pursuit.start(member.number, member.tracker.fork(), task)
+        self._pursuit.start(member.number, member.tracker.fork(), task, background)
         self._collect()
         fit = member.tracker.last
         return [(member.id, fit)] if known is None and fit is not None else []

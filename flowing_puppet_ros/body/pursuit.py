@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A full fit of one person that catches up with the clouds that came while it ran, in line or on a thread."""
+"""A full fit of one person that catches up with the clouds that came while it ran, in line or beside them."""
 
 from __future__ import annotations
 
 import threading
 from collections import deque
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,7 @@ class _Run:
         self.lock = threading.Lock()
         self.stopped = False
         self.done = False
+        self.problem: Exception | None = None
 
     def add(self, task: Task) -> bool:
         """Queue the next cloud; False when the run is through."""
@@ -53,7 +55,14 @@ class _Run:
             return True
 
     def run(self) -> None:
-        """Fit the first cloud, follow the others; `done` once nothing waits."""
+        """Fit the first cloud, follow the others; `done` once nothing waits, or a `problem` has ended it."""
+        try:
+            self._run()
+        except Exception as error:
+            with self.lock:
+                self.problem, self.done = error, True
+
+    def _run(self) -> None:
         first = True
         while True:
             with self.lock:
@@ -84,9 +93,8 @@ class _Run:
 class Pursuit:
     """At most one run at a time."""
 
-    def __init__(self, background: bool) -> None:
-        """Run in line, or on a thread."""
-        self._background = background
+    def __init__(self) -> None:
+        """Start with none."""
         self._run: _Run | None = None
 
     @property
@@ -94,27 +102,29 @@ class Pursuit:
         """Whether a run goes on, or its result was not taken yet."""
         return self._run is not None
 
-    def start(self, number: int, tracker: BodyTracker, task: Task) -> None:
-        """Fit the person `number` by `tracker`, which belongs to the run from now on."""
+    def start(self, number: int, tracker: BodyTracker, task: Task, background: Executor | None) -> None:
+        """Fit the person `number` by `tracker`, which belongs to the run from now on, on `background` or in line."""
         self._run = _Run(number, tracker, task)
-        if self._background:
-            threading.Thread(target=self._run.run, name="full fit", daemon=True).start()
-        else:
+        if background is None:
             self._run.run()
+        else:
+            background.submit(self._run.run)
 
     def add(self, number: int, task: Task) -> bool:
         """Hand the run its person's next cloud; False when it is not about this person."""
         return self._run is not None and self._run.number == number and self._run.add(task)
 
     def finished(self) -> tuple[int, BodyTracker] | None:
-        """Return the person and the tracker of a run that is through, once."""
+        """Return the person and the tracker of a run that is through, once; raises what went wrong in it."""
         if self._run is None or not self._run.done:
             return None
         run, self._run = self._run, None
+        if run.problem is not None:
+            raise run.problem
         return run.number, run.tracker
 
     def stop(self) -> None:
-        """Give up the run; its thread ends at its next step."""
+        """Give up the run; it ends at its next step."""
         if self._run is not None:
             self._run.stopped = True
             self._run = None

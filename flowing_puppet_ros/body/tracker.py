@@ -17,7 +17,8 @@ from threadpoolctl import threadpool_limits
 from flowing_puppet_ros.body.correspondence import Cloud
 from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress, checked_cloud
-from flowing_puppet_ros.body.normals import thinned
+from flowing_puppet_ros.body.geometry import vertex_normals
+from flowing_puppet_ros.body.normals import estimated_normals, thinned
 from flowing_puppet_ros.body.refine import Refiner, RefineWeights
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
@@ -70,6 +71,7 @@ class BodyTracker:
         self._last: _Seen | None = None
         self._best = np.inf
         self._frames = 0
+        self._turned = False
         self.lost = True
 
     @property
@@ -138,11 +140,16 @@ class BodyTracker:
             points, normals = thinned(points, normals, self._settings.track_points)
         if self._last is not None and stamp <= self._last.stamp:
             self.reset()
+        self._turned = normals is None and viewpoint is None and self._last is not None
+        if self._turned and self._last is not None:
+            vertices = self._fitter.model.vertices(self._predicted(self._last, points.mean(axis=0), stamp))
+            normals = estimated_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
         return self._fitter.cloud(points, normals, viewpoint)
 
     def _followed(self, cloud: Cloud, stamp: int) -> BodyFit | None:
         """The last body after a few steps on the new cloud, and whether it is lost."""
-        fit = None if self._last is None else self._tracked(self._predicted(self._last, cloud, stamp), cloud)
+        middle = cloud.points.mean(axis=0)
+        fit = None if self._last is None else self._tracked(self._predicted(self._last, middle, stamp), cloud)
         self.lost = fit is None or self._is_lost(fit)
         return fit
 
@@ -166,7 +173,9 @@ class BodyTracker:
     def _searched(self, tracked: BodyFit | None, cloud: Cloud, seed: int | None, progress: Progress | None) -> BodyFit:
         """The full fit, unless the tracked body is closer to the cloud; its distance is the new measure of lost."""
         self.counters["searched"] += 1
-        found = self._fitter.fit(cloud.points, cloud.normals, viewpoint=cloud.viewpoint, seed=seed, progress=progress)
+        # Normals that were turned by a body that is lost would mislead the search.
+        normals = None if self._turned else cloud.normals
+        found = self._fitter.fit(cloud.points, normals, viewpoint=cloud.viewpoint, seed=seed, progress=progress)
         # Without the surface of its own that a full fit may have, or it would come and go with the searches.
         fit = self._fitter.result(found.state, cloud)
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
@@ -176,14 +185,14 @@ class BodyTracker:
         self._best = fit.two_way_distance
         return fit
 
-    def _predicted(self, last: _Seen, cloud: Cloud, stamp: int) -> BodyState:
+    def _predicted(self, last: _Seen, middle: np.ndarray, stamp: int) -> BodyState:
         """The last body, moved on by its last motion in proportion to the time.
 
         After a long gap, which a search leaves in a live stream too, it moves as the middle of the cloud did.
         """
         state = last.fit.state
         if stamp - last.stamp > 1e9 * self._settings.track_longest_gap:
-            return replace(state, center=state.center + cloud.points.mean(axis=0) - last.middle)
+            return replace(state, center=state.center + middle - last.middle)
         if self._before is None:
             return state
         share = min((stamp - last.stamp) / (last.stamp - self._before.stamp), MOST_STRETCH)

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure speed: ratios of the 3D fit taken in one run, and with `live` the nodes over DDS."""
+"""Measure speed as ratios taken in one run: look-ups, steps, search, growth, tracking, whole fits, images, replay.
+
+`bench peers` compares with what people use today, and the part `live` runs the nodes over DDS.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from flowing_puppet_ros.evaluate import bench_live
 from flowing_puppet_ros.evaluate.bench import Bench
 from flowing_puppet_ros.evaluate.tables import text_table
 
+SUBVERBS = {"peers": "bench_peers"}
 PARTS = {
     "look-ups": Bench.look_ups,
     "steps": Bench.steps,
@@ -19,6 +23,8 @@ PARTS = {
     "growth": Bench.growth,
     "tracking": Bench.tracking,
     "fits": Bench.fits,
+    "images": Bench.images,
+    "replay": Bench.replay,
 }
 LIVE = "live"
 LEAST_SECONDS = 5.0

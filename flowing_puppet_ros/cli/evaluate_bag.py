@@ -1,32 +1,68 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`flowing-puppet evaluate bag`: the bodies of a replay against true joints, or against triangulated detections."""
+"""Output bags against true people: MPJPE, vertex to surface, ids, latency, drops; several runs stand side by side."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
+import numpy as np
+
 from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.evaluate.bag_truth import measured, read_truth
-from flowing_puppet_ros.evaluate.tables import json_text, text_table, write_json
+from flowing_puppet_ros.evaluate.bag_figures import BagFigures, measured
+from flowing_puppet_ros.evaluate.bag_truth import People, read_truth
+from flowing_puppet_ros.evaluate.output import Chart, Line, Outcome, run_names
+from flowing_puppet_ros.evaluate.output import add_arguments as add_output
+
+LIMITS_CM = np.linspace(0, 20, 201)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flowing-puppet evaluate bag`."""
-    parser.add_argument("output", type=Path, metavar="OUT.mcap", help="the bag that the replay wrote")
-    parser.add_argument("--input", type=Path, required=True, metavar="IN.mcap", help="the bag that was replayed")
-    parser.add_argument("--truth", type=Path, metavar="JSON", help="true joints by stamp [triangulated detections]")
-    parser.add_argument("--out", type=Path, metavar="JSON", help="file for the figures, of each joint too")
-    parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
+    parser.add_argument("outputs", nargs="+", type=Path, metavar="OUT.mcap", help="bag with the results of a run")
+    parser.add_argument(
+        "--input", type=Path, metavar="IN.mcap", help="bag that was replayed [the outputs hold their inputs, too]"
+    )
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        metavar="FILE",
+        help="true joints by stamp (JSON), or a bag with true bodies [joints triangulated from the detections]",
+    )
+    add_output(parser, "bag")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print the figures in metres and return the exit status."""
+    """Measure every run, print the figures and return the exit status."""
     truth = None if arguments.truth is None else read_truth(arguments.truth)
-    with open_bag(arguments.input, salvage=True) as given, open_bag(arguments.output, salvage=True) as made:
-        errors, figures = measured(given, made, truth)
-    joints = {name: one.summary() for name, one in errors.per_joint().items() if one.known.size}
-    if arguments.out is not None:
-        write_json(arguments.out, {"summary": figures, "joints": joints})
-    print(json_text(figures) if arguments.json else text_table([{k.replace(" ", "_"): v for k, v in figures.items()}]))
+    names = run_names(arguments.outputs)
+    runs = {
+        name: _measured(arguments.input or path, path, truth)
+        for name, path in zip(names, arguments.outputs, strict=True)
+    }
+    details = {
+        "joints, m": {
+            name: {joint: one.summary() for joint, one in found.errors.per_joint().items() if one.known.size}
+            for name, found in runs.items()
+        }
+    }
+    Outcome("bag", {name: found.figures for name, found in runs.items()}, details, _charts(runs)).give(arguments)
     return 0
+
+
+def _measured(given: Path, made: Path, truth: People | None) -> BagFigures:
+    with open_bag(given, salvage=True) as input_bag, open_bag(made, salvage=True) as output_bag:
+        return measured(input_bag, output_bag, truth)
+
+
+def _charts(runs: dict[str, BagFigures]) -> list[Chart]:
+    known = {name: found for name, found in runs.items() if found.errors.known.size}
+    within = [
+        Line(name, LIMITS_CM, 100 * (100 * found.errors.known[:, None] <= LIMITS_CM).mean(axis=0))
+        for name, found in known.items()
+    ]
+    over_time = [Line(name, found.seconds, 100 * found.errors.per_frame()) for name, found in known.items()]
+    return [
+        Chart("accuracy", "Joints of the bodies", "threshold, cm", "joints within, %", within, y_limits=(0, 100)),
+        Chart("time", "Joints of the bodies", "time, s", "mean error, cm", over_time),
+    ]

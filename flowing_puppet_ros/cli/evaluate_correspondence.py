@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`flowing-puppet evaluate correspondence`: scans mapped to each other through their fits, where the truth is known."""
+"""Scans mapped to each other through their fits, where the truth is known; several sets of fits stand side by side.
+
+The protocol of FAUST: every vertex of a scan goes to the model and on to another scan, of the same person (intra) and
+of other people (inter), and its distance from its true place there is the error.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -20,87 +26,101 @@ from flowing_puppet_ros.evaluate.correspondence import (
     scan_pairs,
     summary,
 )
-from flowing_puppet_ros.evaluate.tables import json_text, text_table, write_csv, write_json
-from flowing_puppet_ros.settings import make_out_folder
-from flowing_puppet_ros.view.page import page, paragraph, table
-from flowing_puppet_ros.view.plots import Series, line_plot
+from flowing_puppet_ros.evaluate.output import Chart, Figures, Line, Outcome, run_names
+from flowing_puppet_ros.evaluate.output import add_arguments as add_output
 
 LIMITS = np.linspace(0, 0.15, 301)  # metres, of the cumulative curve
 BINS = np.linspace(0, 0.15, 31)  # metres, of the histogram
+
+Groups = dict[str, list[PairError]]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flowing-puppet evaluate correspondence`."""
     parser.add_argument("scans", type=Path, metavar="FOLDER", help="meshes in vertex correspondence, as FAUST's are")
-    parser.add_argument("--fits", type=Path, required=True, metavar="DIR", help="what `fit FOLDER/* --out DIR` wrote")
+    parser.add_argument(
+        "--fits",
+        nargs="+",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="what `fit FOLDER --out DIR` wrote, a run each",
+    )
     parser.add_argument("--vts", type=Path, metavar="DIR", help="the meshes correspond by STEM.vts, as TOSCA's do")
     parser.add_argument(
         "--subject", default=SUBJECT, metavar="REGEX", help="its group names a mesh's person [%(default)s]"
     )
     parser.add_argument("--pairs", choices=("first", "all"), default="first", help="each with a person's first [first]")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for correspondence.html, .csv and .json")
-    parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
+    add_output(parser, "correspondence")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure the pairs, print the figures and return the exit status."""
-    scans, faces = read_fitted(arguments.scans, arguments.fits, arguments.vts, arguments.subject)
-    if arguments.out is not None:
-        make_out_folder(arguments.out)
-    chosen = [pair for inter in (False, True) for pair in scan_pairs(scans, arguments.pairs == "all", inter)]
-    if not chosen:
-        raise InputError(f"no two meshes of {arguments.scans} make a pair; check --subject")
-    bar = tqdm(chosen, file=sys.stderr, disable=arguments.json, unit="pair")
-    errors = [pair_error(a, b, faces) for a, b in bar]
-    groups = {"intra": [pair for pair in errors if pair.intra], "inter": [pair for pair in errors if not pair.intra]}
-    groups = {name: pairs for name, pairs in groups.items() if pairs}
-    figures = {name: summary(pairs) for name, pairs in groups.items()}
-    if arguments.out is not None:
-        _write(arguments.out, groups, figures)
-    rows = [{"kind": name} | row for name, row in figures.items()]
-    print(json_text(figures) if arguments.json else text_table(rows))
+    """Measure the pairs of every run, print the figures and return the exit status."""
+    names = run_names(arguments.fits)
+    runs = {name: _measured(fits, arguments) for name, fits in zip(names, arguments.fits, strict=True)}
+    figures: Figures = {
+        name: {f"{kind} {key}": value for kind, pairs in groups.items() for key, value in summary(pairs).items()}
+        for name, groups in runs.items()
+    }
+    Outcome("correspondence", figures, _details(runs), _charts(runs)).give(arguments)
     return 0
 
 
-def _write(folder: Path, groups: dict[str, list[PairError]], figures: dict[str, dict[str, float]]) -> None:
-    rows = [
-        {
-            "first": pair.first,
-            "second": pair.second,
-            "kind": name,
-            "mean_cm": 100 * float(pair.error.mean()),
-            "median_cm": 100 * float(np.median(pair.error)),
-            "worst_cm": 100 * float(pair.error.max()),
-        }
-        for name, pairs in groups.items()
-        for pair in pairs
-    ]
-    write_csv(folder / "correspondence.csv", rows)
-    curves = {name: cumulative(pairs, LIMITS) for name, pairs in groups.items()}
-    counts = {name: np.diff(cumulative(pairs, BINS)) for name, pairs in groups.items()}
-    written = {
-        "summary": figures,
+def _measured(fits: Path, arguments: argparse.Namespace) -> Groups:
+    scans, faces = read_fitted(arguments.scans, fits, arguments.vts, arguments.subject)
+    chosen = [pair for inter in (False, True) for pair in scan_pairs(scans, arguments.pairs == "all", inter)]
+    if not chosen:
+        raise InputError(f"no two meshes of {arguments.scans} make a pair; check --subject")
+    bar = tqdm(chosen, desc=fits.name, file=sys.stderr, disable=arguments.json, unit="pair")
+    errors = [pair_error(a, b, faces) for a, b in bar]
+    groups = {"intra": [pair for pair in errors if pair.intra], "inter": [pair for pair in errors if not pair.intra]}
+    return {name: pairs for name, pairs in groups.items() if pairs}
+
+
+def _details(runs: dict[str, Groups]) -> dict[str, Any]:
+    """Each pair, and the curves."""
+
+    def each(values: Sequence[PairError]) -> list[dict[str, Any]]:
+        return [
+            {
+                "first": pair.first,
+                "second": pair.second,
+                "mean_cm": 100 * float(pair.error.mean()),
+                "median_cm": 100 * float(np.median(pair.error)),
+                "worst_cm": 100 * float(pair.error.max()),
+            }
+            for pair in values
+        ]
+
+    return {
+        "pairs": {run: {kind: each(pairs) for kind, pairs in groups.items()} for run, groups in runs.items()},
         "limits_cm": (100 * LIMITS).tolist(),
-        "cumulative_percent": {name: curve.tolist() for name, curve in curves.items()},
+        "cumulative_percent": {
+            run: {kind: cumulative(pairs, LIMITS).tolist() for kind, pairs in groups.items()}
+            for run, groups in runs.items()
+        },
         "histogram_cm": (100 * BINS).tolist(),
-        "histogram_percent": {name: count.tolist() for name, count in counts.items()},
+        "histogram_percent": {
+            run: {kind: _histogram(pairs).tolist() for kind, pairs in groups.items()} for run, groups in runs.items()
+        },
     }
-    write_json(folder / "correspondence.json", written)
-    lines = [Series(name, 100 * LIMITS, curve) for name, curve in curves.items()]
-    bars = [Series(name, 100 * (BINS[1:] + BINS[:-1]) / 2, count) for name, count in counts.items()]
-    html = page(
-        "Correspondence through the Stitched Puppet",
-        paragraph("Every point of a scan mapped to another scan, against its true place there."),
-        [
-            ("Figures", _table(figures)),
-            ("Cumulative error", line_plot(lines, "cumulative error", "error, cm", "points within, %")),
-            ("Histogram", line_plot(bars, "histogram", "error, cm", "points, %")),
-        ],
-    )
-    (folder / "correspondence.html").write_text(html, encoding="utf-8")
 
 
-def _table(figures: dict[str, dict[str, float]]) -> str:
-    heads = ["kind", *(name.replace("_", " ") for name in next(iter(figures.values())))]
-    rows = [[kind, *(f"{value:.4g}" for value in row.values())] for kind, row in figures.items()]
-    return table(heads, rows, range(1, len(heads)), "Means over pairs; distances in centimetres.")
+def _histogram(pairs: Sequence[PairError]) -> np.ndarray:
+    """Percent (30,) of all points whose error lies in each of the bins."""
+    errors = np.concatenate([pair.error for pair in pairs])
+    return 100 * np.histogram(errors, BINS)[0] / len(errors)
+
+
+def _charts(runs: dict[str, Groups]) -> list[Chart]:
+    labelled = [
+        (kind, pairs, run if len(runs) > 1 else "") for run, groups in runs.items() for kind, pairs in groups.items()
+    ]
+    curves = [Line(kind, 100 * LIMITS, cumulative(pairs, LIMITS), run) for kind, pairs, run in labelled]
+    centres = 100 * (BINS[1:] + BINS[:-1]) / 2
+    bars = [Line(kind, centres, _histogram(pairs), run) for kind, pairs, run in labelled]
+    title = "Correspondence of scans through the model"
+    return [
+        Chart("cumulative", title, "error, cm", "points within, %", curves, y_limits=(0, 100)),
+        Chart("histogram", title, "error, cm", "points, %", bars, "steps"),
+    ]

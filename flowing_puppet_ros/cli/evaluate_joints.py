@@ -1,61 +1,61 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`flowing-puppet evaluate joints`: accuracy of 2D joints against the threshold, from tracks.json or poses.json."""
+"""Accuracy of 2D joints against the threshold, from tracks.json or poses.json; several runs stand side by side."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.tables import json_text, text_table, write_csv, write_json
-from flowing_puppet_ros.evaluate.tracks import joint_misses, read_tracks
+from flowing_puppet_ros.evaluate.output import Chart, Line, Outcome, run_names
+from flowing_puppet_ros.evaluate.output import add_arguments as add_output
+from flowing_puppet_ros.evaluate.tracks import JointMisses, joint_misses, read_tracks
 from flowing_puppet_ros.image.tracks import read_keypoints
-from flowing_puppet_ros.settings import make_out_folder
-from flowing_puppet_ros.view.page import page, paragraph
-from flowing_puppet_ros.view.plots import Series, line_plot
 
-CURVES = ("wrist", "elbow", "shoulder", "knee", "ankle", "hip")
+DRAWN = ("wrists", "elbows", "all joints")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flowing-puppet evaluate joints`."""
-    parser.add_argument("tracks", type=Path, metavar="TRACKS", help="tracks.json or poses.json")
+    parser.add_argument("tracks", nargs="+", type=Path, metavar="TRACKS", help="tracks.json or poses.json of a run")
     parser.add_argument("--truth", type=Path, required=True, metavar="FILE", help="keypoints.json with the true joints")
     parser.add_argument("--most", type=int, default=40, metavar="PX", help="largest threshold, pixels [%(default)s]")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for joints.html, joints.csv and joints.json")
-    parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
+    add_output(parser, "joints")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print the accuracy of each joint at some thresholds and return the exit status."""
+    """Measure, print accuracy at some thresholds, medians and jitter of every run, and return the exit status."""
     if arguments.most < 4:
         raise InputError(f"--most is {arguments.most}; give at least 4 pixels")
-    misses = joint_misses(read_tracks(arguments.tracks), read_keypoints(arguments.truth))
+    names = run_names(arguments.tracks)
+    truth = read_keypoints(arguments.truth)
     thresholds = np.arange(1, arguments.most + 1)
-    accuracy = misses.accuracy(thresholds)
     shown = sorted({max(arguments.most * share // 8, 1) for share in (1, 2, 4, 8)})
-    rows: list[dict[str, Any]] = [
-        {"joint": name} | {f"{t}_px": float(curve[t - 1]) for t in shown} for name, curve in accuracy.items()
-    ]
-    if arguments.out is not None:
-        make_out_folder(arguments.out)
-        write_csv(arguments.out / "joints.csv", rows)
-        curves = {name: curve.tolist() for name, curve in accuracy.items()}
-        write_json(arguments.out / "joints.json", {"thresholds_px": thresholds.tolist(), "percent_within": curves})
-        (arguments.out / "joints.html").write_text(_page(accuracy, thresholds), encoding="utf-8")
-    print(json_text({str(row["joint"]): row for row in rows}) if arguments.json else text_table(rows))
+    figures, curves, lines = {}, {}, []
+    for name, path in zip(names, arguments.tracks, strict=True):
+        tracks = read_tracks(path)
+        misses = joint_misses(tracks.frames, truth)
+        figures[name] = _figures(misses, shown) | {"jitter, px": tracks.jitter()}
+        curves[name] = {joint: curve.tolist() for joint, curve in misses.accuracy(thresholds).items()}
+        lines += [
+            Line(group, thresholds, 100 * (values[:, None] <= thresholds).mean(axis=0), name if len(names) > 1 else "")
+            for group, values in misses.grouped().items()
+            if group in DRAWN
+        ]
+    title = "Accuracy of joints; people nobody found are misses"
+    chart = Chart("accuracy", title, "threshold, px", "joints within, %", lines, y_limits=(0, 100))
+    details = {"thresholds_px": thresholds.tolist(), "percent_within": curves}
+    Outcome("joints", figures, details, [chart]).give(arguments)
     return 0
 
 
-def _page(accuracy: dict[str, np.ndarray], thresholds: np.ndarray) -> str:
-    lines = [Series("all", thresholds.astype(float), accuracy["all"])]
-    for joint in CURVES:
-        sides = [accuracy[f"{side}_{joint}"] for side in ("left", "right") if f"{side}_{joint}" in accuracy]
-        if sides:
-            lines.append(Series(f"{joint}s", thresholds.astype(float), np.mean(sides, axis=0)))
-    plot = line_plot(lines, "accuracy of joints", "threshold, px", "joints within, %")
-    lead = paragraph("Share of the true joints that were found within a threshold; a person nobody found is a miss.")
-    return page("Accuracy of joints", lead, [("Accuracy against the threshold", plot)])
+def _figures(misses: JointMisses, thresholds: list[int]) -> dict[str, float]:
+    figures = {}
+    for group, values in misses.grouped().items():
+        for threshold in thresholds:
+            figures[f"{group} within {threshold} px, %"] = 100 * float(np.mean(values <= threshold))
+        # Halfway between a distance and a miss there is nothing: a middle joint that was missed is a miss.
+        figures[f"{group}, median px"] = float(np.quantile(values, 0.5, method="higher"))
+    return figures

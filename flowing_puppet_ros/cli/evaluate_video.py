@@ -44,10 +44,13 @@ from flowing_puppet_ros.evaluate.video_methods import (
     VideoSettings,
     all_names,
     checked_names,
+    median_filtered,
     run_method,
 )
 from flowing_puppet_ros.evaluate.video_truth import People, find_clips, read_people
 from flowing_puppet_ros.image.arm_path import PathSettings
+from flowing_puppet_ros.image.flowing import LoopSettings
+from flowing_puppet_ros.image.flowing_energy import EnergySettings
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.tracks import write_tracks
 from flowing_puppet_ros.image.video import open_frames
@@ -75,6 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     PathSettings.add_arguments(parser)
     SmoothingSettings.add_arguments(parser)
+    LoopSettings.add_arguments(parser)
+    EnergySettings.add_arguments(parser)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -87,7 +92,10 @@ def run(arguments: argparse.Namespace) -> int:
     chosen = _listed(arguments.methods) or all_names(arguments.init is not None)
     methods = checked_names(chosen, arguments.init is not None)
     settings = VideoSettings(
-        path=PathSettings.from_arguments(arguments), smoothing=SmoothingSettings.from_arguments(arguments)
+        path=PathSettings.from_arguments(arguments),
+        smoothing=SmoothingSettings.from_arguments(arguments),
+        loop=LoopSettings.from_arguments(arguments),
+        energy=EnergySettings.from_arguments(arguments),
     )
     make_out_folder(arguments.out)
     tasks = [_Task(name, clips[name], given.get(name), methods, settings, arguments) for name in truth]
@@ -119,24 +127,40 @@ class _Task:
 
     def __call__(self) -> None:
         """Track the clip by the methods that have no file yet."""
-        missing = [name for name in self.methods if self.arguments.again or not self.file(name).is_file()]
-        if not missing:
-            return
-        cv2.setNumThreads(1)
-        with threadpool_limits(1):
-            source = open_frames(self.path)
-            frames = list(source)
-            if len(frames) > MOST_FRAMES:
-                raise InputError(f"{self.path} has {len(frames)} frames; clips of up to {MOST_FRAMES} can be measured")
-            made = ClipRun.load(frames, self.given, self.settings)
-            size = [int(side) for side in frames[0].image.shape[1::-1]]
-            for name in missing:
-                began = time.process_time()
-                track = run_method(name, made)
-                entries = (_entry(frame.index, people) for frame, people in zip(frames, track, strict=True))
-                write_tracks(self.file(name), made.joint_names, source.fps, entries)
-                about = {"seconds": round((time.process_time() - began) / len(frames), 4), "size": size}
-                self.file(name).with_suffix(".about").write_text(json.dumps(about))
+        plain = dict.fromkeys(name.removesuffix(MEDIAN) for name in self.methods)
+        missing = [name for name in plain if self.arguments.again or not self.file(name).is_file()]
+        if missing:
+            cv2.setNumThreads(1)
+            with threadpool_limits(1):
+                self._track(missing)
+        for name in self.methods:
+            if name.endswith(MEDIAN):
+                self._filter(name)
+
+    def _track(self, missing: Sequence[str]) -> None:
+        source = open_frames(self.path)
+        frames = list(source)
+        if len(frames) > MOST_FRAMES:
+            raise InputError(f"{self.path} has {len(frames)} frames; clips of up to {MOST_FRAMES} can be measured")
+        made = ClipRun.load(frames, self.given, self.settings)
+        size = [int(side) for side in frames[0].image.shape[1::-1]]
+        for name in missing:
+            began = time.process_time()
+            track = run_method(name, made)
+            entries = (_entry(frame.index, people) for frame, people in zip(frames, track, strict=True))
+            write_tracks(self.file(name), made.joint_names, source.fps, entries)
+            about = {"seconds": round((time.process_time() - began) / len(frames), 4), "size": size}
+            self._about_file(name).write_text(json.dumps(about))
+
+    def _filter(self, name: str) -> None:
+        """Filter the tracks of the plain method."""
+        plain = name.removesuffix(MEDIAN)
+        data = json.loads(self.file(plain).read_text(encoding="utf-8"))
+        track = [[_located(puppet) for puppet in frame["puppets"]] for frame in data["frames"]]
+        indices = [frame["index"] for frame in data["frames"]]
+        entries = (_entry(index, people) for index, people in zip(indices, median_filtered(track), strict=True))
+        write_tracks(self.file(name), tuple(data["joint_names"]), data["fps"], entries)
+        self._about_file(name).write_text(self._about_file(plain).read_text())
 
     def seconds(self, method: str) -> float:
         """CPU seconds a frame that a method took, without what an earlier one had done for it."""
@@ -147,13 +171,16 @@ class _Task:
         data = json.loads(self.file(method).read_text(encoding="utf-8"))
         width, height = self._about(method)["size"]
         found = {
-            int(frame["index"]): [_person(data["joint_names"], puppet["joints"]) for puppet in frame["puppets"]]
+            int(frame["index"]): [_person(data["joint_names"], _located(puppet)) for puppet in frame["puppets"]]
             for frame in data["frames"]
         }
         return clip_errors(found, truth, (width, height))
 
     def _about(self, method: str) -> dict[str, Any]:
-        return dict(json.loads(self.file(method).with_suffix(".about").read_text()))
+        return dict(json.loads(self._about_file(method).read_text()))
+
+    def _about_file(self, method: str) -> Path:
+        return self.file(method).with_suffix(".about")
 
 
 def _entry(index: int, people: Sequence[Located]) -> dict[str, Any]:
@@ -164,9 +191,13 @@ def _entry(index: int, people: Sequence[Located]) -> dict[str, Any]:
     return {"index": index, "puppets": puppets}
 
 
-def _person(names: Sequence[str], joints: Sequence[Sequence[float | None]]) -> TrackedPerson:
-    rows = np.array(joints, np.float64)
-    return TrackedPerson.of(names, rows[:, :2], rows[:, 2])
+def _located(puppet: Mapping[str, Any]) -> Located:
+    rows = np.array(puppet["joints"], np.float64)
+    return Located(puppet["id"], rows[:, :2], rows[:, 2])
+
+
+def _person(names: Sequence[str], person: Located) -> TrackedPerson:
+    return TrackedPerson.of(names, person.joints, person.confidence)
 
 
 def _call(task: _Task) -> None:

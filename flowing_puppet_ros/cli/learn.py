@@ -15,6 +15,7 @@ MODULES = {
     "likelihood": "likelihood_command",
     "detector": "detector_command",
     "hands": "hands_command",
+    "flowing": "flowing_command",
 }
 
 

@@ -39,7 +39,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this verb."""
     parser.add_argument("images", nargs="+", type=Path, help="image files, or folders of images")
     parser.add_argument("--out", required=True, type=Path, help="poses.json to write")
-    parser.add_argument("--init", type=Path, help="keypoints.json: people of each image, instead of the detector")
+    parser.add_argument(
+        "--init", type=Path, help="keypoints.json or sticks.txt: people of each image, for the detector"
+    )
     parser.add_argument(
         "--model", default="neutral", choices=(*GENDERS, "auto"), help="body; auto: the likeliest [neutral]"
     )

@@ -3,7 +3,9 @@
 
 Each camera (a topic named image, with its camera_info and, if there are any, detections) is tracked; three or more
 calibrated cameras give a visual hull; hulls and point clouds are fitted with bodies. All results go into one bag with
-the stamps of the input, and so do camera_info, detections and /tf_static.
+the stamps of the input, and so do camera_info, detections and /tf_static. Several bags are replayed in parallel, on
+this machine or on a Dask cluster, with the same results as one by one; those that were finished by an earlier call with
+the same flags are skipped.
 """
 
 from __future__ import annotations
@@ -11,22 +13,42 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from flowing_puppet_ros.bag.paths import is_bag
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.cli import batch
 from flowing_puppet_ros.errors import InputError
 
 _OF_NODES_ONLY = ("queue", "autostart", "use_sim_time")
 
 
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What each replay of several is told; the bags, and the reports if there are any, go into folders."""
+
+    out: Path = field(repr=False)
+    reports: Path | None
+    recordings: Path | None
+    options: ReplayOptions
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `replay`."""
-    parser.add_argument("input", type=Path, help="bag: .mcap, .db3 or a rosbag2 folder")
-    parser.add_argument("--out", type=Path, required=True, help="output bag: a .mcap file, or a folder with metadata")
+    parser.add_argument(
+        "inputs", nargs="+", type=Path, metavar="INPUT", help="bag: .mcap, .db3, a rosbag2 folder, or a folder of bags"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        required=True,
+        help="output bag: a .mcap file, or a folder with metadata; of several inputs the folder of their .mcap files",
+    )
     parser.add_argument("--rate", type=float, default=0.0, help="times the recording's speed; 0 is full speed [0]")
     parser.add_argument(
         "--topic-map", action="append", default=[], metavar="OLD:=NEW", help="rename a topic of the input (repeatable)"
@@ -34,8 +56,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--params", type=Path, help="YAML file with the parameters of the nodes")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random [0]")
     parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated or damaged .mcap")
-    parser.add_argument("--report", type=Path, metavar="HTML", help="write a report with pictures and figures")
-    parser.add_argument("--json", action="store_true", help="print the summary as one JSON object")
+    parser.add_argument(
+        "--report", type=Path, metavar="HTML", help="write a report with pictures and figures; of several, a folder"
+    )
+    parser.add_argument(
+        "--rerun", type=Path, metavar="RRD", help="write a recording for the Rerun viewer; of several, a folder"
+    )
+    batch.add_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print a summary as one JSON object an input")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -51,19 +79,81 @@ def run(arguments: argparse.Namespace) -> int:
         seed=arguments.seed,
         salvage=arguments.salvage,
     )
-    summary = replay(arguments.input, arguments.out, options)
-    for warning in summary["warnings"]:
-        print(f"flowing-puppet replay: {warning}", file=sys.stderr)
+    if arguments.rerun is not None:
+        from flowing_puppet_ros.view.rerun_file import rerun_sdk
+
+        rerun_sdk()
+    sources = [batch.placed(source, arguments) for given in arguments.inputs for source in bags_of(given)]
+    if sources == arguments.inputs and len(sources) == 1 and arguments.scheduler is None:
+        return _one(sources[0], arguments, options)
+    if arguments.out.suffix == ".mcap":
+        raise InputError(f"--out is {arguments.out}: the results of several bags need a folder")
+    told = Told(
+        out=batch.placed(arguments.out, arguments),
+        reports=arguments.report and batch.placed(arguments.report, arguments),
+        recordings=arguments.rerun and batch.placed(arguments.rerun, arguments),
+        options=replace(options, progress=False),
+    )
+    verb = batch.Verb("replay", replay_one, files_of, lambda summary: _tell(summary, arguments.json))
+    return batch.run_batch(verb, sources, told, arguments.out, arguments)
+
+
+def _one(source: Path, arguments: argparse.Namespace, options: ReplayOptions) -> int:
+    summary = replay(source, arguments.out, options)
     try:
         if arguments.report:
-            from flowing_puppet_ros.view.report import write_report
-
-            write_report(arguments.input, arguments.out, arguments.report, summary)
-            summary["report"] = str(arguments.report)
+            _report(source, arguments.out, arguments.report, summary)
+        if arguments.rerun:
+            _record(source, arguments.out, arguments.rerun, summary)
     finally:
         # The output bag is there, whatever becomes of the report.
-        print(json.dumps(summary) if arguments.json else _text(summary))
+        _tell(summary, arguments.json)
     return 0
+
+
+def replay_one(source: Path, told: Told) -> dict[str, Any]:
+    """Replay one bag of several into a file of its own, with its report if that is wanted, and return the summary."""
+    name = batch.stem_of(source)
+    target = told.out / f"{name}.mcap"
+    summary = replay(source, target, told.options)
+    if told.reports is not None:
+        _report(source, target, told.reports / f"{name}.html", summary)
+    if told.recordings is not None:
+        _record(source, target, told.recordings / f"{name}.rrd", summary)
+    return summary
+
+
+def files_of(summary: dict[str, Any]) -> list[Path]:
+    """The files that a summary of `replay_one` names."""
+    return [Path(summary[name]) for name in ("output", "report", "rerun") if name in summary]
+
+
+def _report(source: Path, target: Path, report: Path, summary: dict[str, Any]) -> None:
+    from flowing_puppet_ros.view.report import write_report
+
+    write_report(source, target, report, summary)
+    summary["report"] = str(report)
+
+
+def _record(source: Path, target: Path, recording: Path, summary: dict[str, Any]) -> None:
+    from flowing_puppet_ros.view.rerun_file import write_replay
+
+    write_replay(source, target, recording)
+    summary["rerun"] = str(recording)
+
+
+def _tell(summary: dict[str, Any], as_json: bool) -> None:
+    for warning in summary.get("warnings", ()):
+        print(f"flowing-puppet replay: {warning}", file=sys.stderr)
+    if as_json or "error" not in summary:
+        print(json.dumps(summary) if as_json else _text(summary), flush=True)
+
+
+def bags_of(given: Path) -> list[Path]:
+    """An input as it is, or the bags in a folder that is none itself, by name."""
+    if not given.is_dir() or is_bag(given):
+        return [given]
+    return sorted(path for path in given.iterdir() if is_bag(path)) or [given]
 
 
 def parse_topic_map(rules: list[str]) -> dict[str, str]:
@@ -99,6 +189,5 @@ def _text(summary: dict[str, Any]) -> str:
         f"({summary['frames_per_second']:.1f} images a second)",
         f"results: {summary['output']}",
     ]
-    if "report" in summary:
-        lines.append(f"report: {summary['report']}")
+    lines += [f"{name}: {summary[name]}" for name in ("report", "rerun") if name in summary]
     return "\n".join(lines)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the HTML report of a replay from its output bag and its input bag: one file, nothing beside it."""
+"""Make the HTML report of a replay from its output bag and, for images and flow, its input bag: one file alone."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from flowing_puppet_ros.view.report import write_report
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flowing-puppet report`."""
     parser.add_argument("output", type=Path, metavar="OUT.mcap", help="the bag that the replay wrote")
-    parser.add_argument("--input", type=Path, required=True, metavar="IN.mcap", help="the bag that was replayed")
+    parser.add_argument(
+        "--input", type=Path, metavar="IN.mcap", help="the bag that was replayed [none: overlays instead of images]"
+    )
     parser.add_argument("--out", type=Path, default=Path("report.html"), help="the report to write [report.html]")
     parser.add_argument("--picture", type=Path, metavar="PNG", help="also write a collage of the main pictures")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the report and name it on stdout."""
-    write_report(arguments.input, arguments.output, arguments.out, picture=arguments.picture)
+    write_report(arguments.input or arguments.output, arguments.output, arguments.out, picture=arguments.picture)
     print(arguments.out)
     return 0

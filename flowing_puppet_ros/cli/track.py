@@ -19,6 +19,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from flowing_puppet_ros.bag.paths import is_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import FlowSettings
@@ -34,8 +35,7 @@ from flowing_puppet_ros.image.tracks import puppet_entry, read_keypoints, write_
 from flowing_puppet_ros.image.video import Frame, open_frames
 from flowing_puppet_ros.image.video_tracker import DetectionSettings, VideoTracker
 from flowing_puppet_ros.model.ds import DeformableStructures
-
-BAG_SUFFIXES = frozenset({".mcap", ".db3"})
+from flowing_puppet_ros.view.overlay_video import check_overlay, drawn_tracks, write_overlay
 
 type Detected = tuple[Frame, list[Keypoints] | None]
 type Stepped = tuple[TrackResult, dict[str, Sight] | None]
@@ -47,12 +47,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this verb."""
     parser.add_argument("input", help="video file, folder of images, or bag (.mcap, .db3 or a rosbag2 folder)")
     parser.add_argument("--out", required=True, help="tracks.json to write")
-    parser.add_argument("--init", help="keypoints.json, people of one or more frames, instead of the detector")
+    parser.add_argument("--init", help="keypoints.json or sticks.txt, people of one or more frames, for the detector")
     parser.add_argument("--topic", default="", help="image topic of a bag [the first camera with detections]")
     parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated or damaged .mcap")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
     parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object")
+    parser.add_argument("--overlay", help="video to write: the puppets on the frames and on the flow (.mp4 or .avi)")
     parser.add_argument("--live", action="store_true", help="use no frame after the one on show, as the nodes do")
     TrackerSettings.add_arguments(parser)
     FlowSettings.add_arguments(parser)
@@ -67,7 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
     settings = TrackerSettings.from_arguments(arguments), FlowSettings.from_arguments(arguments)
     clip = Clip(model, SmoothingSettings.from_arguments(arguments), PathSettings.from_arguments(arguments))
     tracker = FlowingPuppetTracker(model, *settings)
-    source = _open(arguments)
+    if arguments.overlay:
+        check_overlay(Path(arguments.overlay))
+    source = _open(arguments, _warn)
     tally = _Tally()
     shown = tqdm(source.frames, total=source.count or None, unit="frame", disable=None)
     steps = _tracked(_stepper(arguments, tracker, source.given), shown)
@@ -77,8 +80,16 @@ def run(arguments: argparse.Namespace) -> int:
     if not tally.frames:
         Path(arguments.out).unlink(missing_ok=True)
         raise InputError(f"{arguments.input} has no image that can be used")
+    if arguments.overlay:
+        _draw(arguments, source.fps)
     _summarise(arguments, tally, time.monotonic() - began)
     return 0
+
+
+def _draw(arguments: argparse.Namespace, fps: float) -> None:
+    """Write --overlay: the input again, with what was written to --out."""
+    images = ((frame.index, frame.image) for frame, _ in _open(arguments, lambda _: None).frames)
+    write_overlay(Path(arguments.overlay), images, drawn_tracks(Path(arguments.out)), fps)
 
 
 def _stepper(arguments: argparse.Namespace, tracker: FlowingPuppetTracker, given: bool) -> Stepper:
@@ -89,7 +100,7 @@ def _stepper(arguments: argparse.Namespace, tracker: FlowingPuppetTracker, given
     video = VideoTracker(tracker, PartDetector.load(), likelihood, settings)
     if arguments.live:
         return lambda frame, _: (video.step(frame.image, frame.stamp_ns)[0], None)
-    again = _open(arguments)
+    again = _open(arguments, lambda _: None)
     searched = tqdm(again.frames, "search", total=again.count or None, unit="frame", disable=None)
     paths = video.search(frame.image for frame, _ in searched)
 
@@ -167,8 +178,8 @@ class _Source:
     given: bool
 
 
-def _open(arguments: argparse.Namespace) -> _Source:
-    """The input's frames with the keypoints that it or --init has."""
+def _open(arguments: argparse.Namespace, warn: Callable[[str], None]) -> _Source:
+    """The input's frames with the keypoints that it or --init has; `warn` is told what is left out of it."""
     path, init, out = Path(arguments.input), arguments.init, Path(arguments.out)
     if out.resolve() in {Path(name).resolve() for name in (path, init) if name}:
         raise InputError(f"{out} is an input itself: name another output")
@@ -177,12 +188,12 @@ def _open(arguments: argparse.Namespace) -> _Source:
         # Only bags need the bag stack, which takes a while to import.
         from flowing_puppet_ros.bag.frames import open_bag_frames
 
-        bag = open_bag_frames(path, arguments.topic, arguments.salvage, _warn)
+        bag = open_bag_frames(path, arguments.topic, arguments.salvage, warn)
         if keypoints is None:
             return _Source(bag, bag.fps, bag.count, bool(bag.detections))
         _check_reach(keypoints, bag.count, arguments)
         return _Source(((frame, keypoints.get(frame.index)) for frame, _ in bag), bag.fps, bag.count, True)
-    source = open_frames(path)
+    source = open_frames(path, warn)
     if keypoints is None:
         return _Source(((frame, None) for frame in source), source.fps, source.count, False)
     _check_reach(keypoints, source.count, arguments)
@@ -196,11 +207,6 @@ def _check_reach(keypoints: dict[int, list[Keypoints]], count: int, arguments: a
         raise InputError(
             f"{arguments.init} has keypoints from frame {first} on, but {arguments.input} has {count} frames"
         )
-
-
-def is_bag(path: Path) -> bool:
-    """Whether `path` is a bag file or a folder that rosbag2 wrote."""
-    return path.suffix.lower() in BAG_SUFFIXES or (path / "metadata.yaml").is_file() or any(path.glob("*.mcap"))
 
 
 def _summarise(arguments: argparse.Namespace, tally: _Tally, seconds: float) -> None:

@@ -1,81 +1,107 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bodies of a replay's bag against true 3D joints: mean distances, sides swapped, jitter."""
+"""The people who were really there, from a file or a bag, and the bodies of a replay's bag set against them."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
-from flowing_puppet_ros.bag.reader import Bag
+from flowing_puppet_ros.bag.paths import is_bag
+from flowing_puppet_ros.bag.reader import Bag, open_bag
+from flowing_puppet_ros.body.surface import closest_on_mesh
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.from_bag import (
-    Joints,
-    body_joints,
-    first_bodies,
-    nearest,
-    read_recording,
-    triangulated,
-)
-from flowing_puppet_ros.evaluate.joints import ARM_JOINTS, LEG_JOINTS, JointErrors, joint_errors, swapped_share
+from flowing_puppet_ros.evaluate.from_bag import Joints, Recording, body_joints, read_recording
+from flowing_puppet_ros.stream.clouds import decode_cloud
+from flowing_puppet_ros.stream.messages import stamp_ns
 
-WITHIN = (0.05, 0.1)  # metres
+FAR = 1e6
 
 
-def read_truth(path: Path) -> dict[int, Joints]:
-    """Read true joints, JSON {"stamp in ns": {"joint": [x, y, z in metres]}}; InputError when it has another form."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Person:
+    """One person at one stamp: joints by our names, and the vertices (V, 3) of their surface or None; metres."""
+
+    joints: Joints
+    vertices: np.ndarray | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class People:
+    """People {stamp in ns: those of the stamp}, and the triangles (F, 3) that every surface has."""
+
+    at: dict[int, list[Person]]
+    triangles: np.ndarray
+
+
+def read_truth(path: Path) -> People:
+    """Read who was there from a bag with BodyArray messages, or from JSON.
+
+    The JSON is {"stamp in ns": {"joint": [x, y, z in metres]}}, or with a list of such people a stamp. InputError when
+    it has another form.
+    """
+    if is_bag(path):
+        with open_bag(path, salvage=True) as bag:
+            return people_of(bag, read_recording(bag, bag))
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        return {
-            int(stamp): {str(name): _place(place) for name, place in joints.items()} for stamp, joints in data.items()
-        }
+        at = {}
+        for stamp, given in data.items():
+            listed = given if isinstance(given, list) else [given]
+            at[int(stamp)] = [Person({str(name): _place(place) for name, place in one.items()}) for one in listed]
+        return People(at, np.zeros((0, 3), np.int64))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f'{path} is not of the form {{"stamp in ns": {{"joint": [x, y, z]}}}}') from error
 
 
-def measured(given: Bag, made: Bag, truth: dict[int, Joints] | None) -> tuple[JointErrors, dict[str, float]]:
-    """Errors of the bodies in `made`, and figures of them, distances in metres.
-
-    With several bodies at a stamp the one nearest to the truth counts. Without `truth` the reference are joints
-    triangulated from the detections of both bags.
-
-    Raises:
-        InputError: when there is nothing to compare.
-    """
-    recording = read_recording(given, made)
-    frames = {stamp: body_joints(body) for stamp, body in first_bodies(recording).items()}
-    if truth is not None:
-        for stamp, bodies in recording.bodies.items():
-            candidates = [body_joints(body) for body in bodies]
-            index = nearest(truth.get(stamp, {}), candidates)
-            if index is not None:
-                frames[stamp] = candidates[index]
-    reference = triangulated(recording, frames) if truth is None else truth
-    errors = joint_errors(frames, reference)
-    if not errors.known.size:
-        raise InputError(f"{made.path} has no body at a stamp of the truth; check that both come from one recording")
-    figures = errors.summary(WITHIN) | {"true frames": float(len(reference)), "jitter": _jitter(frames)}
-    for limbs, joints in (("arms", ARM_JOINTS), ("legs", LEG_JOINTS)):
-        swapped, told = swapped_share(frames, reference, joints)
-        figures[f"{limbs} swapped"] = swapped / told if told else float("nan")
-    return errors, figures
+def people_of(bag: Bag, recording: Recording) -> People:
+    """The bodies of a bag with their surfaces, as far as it has `body_vertices` and `body_topology`."""
+    vertices: dict[int, np.ndarray] = {}
+    topic = recording.cloud_topics.get("body_vertices")
+    if topic and len(recording.triangles):
+        vertices = {stamp_ns(record.message): decode_cloud(record.message)[0] for record in bag.messages([topic])}
+    count = int(recording.triangles.max()) + 1 if len(recording.triangles) else 0
+    at = {}
+    for stamp, bodies in recording.bodies.items():
+        surface = vertices.get(stamp, np.zeros((0, 3)))
+        whole = count > 0 and len(surface) == count * len(bodies)
+        at[stamp] = [
+            Person(body_joints(body), surface[count * k : count * (k + 1)] if whole else None)
+            for k, body in enumerate(bodies)
+        ]
+    return People(at, recording.triangles)
 
 
-def _jitter(frames: dict[int, Joints]) -> float:
-    """Mean length of the second difference of the joints over successive frames, metres."""
-    stamps = sorted(frames)
-    lengths = []
-    for before, now, after in zip(stamps, stamps[1:], stamps[2:], strict=False):
-        for name in frames[now]:
-            if name in frames[before] and name in frames[after]:
-                lengths.append(np.linalg.norm(frames[before][name] - 2 * frames[now][name] + frames[after][name]))
-    return float(np.mean(lengths)) if lengths else float("nan")
+def matched(found: People, truth: People) -> list[tuple[int, Person, Person | None]]:
+    """Every true person (stamp, truth, found) with the nearest body of their stamp, no body twice; None when missed."""
+    pairs: list[tuple[int, Person, Person | None]] = []
+    for stamp in sorted(truth.at):
+        true, bodies = truth.at[stamp], found.at.get(stamp, [])
+        cost = np.array([[_apart(one.joints, body.joints) for body in bodies] for one in true])
+        rows, columns = linear_sum_assignment(cost) if bodies else ((), ())
+        chosen = {row: bodies[column] for row, column in zip(rows, columns, strict=True) if cost[row, column] < FAR}
+        pairs += [(stamp, person, chosen.get(row)) for row, person in enumerate(true)]
+    return pairs
 
 
-def _place(values: list[float]) -> np.ndarray:
+def to_surface(points: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> float:
+    """Mean distance of points (N, 3) to a mesh, in their unit."""
+    found = closest_on_mesh(points, None, vertices, triangles).points(vertices, triangles)
+    return float(np.linalg.norm(found - points, axis=1).mean())
+
+
+def _apart(joints: Joints, other: Joints) -> float:
+    common = [name for name in joints if name in other]
+    return float(np.mean([np.linalg.norm(joints[name] - other[name]) for name in common])) if common else FAR
+
+
+def _place(values: Any) -> np.ndarray:
     place = np.array(values, dtype=np.float64)
     if place.shape != (3,):
         raise ValueError("a place has three coordinates")

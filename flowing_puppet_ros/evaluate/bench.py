@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of the 3D fit as ratios taken in one run, on clouds of random bodies of the shipped model.
+"""Speed as ratios taken in one run, the 3D fit on clouds of random bodies of the shipped model.
 
 Times are processor time of the whole process, and the least of several runs: other programs on the machine disturb
 neither much. Compiled code runs once before it is measured.
@@ -27,8 +27,9 @@ from flowing_puppet_ros.body.points import part_points
 from flowing_puppet_ros.body.schedule import four_stages
 from flowing_puppet_ros.body.search import Search, SearchWeights
 from flowing_puppet_ros.body.tracker import BodyTracker, BodyTrackerSettings
-from flowing_puppet_ros.evaluate import plain
+from flowing_puppet_ros.evaluate import bench_streams, plain
 from flowing_puppet_ros.evaluate.synthetic_scans import surface_samples
+from flowing_puppet_ros.evaluate.tables import Row
 from flowing_puppet_ros.evidence.cloud import CloudGrid, look_up
 from flowing_puppet_ros.inference import diverse
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -39,7 +40,6 @@ GROWTH = {"points": (2500, 5000, 10000), "particles": (10, 20, 40), "iterations"
 BASE = {"points": 5000, "particles": 20, "iterations": 10}
 PLAIN_SIZE = (10, 3)  # particles and iterations of the search that is also run plainly
 TRACKED_POINTS, TRACKED_FRAMES, WALK = 5000, 6, 0.03  # points, frames, metres a frame
-Row = dict[str, Any]
 
 
 class Bench:
@@ -149,6 +149,14 @@ class Bench:
                 row | {"seconds": time.perf_counter() - wall, "two_way_distance_cm": 100 * fit.two_way_distance}
             )
         return rows
+
+    def images(self) -> list[Row]:
+        """Milliseconds of the 2D tracker an image, by its size and by people; flow preset fast."""
+        return bench_streams.tracking(self._seed)
+
+    def replay(self) -> list[Row]:
+        """Replay of the small recording of four cameras in the repository, with all that it writes."""
+        return bench_streams.replaying(self._seed)
 
     @cached_property
     def _fitter(self) -> BodyFitter:

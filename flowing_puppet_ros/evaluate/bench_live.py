@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.evaluate.drawn_person import DrawnPerson
 from flowing_puppet_ros.evaluate.synthetic_scans import surface_samples
 from flowing_puppet_ros.model.sp import StitchedPuppet
-from flowing_puppet_ros.view.drawn_person import DrawnPerson
 
 IMAGE_RATE, CLOUD_RATE = 30.0, 10.0  # Hz
 IMAGE_COUNT, CLOUD_COUNT = 90, 40

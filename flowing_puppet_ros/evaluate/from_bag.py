@@ -27,6 +27,9 @@ INFO, CLOUD, TRANSFORMS = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/PointCl
 MESH = "shape_msgs/msg/Mesh"
 PUPPETS, BODIES = "flowing_puppet_msgs/msg/PuppetArray", "flowing_puppet_msgs/msg/BodyArray"
 
+MADE = ("overlay", "part_labels", "preview", "hull", "body_vertices")
+"""Last words of topics of images and clouds that are results and not a sensor's."""
+
 Joints = dict[str, np.ndarray]
 
 
@@ -56,7 +59,7 @@ class Recording:
     bodies: dict[int, list[Any]] = field(default_factory=dict)
     triangles: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     body_frame: str = ""
-    cloud_topics: dict[str, str] = field(default_factory=dict)  # "hull" and "body_vertices" -> topic
+    cloud_topics: dict[str, str] = field(default_factory=dict)  # "hull", "body_vertices", the input's "points" -> topic
     counts: dict[str, int] = field(default_factory=dict)  # messages of each topic that replay wrote
 
     @property
@@ -92,20 +95,26 @@ def read_recording(given: Bag, made: Bag) -> Recording:
             with suppress(InputError):
                 _take(recording, frames, record.topic, record.type, record.message)
     for name, kind in made.topics.items():
-        leaf = name.rpartition("/")[2]
-        if kind == CLOUD and leaf in ("hull", "points", "body_vertices"):
-            recording.cloud_topics["body_vertices" if leaf == "body_vertices" else "hull"] = name
+        if kind == CLOUD and leaf(name) in ("hull", "body_vertices"):
+            recording.cloud_topics[leaf(name)] = name
+    for name, kind in given.topics.items():
+        if kind == CLOUD and leaf(name) not in MADE:
+            recording.cloud_topics.setdefault("points", name)
     _find_images(recording, given)
     _place_cameras(recording, frames)
     return recording
 
 
+def leaf(topic: str) -> str:
+    """The last word of a topic; `/compressed` does not count as a word."""
+    return topic.removesuffix("/compressed").rpartition("/")[2]
+
+
 def _role(topic: str, kind: str) -> str:
     """What a topic of this type is read for: its type, or "detections"; empty when it is not read."""
-    leaf = topic.rpartition("/")[2]
-    if kind == PUPPETS and leaf == "detections":
+    if kind == PUPPETS and leaf(topic) == "detections":
         return "detections"
-    unread = (kind == BODIES and leaf == "joints") or (kind == TRANSFORMS and leaf != "tf_static")
+    unread = (kind == BODIES and leaf(topic) == "joints") or (kind == TRANSFORMS and leaf(topic) != "tf_static")
     return kind if kind in (INFO, TRANSFORMS, PUPPETS, BODIES, MESH) and not unread else ""
 
 
@@ -131,7 +140,9 @@ def _take(recording: Recording, frames: FrameTree, topic: str, kind: str, messag
 
 def _find_images(recording: Recording, given: Bag) -> None:
     """Give each camera the image topic of its namespace, or else the one whose first image has its frame."""
-    topics = [name for name, topic in given.details.items() if topic.type in IMAGE and topic.count]
+    topics = [
+        name for name, topic in given.details.items() if topic.type in IMAGE and topic.count and leaf(name) not in MADE
+    ]
     by_frame: dict[str, str] = {}
     for topic in topics:
         with suppress(InputError):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.evaluate.likelihood import Ranks
-from flowing_puppet_ros.evidence.hands import EXTRAS, HandDetectors, HandMaps, hand_score
+from flowing_puppet_ros.evidence.hands import EXTRAS, SPEED, HandDetectors, HandMaps, hand_score
 from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.learn.hands import maps_of, wrists_of, wrong_places
@@ -69,4 +69,4 @@ def _moves(maps: HandMaps, wrist: Array) -> bool:
     height, width = field.extras.shape[:2]
     x, y = np.clip(np.rint(wrist * field.level.scale), 0, (width - 1, height - 1)).astype(int)
     speed = field.extras[max(0, y - 2) : y + 3, max(0, x - 2) : x + 3, 1]
-    return bool(speed.mean() > 1 - np.exp(-MOVES / 0.06))
+    return bool(speed.mean() > 1 - np.exp(-MOVES / SPEED))

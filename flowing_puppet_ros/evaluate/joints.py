@@ -123,6 +123,21 @@ def swapped_share(
     return sum(told), len(told)
 
 
+def jitter(frames: Mapping[int, Mapping[str, np.ndarray]], step: int | None = None) -> np.ndarray:
+    """Lengths (n,) of the second differences of joints {stamp: {name: point}} over three successive frames.
+
+    With `step` only frames that are so far apart are successive.
+    """
+    stamps = sorted(frames)
+    lengths = []
+    for before, now, after in zip(stamps, stamps[1:], stamps[2:], strict=False):
+        if step is None or now - before == after - now == step:
+            for name in frames[now].keys() & frames[before].keys() & frames[after].keys():
+                bend = frames[before][name] - 2 * frames[now][name] + frames[after][name]
+                lengths.append(float(np.linalg.norm(bend)))
+    return np.sort(np.array(lengths))
+
+
 def id_switches(ids: Sequence[Sequence[str]]) -> int:
     """Count how often a person goes on under another id; `ids` are those of the people of each frame, in order.
 

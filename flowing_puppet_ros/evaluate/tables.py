@@ -10,6 +10,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+Row = dict[str, Any]
+"""Figures by name; all rows of a table have the same names."""
+
 
 def text_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Lay out rows of one form as a table with a heading; numbers to the right, rounded to 4 digits."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many joints of tracks.json or poses.json lie within a threshold of the true ones, threshold by threshold."""
+"""How many joints of tracks.json or poses.json lie within a threshold of the true ones, and how much they jitter."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ import numpy as np
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.from_bag import Joints, nearest
-from flowing_puppet_ros.evaluate.joints import named_points
+from flowing_puppet_ros.evaluate.joints import jitter, named_points
 from flowing_puppet_ros.image.keypoints import Keypoints
+
+GROUPS = ("wrist", "elbow", "shoulder", "hip", "knee", "ankle")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,9 +34,37 @@ class JointMisses:
             name: 100 * (column[:, None] <= thresholds).mean(axis=0) for name, column in known.items() if len(column)
         }
 
+    def grouped(self) -> dict[str, np.ndarray]:
+        """The known distances (n,) of wrists, elbows and so on, as far as there are any, and of all joints."""
+        found = {
+            f"{group}s": self.distance[:, [k for k, name in enumerate(self.names) if name.endswith(f"_{group}")]]
+            for group in GROUPS
+        } | {"all joints": self.distance}
+        known = {name: values[~np.isnan(values)] for name, values in found.items()}
+        return {name: values for name, values in known.items() if len(values)}
 
-def read_tracks(path: Path) -> dict[int, list[Joints]]:
-    """Read tracks.json or poses.json: {frame index: known joints {our name: (2,) px} of each puppet}.
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """A tracks.json or poses.json.
+
+    Attributes:
+        frames: frame index -> known joints {our name: (2,) px} of each puppet.
+        people: id -> frame index -> joints; empty for single images, which nobody is followed through.
+    """
+
+    frames: dict[int, list[Joints]]
+    people: dict[str, dict[int, Joints]]
+
+    def jitter(self) -> float:
+        """Mean length of the joints' second difference over three successive frames, px; NaN without any."""
+        lengths = [jitter(frames, 1) for frames in self.people.values()]
+        joined = np.concatenate(lengths) if lengths else np.empty(0)
+        return float(joined.mean()) if joined.size else float("nan")
+
+
+def read_tracks(path: Path) -> Tracks:
+    """Read tracks.json or poses.json.
 
     Raises:
         InputError: when the file cannot be read or has another form.
@@ -42,9 +72,15 @@ def read_tracks(path: Path) -> dict[int, list[Joints]]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         names = [str(name) for name in data["joint_names"]]
-        return {
-            int(frame["index"]): [_joints(names, puppet) for puppet in frame["puppets"]] for frame in data["frames"]
-        }
+        frames: dict[int, list[Joints]] = {}
+        people: dict[str, dict[int, Joints]] = {}
+        for frame in data["frames"]:
+            index = int(frame["index"])
+            frames[index] = [_joints(names, puppet) for puppet in frame["puppets"]]
+            if "path" not in frame:
+                for puppet, joints in zip(frame["puppets"], frames[index], strict=True):
+                    people.setdefault(str(puppet.get("id", "")), {})[index] = joints
+        return Tracks(frames, people)
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, LookupError, TypeError, RecursionError) as error:
@@ -57,7 +93,7 @@ def joint_misses(
     """Compare every true person with the puppet of their frame that is nearest.
 
     Args:
-        found: as `read_tracks` returns it; a frame that it lacks has nobody.
+        found: puppets by frame; a frame that it lacks has nobody.
         truth: people by frame.
         names: joints to measure; without any, all that both sides know somewhere.
 

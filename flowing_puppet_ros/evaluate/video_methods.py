@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.video_truth import People
+from flowing_puppet_ros.evidence.hands import HandDetectors
 from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, working_size
 from flowing_puppet_ros.image.arm_path import PathSettings
@@ -22,6 +23,9 @@ from flowing_puppet_ros.image.arms import Sight
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
+from flowing_puppet_ros.image.flowing import LoopSettings
+from flowing_puppet_ros.image.flowing_clip import FlowingClip, given_sights
+from flowing_puppet_ros.image.flowing_energy import EnergySettings
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
@@ -55,6 +59,8 @@ class VideoSettings:
     detection: DetectionSettings = field(default_factory=DetectionSettings)
     path: PathSettings = field(default_factory=PathSettings)
     smoothing: SmoothingSettings = field(default_factory=SmoothingSettings)
+    loop: LoopSettings = field(default_factory=LoopSettings)
+    energy: EnergySettings = field(default_factory=EnergySettings)
 
 
 @dataclass(slots=True, eq=False)
@@ -177,6 +183,23 @@ def _unflowed(run: ClipRun) -> Track:
     return _whole(replace(run, settings=settings), still=True)
 
 
+def _thesis(run: ClipRun, flow: bool = True, hands: bool = True) -> Track:
+    """The loop of the thesis, without the flow in propagation and likelihood, or without hands, where so told."""
+    loop, energy = run.settings.loop, run.settings.energy
+    if not flow:
+        loop, energy = replace(loop, carried=0), replace(energy, forward=False, backward=False)
+    if not hands:
+        energy = replace(energy, hand_weight=0.0)
+    clip = FlowingClip(run.model, HandDetectors.load(), loop, energy)
+    for frame, (result, sights) in zip(run.frames, _steps(run), strict=True):
+        if sights is None:
+            given = given_sights(run.model, run.likelihood, frame.image, result, run.keypoints(frame))
+            clip.add(result, given)
+        else:
+            clip.add(result, sights)
+    return [_located(puppets) for puppets in clip.people()]
+
+
 def _located(puppets: Sequence[TrackedPuppet]) -> list[Located]:
     return [Located(puppet.id, puppet.joints, puppet.confidence) for puppet in puppets]
 
@@ -187,8 +210,11 @@ METHODS: Mapping[str, Callable[[ClipRun], Track]] = {
     "default-still": lambda run: _whole(run, still=True),
     "default-noflow": _unflowed,
     "default": _whole,
+    "thesis-noflow": lambda run: _thesis(run, flow=False),
+    "thesis-nohands": lambda run: _thesis(run, hands=False),
+    "thesis": _thesis,
 }
-"""Rows by name. `still`: the flow says that nothing moves; `noflow`: neither flow nor its smoothing is used."""
+"""Rows by name. `still`: the flow says that nothing moves; `noflow`: it is not used for anything that is judged."""
 
 MEDIAN = "-median"
 INIT = "init-"
@@ -196,8 +222,10 @@ INIT = "init-"
 
 def all_names(with_init: bool) -> list[str]:
     """The rows that are measured when none is chosen."""
-    from_init = ("detector", "live", "default")
-    return [*METHODS, *(f"{INIT}{name}" for name in from_init)] if with_init else [*METHODS]
+    names = [*METHODS]
+    names += [f"{name}{MEDIAN}" for name in ("detector", "thesis")]
+    from_init = ("detector", f"detector{MEDIAN}", "live", "default", f"thesis{MEDIAN}")
+    return names + [f"{INIT}{name}" for name in from_init] if with_init else names
 
 
 def checked_names(names: Sequence[str], with_init: bool) -> list[str]:
@@ -215,12 +243,10 @@ def checked_names(names: Sequence[str], with_init: bool) -> list[str]:
 
 
 def run_method(name: str, run: ClipRun) -> Track:
-    """The people of each frame by one of the rows."""
-    bare = name.removesuffix(MEDIAN)
-    if not bare.startswith(INIT):
+    """The people of each frame by one of the rows, before any median filter."""
+    if not name.startswith(INIT):
         run = replace(run, given=None)
-    track = METHODS[bare.removeprefix(INIT)](run)
-    return median_filtered(track) if name.endswith(MEDIAN) else track
+    return METHODS[name.removeprefix(INIT)](run)
 
 
 def median_filtered(track: Track) -> Track:

@@ -38,7 +38,7 @@ ORIENTATIONS = 12
 PITCH = 0.03  # m; between the places of a map
 SHORT = 0.05  # m; a forearm that is seen shorter than this has no direction
 _GRADIENT = 0.25  # px/px a frame at which the flow's gradient counts 63 %
-_SPEED = 0.06  # m a frame beside the background at which the speed counts 63 %
+SPEED = 0.06  # m a frame beside the background at which the speed counts 63 %
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,7 @@ def _moving(flow: Flow, scale: float) -> tuple[NDArray[np.float32], NDArray[np.f
     vertical, horizontal = np.gradient(known, axis=(0, 1))
     gradient = np.sqrt((vertical**2 + horizontal**2).sum(axis=2))
     beside = known - np.median(known.reshape(-1, 2), axis=0)
-    speed = np.hypot(beside[..., 0], beside[..., 1]) / (_SPEED * scale)
+    speed = np.hypot(beside[..., 0], beside[..., 1]) / (SPEED * scale)
     return (1 - np.exp(-gradient / _GRADIENT)).astype(np.float32), (1 - np.exp(-speed)).astype(np.float32)
 
 
@@ -228,7 +228,7 @@ class HandMaps:
         """Largest log odds (N,) over the orientations of a box at places (N,2) px, and the orientation (N,)."""
         turns = np.arange(ORIENTATIONS) * (2 * np.pi / ORIENTATIONS)
         odds = np.stack([self.log_odds(kind, places, np.full(len(places), turn)) for turn in turns])
-        return odds.max(axis=0), turns[odds.argmax(axis=0)]
+        return odds.max(axis=0), np.asarray(turns[odds.argmax(axis=0)], np.float64)
 
 
 def hand_score(maps: HandMaps, wrist: Floats, elbow: Floats, scale: float) -> Floats:

@@ -110,6 +110,14 @@ class Scene:
         weight = self.likelihood.terms.get(kind_of(self.names[part]), np.zeros(1))
         return np.where(usable, np.einsum("pt,t->p", np.where(usable[:, None], terms, 0.0), weight), -np.inf)
 
+    def contour_and_colour(
+        self, part: int, contours: Array, scale: Array | float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """The weighted terms of `log_likelihood` in two sums, each (P,): contour, and all that is of colour."""
+        weighted = self.terms(part, contours, scale) * self.likelihood.terms.get(kind_of(self.names[part]), np.zeros(1))
+        usable = np.isfinite(weighted).all(axis=1)
+        return np.where(usable, weighted[:, 0], -np.inf), np.where(usable, weighted[:, 1:].sum(axis=1), 0.0)
+
     def terms(self, part: int, contours: Array, scale: Array | float) -> NDArray[np.float64]:
         """The terms (P,T) that TERMS_OF names for the part, before they are weighted; only the contour's for others."""
         name = self.names[part]

@@ -27,6 +27,7 @@ from flowing_puppet_ros.image.association import Detection, associate
 from flowing_puppet_ros.image.carry import Carriage, Grid, carry_people, paint_people
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.people import Person, TrackerSettings
+from flowing_puppet_ros.image.shots import colours_of, is_cut
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_render import depth_order
 from flowing_puppet_ros.model.ds_shape import PuppetShape, View
@@ -34,6 +35,7 @@ from flowing_puppet_ros.model.ds_shape import PuppetShape, View
 type Floats = NDArray[np.float64]
 
 LEAST_KNOWN = 3  # a person of whom fewer joints are known is lost
+HIDDEN = 0.3  # share of the confidence that is left of a joint behind somebody nearer
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,11 +91,12 @@ class TrackResult:
 
 @dataclass(slots=True, eq=False)
 class _Previous:
-    """What the next step needs of an image: its stamp, the grid and the small grey picture."""
+    """What the next step needs of an image: its stamp, the grid, the small grey picture and its colours."""
 
     stamp_ns: int
     grid: Grid
     grey: NDArray[np.uint8]
+    colours: Floats
 
 
 class FlowingPuppetTracker:
@@ -128,25 +131,28 @@ class FlowingPuppetTracker:
 
         `detections` are the people a detector found in this image; None when none ran, empty when it found nobody.
         `flow` is (forward from the previous image, backward to it), each (h, w, 2) in pixels of its own grid of any
-        resolution, NaN unknown; computed here when not given. A stamp before the previous one or an image of another
-        size restarts the tracker with a warning. InputError for what is no image.
+        resolution, NaN unknown; computed here when not given. A stamp before the previous one, an image of another size
+        and a cut between shots restart the tracker with a warning. InputError for what is no image.
         """
         image = as_image(image)
         size = (image.shape[1], image.shape[0])
         grid = Grid(size, working_size(image.shape, self.optical_flow.settings.max_side))
         warnings = self._restart_if_broken(stamp_ns, size)
         previous = self._previous
-        self._previous = _Previous(stamp_ns, grid, self.optical_flow.prepare(image))
+        self._previous = _Previous(stamp_ns, grid, self.optical_flow.prepare(image), colours_of(image))
         carriage, pair = None, None
         if previous is not None and self.people:
             pair = self._flow(previous, flow, warnings)
-            carriage = carry_people(self.model, self.people, pair, grid, self.settings)
+            if is_cut(previous.colours, self._previous.colours, pair):
+                warnings.append("the picture changes as at a cut between shots: tracking starts anew")
+                self.people, pair = [], None
+            else:
+                carriage = carry_people(self.model, self.people, pair, grid, self.settings)
         self._take(detections, warnings)
         self.people = [person for person in self.people if self._lives(person, size)]
         for person in self.people:
             person.settle(self.model)
-        puppets = [self._puppet(person, size) for person in self.people]
-        return TrackResult(puppets, pair, warnings, self.model, grid, carriage)
+        return TrackResult(self._puppets(grid), pair, warnings, self.model, grid, carriage)
 
     def redirected(self, result: TrackResult, places: Mapping[str, Mapping[int, tuple[Floats, float]]]) -> TrackResult:
         """The last result with some joints moved: by id and joint the place (2,) px and how sure it is (0 to 1)."""
@@ -155,7 +161,7 @@ class FlowingPuppetTracker:
                 person.redirect(joint, place, confidence, self.settings)
             if places.get(person.id):
                 person.settle(self.model)
-        return replace(result, puppets=[self._puppet(person, result.grid.image) for person in self.people])
+        return replace(result, puppets=self._puppets(result.grid))
 
     def _restart_if_broken(self, stamp_ns: int, size: tuple[int, int]) -> list[str]:
         previous = self._previous
@@ -229,7 +235,11 @@ class FlowingPuppetTracker:
         low, high = known.min(axis=0), known.max(axis=0)
         return not ((high < 0).any() or (low > np.array(size) - 1).any())
 
-    def _puppet(self, person: Person, size: tuple[int, int]) -> TrackedPuppet:
+    def _puppets(self, grid: Grid) -> list[TrackedPuppet]:
+        hidden = hidden_joints(self.model, self.people, grid)
+        return [self._puppet(one, grid.image, covered) for one, covered in zip(self.people, hidden, strict=True)]
+
+    def _puppet(self, person: Person, size: tuple[int, int], hidden: NDArray[np.bool_]) -> TrackedPuppet:
         shape = person.shape
         assert shape is not None
         order = depth_order(self.model, person.view)
@@ -239,7 +249,7 @@ class FlowingPuppetTracker:
             person.id,
             self.model.name,
             person.mean.copy(),
-            person.confidence(size),
+            person.confidence(size) * np.where(hidden, HIDDEN, 1.0),
             person.scale,
             person.view,
             float(energy),
@@ -249,6 +259,21 @@ class FlowingPuppetTracker:
             person.detected,
             person.detection,
         )
+
+
+def hidden_joints(model: DeformableStructures, people: Sequence[Person], grid: Grid) -> list[NDArray[np.bool_]]:
+    """Which joints (J,) of each person lie behind the puppet of somebody nearer."""
+    if len(people) < 2:
+        return [np.zeros(len(model.joint_names), dtype=bool) for _ in people]
+    labels = paint_people(model, [person.shape for person in people if person.shape is not None], grid)
+    height, width = labels.shape
+    hidden = []
+    for k, person in enumerate(people):
+        x, y = np.rint(grid.reduced(person.mean)).astype(np.int64).T
+        inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        owner = (labels[np.where(inside, y, 0), np.where(inside, x, 0)].astype(np.int64) - 1) // len(model.tree)
+        hidden.append(inside & (owner >= 0) & (owner != k))
+    return hidden
 
 
 def letters(seed: int) -> str:

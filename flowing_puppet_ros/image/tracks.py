@@ -20,6 +20,9 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.keypoints import Keypoints, normalise_name
+from flowing_puppet_ros.image.stick_figures import StickRegression
+from flowing_puppet_ros.image.sticks import read_sticks
+from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_shape import View
 from flowing_puppet_ros.model.tree import PartTree
 
@@ -74,7 +77,16 @@ class Puppet(Protocol):
 
 
 def read_keypoints(path: str | Path) -> dict[int, list[Keypoints]]:
-    """Read keypoints.json: {frame index: people}. A frame that is not listed had no detector run on it."""
+    """Read keypoints.json, or sticks.txt: {frame index: people}. A frame that is not listed had no detector run on it.
+
+    Sticks become the puppets that stand in their place, see `stick_figures`.
+    """
+    if Path(path).suffix.lower() == ".txt":
+        regression = StickRegression(DeformableStructures.load())
+        return {
+            number: [regression.keypoints(sticks) for sticks in people]
+            for number, people in read_sticks(Path(path)).items()
+        }
     try:
         data = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from flowing_puppet_ros.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
 FOLDER_FPS = 30.0  # of images in a folder, which carry no rate
+MOST_BROKEN = 100  # frames of a video in a row that cannot be decoded before it is given up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,50 +31,69 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class FrameSource:
-    """Frames of a video or folder: iterate to read them; `count` is what the container says, 0 unknown."""
+    """Frames of a video or folder: iterate to read them; `count` is what the container says, 0 unknown.
+
+    `warn` is told of frames that cannot be read and are left out; without it the first such image is an error.
+    """
 
     path: Path
     fps: float
     count: int
     files: tuple[Path, ...]
+    warn: Callable[[str], None] | None = None
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yield the frames in order; InputError at the first that cannot be read."""
+        """Yield the frames in order; InputError when there is none, or at the first that cannot be read."""
         images = self._images() if self.files else self._video()
         index = -1
-        for index, (image, path) in enumerate(images):
+        for index, image, path in images:
             rgb = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
             yield Frame(index, round(index * 1e9 / self.fps), rgb, path)
         if index < 0:
             raise InputError(f"{self.path} has no frame that can be decoded; it is broken or of an unknown codec")
 
-    def _images(self) -> Iterator[tuple[NDArray[np.uint8], str]]:
-        for path in self.files:
+    def _images(self) -> Iterator[tuple[int, NDArray[np.uint8], str]]:
+        for index, path in enumerate(self.files):
             image = cv2.imread(str(path), cv2.IMREAD_COLOR)
-            if image is None:
+            if image is not None:
+                yield index, np.asarray(image, dtype=np.uint8), str(path)
+            elif self.warn is None:
                 raise InputError(f"{path} is no readable image; remove or replace it")
-            yield np.asarray(image, dtype=np.uint8), str(path)
+            else:
+                self.warn(f"frame {index}: {path} is no readable image and is left out")
 
-    def _video(self) -> Iterator[tuple[NDArray[np.uint8], str]]:
+    def _video(self) -> Iterator[tuple[int, NDArray[np.uint8], str]]:
         capture = cv2.VideoCapture(str(self.path))
+        index, broken = 0, 0
         try:
-            while True:
+            # Containers often announce more frames than they have: what is missing at the end says nothing.
+            while broken <= MOST_BROKEN:
                 read, image = capture.read()
-                if not read:
-                    return
-                yield np.asarray(image, dtype=np.uint8), ""
+                if read:
+                    if broken and self.warn is not None:
+                        self.warn(f"{broken} frames from {index - broken} on cannot be decoded and are left out")
+                    broken = 0
+                    yield index, np.asarray(image, dtype=np.uint8), ""
+                elif index >= self.count:
+                    break
+                else:
+                    broken += 1
+                index += 1
         finally:
             capture.release()
 
 
-def open_frames(path: str | Path) -> FrameSource:
-    """Open a video file or a folder of images (in natural order: frame2 before frame10); InputError with the reason."""
+def open_frames(path: str | Path, warn: Callable[[str], None] | None = None) -> FrameSource:
+    """Open a video file or a folder of images (in natural order: frame2 before frame10); InputError with the reason.
+
+    `warn` as in `FrameSource`.
+    """
     path = Path(path)
     if path.is_dir():
         files = tuple(sorted((f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES), key=natural_order))
         if not files:
             raise InputError(f"the folder {path} has no images ({' '.join(sorted(IMAGE_SUFFIXES))})")
-        return FrameSource(path, FOLDER_FPS, len(files), files)
+        return FrameSource(path, FOLDER_FPS, len(files), files, warn)
     if not path.is_file():
         raise InputError(f"{path} does not exist; give a video file, a folder of images or a bag")
     if path.suffix.lower() in IMAGE_SUFFIXES:
@@ -84,7 +104,7 @@ def open_frames(path: str | Path) -> FrameSource:
     if not opened:
         raise InputError(f"{path} is no video that can be read; give a video file, a folder of images or a bag")
     rate = fps if np.isfinite(fps) and 0 < fps <= 1e4 else FOLDER_FPS
-    return FrameSource(path, float(rate), max(0, int(count)), ())
+    return FrameSource(path, float(rate), max(0, int(count)), (), warn)
 
 
 def natural_order(path: Path) -> tuple[list[tuple[int, int, str]], str]:

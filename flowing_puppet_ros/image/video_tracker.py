@@ -22,6 +22,7 @@ from flowing_puppet_ros.image.detector import DetectorSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
 from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
+from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
 
 SURE_SIZES, SIZES = 3, 9
@@ -187,10 +188,17 @@ class VideoTracker:
         )
 
     def _sight(self, puppet: TrackedPuppet, image: NDArray[np.uint8], found: Sequence[PersonDetection]) -> Sight:
-        model = self.tracker.model
-        window = Window.around(self.likelihood, image, puppet.joints, puppet.scale)
-        if window is not None:
-            torso, head = (puppet.contours[model.tree.names.index(name)] for name in ("torso", "head"))
-            window = window.with_torso(torso, head)
+        window = window_of(self.tracker.model, self.likelihood, image, puppet)
         detection = None if puppet.detection is None else found[puppet.detection]
-        return Sight(model, puppet.joints, puppet.scale, puppet.view, detection, window)
+        return Sight(self.tracker.model, puppet.joints, puppet.scale, puppet.view, detection, window)
+
+
+def window_of(
+    model: DeformableStructures, likelihood: Likelihood, image: NDArray[np.uint8], puppet: TrackedPuppet
+) -> Window | None:
+    """The evidence around a puppet in an image (H, W, 3), with the colours of its torso and head; None outside."""
+    window = Window.around(likelihood, image, puppet.joints, puppet.scale)
+    if window is None:
+        return None
+    torso, head = (puppet.contours[model.tree.names.index(name)] for name in ("torso", "head"))
+    return window.with_torso(torso, head)

@@ -87,6 +87,6 @@ each cell moves beside the background. Left and right hands share a filter.
 - Differences from the thesis: descriptors are Fourier coefficients of orientation histograms, which turn exactly, so
   that one filter serves all orientations; speed beside the flow's gradient; one box serves both detectors.
 - How well they tell hands: `flowing-puppet evaluate hands ANNOTATIONS.json`.
-- Limits: people at rest give the flow detector nothing; faces are the most frequent error of the other.
+- Limits: people at rest give the flow detector nothing, and most hands rest most of the time.
 - Licence: Apache-2.0, as the package.
 """

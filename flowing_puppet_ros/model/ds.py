@@ -178,6 +178,11 @@ class DeformableStructures:
         energy = self._energy.many(local, coefficients, chosen)
         return tuple(contour * to_pixels + origin for contour in contours), energy
 
+    def shape_coefficients(self, joints: Array, scale: Array, view: View = "front") -> Array:
+        """Shape coefficients (P,N,Z) of the puppets that `puppets_from_joints` gives."""
+        to_pixels = np.asarray(scale, np.float64)[:, None, None] * self._to_pixels(1.0, view)
+        return self._shape_from_joints.many((joints - joints[:, :1]) / to_pixels)[1]
+
     def energy(self, shape: PuppetShape) -> float:
         """-log p(l) of Eq. 5 in nats, with Z = 1, of a puppet that stands on its joints; lower is more likely."""
         to_pixels = self._to_pixels(shape.scale, shape.view)

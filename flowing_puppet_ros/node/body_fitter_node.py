@@ -27,8 +27,6 @@ class BodyFitterNode(ComponentNode[BodyFitterComponent]):
 
     def _open(self) -> None:
         super()._open()
-        assert self.session is not None
-        self.session.component.search_in_background()
         self._action = ActionServer(
             self,
             FitBody,

@@ -7,6 +7,7 @@ import threading
 import traceback
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -100,6 +101,8 @@ class Session[C: Component]:
         """Let the running task end, then close the outputs."""
         self.deactivate()
         self.worker.stop()
+        # The worker takes no more tasks, and what runs in the background must end too.
+        self.component.reset()
         self._close_outputs()
 
     def _close_output(self, name: str) -> None:
@@ -137,7 +140,7 @@ class Session[C: Component]:
             kind,
             topic,
             partial(self._received, port.name, name),
-            _SUBSCRIPTION_QOS[port.qos],
+            copy(_SUBSCRIPTION_QOS[port.qos]),  # an override changes the profile itself
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=partial(self._incompatible, name, "subscription"),
@@ -166,7 +169,7 @@ class Session[C: Component]:
         options = None if person else QoSOverridingOptions.with_default_policies()
         events = PublisherEventCallbacks(incompatible_qos=partial(self._incompatible, name, "publisher"))
         return self._node.create_publisher(
-            kind, topic, _PUBLISHER_QOS[qos], qos_overriding_options=options, event_callbacks=events
+            kind, topic, copy(_PUBLISHER_QOS[qos]), qos_overriding_options=options, event_callbacks=events
         )
 
     def _incompatible(self, topic: str, side: str, event: Any) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.frames import axis_of, upright
 from flowing_puppet_ros.body.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.errors import InputError
@@ -40,7 +40,7 @@ OPTICAL = re.compile(r"optical(_frame)?$")
 
 
 @dataclass(frozen=True)
-class BodyFitterSettings(SceneSettings, SilhouetteFitterSettings, BodyOutputSettings):
+class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings, SceneSettings, BodyOutputSettings):
     """Settings of the fits, and of what the component reads, waits for and publishes."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
@@ -67,7 +67,7 @@ class BodyFitterComponent(Component):
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),
     )
-    outputs: tuple[Port, ...] = BodyOutputs.ports
+    outputs = BodyOutputs.ports
 
     def __init__(self, settings: BodyFitterSettings, factory: MessageFactory) -> None:
         """Load the body model."""
@@ -82,13 +82,6 @@ class BodyFitterComponent(Component):
         self._initial = Shelf()
         self._outputs = BodyOutputs(settings, factory, self._model)
         self.outputs = (*BodyOutputs.ports, *self._outputs.humans.ports)
-
-    def search_in_background(self) -> None:
-        """Make the full fits of people who are tracked on a thread of its own, for a node that must not stand still.
-
-        Which cloud first shows a body then depends on the time that the fit took.
-        """
-        self._people = ScenePeople(self._fitter, self._settings, background=True)
 
     def reset(self) -> None:
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""
@@ -110,7 +103,7 @@ class BodyFitterComponent(Component):
         Nothing of other clouds is used or changed. Returns the BodyArray message and (id, fit) of each of its bodies,
         in the cloud's frame. InputError in one sentence when the cloud cannot be used.
         """
-        view = self._view(cloud)
+        view = self._view(cloud, of_depth=False)
         if initial is not None and initial.bodies:
             fits = self._from_initial(view, initial, seed, progress)
         else:
@@ -119,22 +112,25 @@ class BodyFitterComponent(Component):
         bodies = [make_body(self.factory, identity, self._model, fit) for identity, fit in fits]
         return make_bodies(self.factory, cloud.header, bodies), fits
 
-    def _view(self, cloud: Any) -> View:
-        """The points of a cloud message in the region of interest, z up."""
+    def _view(self, cloud: Any, of_depth: bool) -> View:
+        """The points of a cloud message in the region of interest, z up.
+
+        That of a depth image is seen from one side, in an optical frame, whatever its name, whose y axis points down.
+        """
         up = self._settings.up
         if up == "auto":
-            up = "-y" if OPTICAL.search(cloud.header.frame_id) else "z"
+            up = "-y" if of_depth or OPTICAL.search(cloud.header.frame_id) else "z"
         turn = upright(axis_of(up))
         points, normals = decode_cloud(cloud)
         inside = within(points, self._settings)
         if not inside.all():
             points, normals = points[inside], None if normals is None else normals[inside]
-        return View(points @ turn.T, None if normals is None else normals @ turn.T, turn, stamp_ns(cloud))
+        return View(points @ turn.T, None if normals is None else normals @ turn.T, turn, stamp_ns(cloud), of_depth)
 
     def _from_initial(
         self, view: View, initial: Any, seed: int, progress: Progress | None = None
     ) -> list[tuple[str, BodyFit]]:
-        viewpoint = np.zeros(3) if self._settings.view == "single" else None
+        viewpoint = np.zeros(3) if self._settings.view == "single" or view.single else None
         fits = []
         for number, body in enumerate(initial.bodies, start=1):
             joints = _turned_joints(joints_of(body), view.turn)
@@ -155,7 +151,7 @@ class BodyFitterComponent(Component):
             return self._fit_depth(self._depth.add(port, message))
         stamp = stamp_ns(message)
         if port == "points":
-            self._line.waiting.append((stamp, message))
+            self._line.waiting.append((stamp, (message, False)))
         elif self._line.too_late(stamp):
             self.counters["late initial"] += 1
         else:
@@ -163,48 +159,49 @@ class BodyFitterComponent(Component):
         return self._release(final=False)
 
     def _fit_depth(self, pairs: list[tuple[Any, Any]]) -> Output:
-        """Fit the clouds of depth images; they are in an optical frame, whatever its name, whose y axis points down."""
+        """Fit the clouds of depth images."""
         outputs: Output = []
         for image, info in pairs:
-            if self._settings.up == "auto":
-                self._settings = replace(self._settings, up="-y")
             try:
-                outputs += self._process("points", depth_cloud(self.factory, image, info))
+                cloud = depth_cloud(self.factory, image, info)
             except InputError as error:
                 self._unusable(error)
+            else:
+                self._line.waiting.append((stamp_ns(cloud), (cloud, True)))
+                outputs += self._release(final=False)
         return outputs
 
     def _release(self, final: bool) -> Output:
         outputs: Output = []
         while self._line.waiting:
-            stamp, cloud = self._line.waiting[0]
+            stamp, (cloud, of_depth) = self._line.waiting[0]
             initial = self._initial.get(stamp)
             crowded = len(self._line.waiting) > self._settings.wait
             if not (final or crowded or initial is not None or "initial" not in self._expected):
                 break
             self._line.pop()
             self._initial.forget_until(stamp)
-            outputs += self._fit_one(stamp, cloud, initial)
+            outputs += self._fit_one(stamp, cloud, of_depth, initial)
         return outputs
 
-    def _fit_one(self, stamp: int, cloud: Any, initial: Any | None) -> Output:
+    def _fit_one(self, stamp: int, cloud: Any, of_depth: bool, initial: Any | None) -> Output:
         self.counters["clouds"] += 1
         fits: list[tuple[str, BodyFit]] = []
         held: list[str] = []
         try:
-            view = self._view(cloud)
+            view = self._view(cloud, of_depth)
             if initial is not None and initial.bodies:
                 fits = self._from_initial(view, initial, self.seed_of(stamp))
             else:
-                fits, held = self._people.step(view, self.seed_of(stamp))
+                fits, held = self._people.step(view, self.seed_of(stamp), self.background)
             fits = [(identity, _turned_back(fit, view.turn)) for identity, fit in fits]
         except InputError as error:
             self._unusable(error)
         self.counters["bodies"] += len(fits)
         counted, errors = self._people.drain()
         self.counters.update(counted)
-        for reason in errors:
-            self._unusable(reason)
+        for error in errors:
+            self._unusable(error)
         return self._outputs.make(cloud.header, fits, held, self._wanted)
 
     def _fit_silhouettes(self, message: Any) -> Output:

@@ -197,6 +197,7 @@ class PuppetTrackerComponent(Component):
         backward = self._shelves["flow/backward"].get(stamp)
         if forward is None or backward is None:
             self.counters["images without flow"] += 1
+            self._warn("an image came without the flow that others had: it is computed here")
             return None
         self.counters["paired flows"] += 1
         try:

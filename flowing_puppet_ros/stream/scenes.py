@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.body.crowd import Crowd, CrowdSettings
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.people import ExtractionSettings, PersonCloud, extract_people
 from flowing_puppet_ros.body.planes import PlaneMemory
 from flowing_puppet_ros.body.viewpoint import one_sided
@@ -37,8 +38,8 @@ class RegionSettings(Settings):
 
 
 @dataclass(frozen=True)
-class SceneSettings(FitterSettings, CrowdSettings, ExtractionSettings, RegionSettings):
-    """How people are found in clouds, fitted and followed."""
+class SceneSettings(CrowdSettings, ExtractionSettings, RegionSettings):
+    """Where the people are looked for, how they are seen, and whether they are followed."""
 
     view: str = setting("auto", "people are seen from all sides (full) or from one sensor at the frame's origin"
                                 " (single); auto: as their first points look",
@@ -57,22 +58,26 @@ def within(points: NDArray[np.float64], region: RegionSettings) -> NDArray[np.bo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A cloud: points (N,3) and normals (N,3) or None in metres, z up after `turn` (3,3); the stamp in nanoseconds."""
+    """A cloud: points (N,3) and normals (N,3) or None in metres, z up after `turn` (3,3); the stamp in nanoseconds.
+
+    `single` says that it is known to be seen from one side, from the origin of its frame.
+    """
 
     points: NDArray[np.float64]
     normals: NDArray[np.float64] | None
     turn: NDArray[np.float64]
     stamp: int
+    single: bool = False
 
 
 class ScenePeople:
     """Finds the people in clouds and fits a body to each: tracked, or every cloud for itself."""
 
-    def __init__(self, fitter: BodyFitter, settings: SceneSettings, background: bool = False) -> None:
-        """Fit with `fitter`; `background` is what `Crowd` says of it."""
+    def __init__(self, fitter: BodyFitter, settings: SceneSettings) -> None:
+        """Fit with `fitter`."""
         self._fitter = fitter
         self._settings = settings
-        self._crowd = Crowd(fitter, settings, settings.seed, background)
+        self._crowd = Crowd(fitter, settings, fitter.settings.seed)
         self._single: bool | None = None
         self._planes = PlaneMemory()
 
@@ -88,24 +93,26 @@ class ScenePeople:
         self._crowd.counters, self._crowd.errors = Counter(), []
         return found
 
-    def step(self, view: View, seed: int) -> tuple[list[tuple[str, BodyFit]], list[str]]:
+    def step(
+        self, view: View, seed: int, background: Executor | None = None
+    ) -> tuple[list[tuple[str, BodyFit]], list[str]]:
         """Return (id, fit) of everybody in the next cloud, and the ids of those who are out of sight for now.
 
-        InputError when the cloud cannot be one of people.
+        `background` is what `Crowd` says of it. InputError when the cloud cannot be one of people.
         """
         settings = self._settings
         self._check(view)
         if not settings.scene:
             whole = [PersonCloud(view.points, view.normals, np.arange(len(view.points)), 1.0)]
-            viewpoint = self._viewpoint(whole)
+            viewpoint = self._viewpoint(view, whole)
             if not settings.track:
                 return [(ONE, self._full_fit(whole[0], viewpoint, seed))], []
-            return self._crowd.step_one(whole[0], view.stamp, viewpoint, seed), []
+            return self._crowd.step_one(whole[0], view.stamp, viewpoint, seed, background), []
         known = self._crowd.bodies(view.stamp) if settings.track else ()
-        people = extract_people(view.points, view.normals, settings, self._sensor(), known, self._planes)
-        viewpoint = self._viewpoint(people)
+        people = extract_people(view.points, view.normals, settings, self._sensor(view), known, self._planes)
+        viewpoint = self._viewpoint(view, people)
         if settings.track:
-            return self._crowd.step(people, view.stamp, viewpoint, seed), self._crowd.held
+            return self._crowd.step(people, view.stamp, viewpoint, seed, background), self._crowd.held
         named = self._crowd.named(people, view.stamp)
         return [(identity, self._full_fit(person, viewpoint, seed)) for identity, person in named], []
 
@@ -116,13 +123,13 @@ class ScenePeople:
         """
         people: list[PersonCloud] = []
         if self._settings.scene:
-            people = extract_people(view.points, view.normals, self._settings, self._sensor())
+            people = extract_people(view.points, view.normals, self._settings, self._sensor(view))
         extent = np.ptp(view.points, axis=0).max(initial=0.0) if len(view.points) else 0.0
         if not people and (not self._settings.scene or extent <= TALLEST):
             people = [PersonCloud(view.points, view.normals, np.arange(len(view.points)), 1.0)]
         if not people:
             raise InputError(f"there is nobody in the cloud of {len(view.points)} points; turn scene off to fit it all")
-        viewpoint = self._viewpoint(people, remember=False)
+        viewpoint = self._viewpoint(view, people, remember=False)
         return [
             (f"b{number}", self._full_fit(person, viewpoint, seed, progress))
             for number, person in enumerate(people, start=1)
@@ -143,13 +150,15 @@ class ScenePeople:
     ) -> BodyFit:
         return self._fitter.fit(person.points, person.normals, viewpoint=viewpoint, seed=seed, progress=progress)
 
-    def _sensor(self) -> NDArray[np.float64] | None:
+    def _sensor(self, view: View) -> NDArray[np.float64] | None:
         """Where the sensor stands when people are cut out: at the origin, unless they are seen all round."""
         full = self._settings.view == "full" or (self._settings.view == "auto" and self._single is False)
-        return None if full else np.zeros(3)
+        return None if full and not view.single else np.zeros(3)
 
-    def _viewpoint(self, people: list[PersonCloud], remember: bool = True) -> NDArray[np.float64] | None:
-        """Where the sensor stands for the fits: what the settings say, else what the first people look like."""
+    def _viewpoint(self, view: View, people: list[PersonCloud], remember: bool = True) -> NDArray[np.float64] | None:
+        """Where the sensor stands for the fits: what is known or set, else what the first people look like."""
+        if view.single:
+            return np.zeros(3)
         single = {"single": True, "full": False}.get(self._settings.view, self._single)
         if single is None and people:
             single = one_sided(people[0].points)

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from html import escape
+from importlib.resources import files
+from typing import Any
 
 import numpy as np
 
@@ -30,49 +33,43 @@ figure{margin:10px 0}img{max-width:100%;height:auto;border-radius:4px;vertical-a
 .row{display:flex;flex-wrap:wrap;gap:12px;align-items:flex-start}.row figure{margin:0 0 6px;flex:0 1 auto}
 .row img{outline:1px solid var(--rule);outline-offset:-1px}.row.three figure{flex:0 1 32%}
 .row.views{flex-wrap:nowrap;overflow-x:auto}.row.views figure{flex:0 1 24%;min-width:150px}
-.strip .frame{display:none}.strip .frame.on{display:block}.strip img{max-height:78vh;width:auto}
-.strip .controls{display:flex;gap:14px;align-items:center;margin:8px 0;max-width:560px}
-.strip input{flex:1;accent-color:var(--accent)}
+.frame{display:none}.frame.on{display:block}
+.frame img{height:min(62vh,420px);width:auto;object-fit:contain;object-position:left}
+.panes{display:flex;gap:16px;align-items:stretch}.panes>*{flex:1 1 0;min-width:0}.pictures{flex:0 1 auto;max-width:58%}
+.space{display:flex;flex-direction:column}.space canvas{width:100%;flex:1 1 380px;min-height:380px;touch-action:none;
+border:1px solid var(--rule);border-radius:4px;cursor:grab}[hidden]{display:none!important}
+.controls{display:flex;flex-wrap:wrap;gap:6px 14px;align-items:center;margin:8px 0}.controls label{white-space:nowrap}
+.scrub{position:sticky;bottom:0;background:var(--bg);border-top:1px solid var(--rule);padding:8px 0;margin:0;z-index:1;
+flex-wrap:nowrap}.scrub input{flex:1;min-width:60px;accent-color:var(--accent)}
+.scrub output{font-variant-numeric:tabular-nums;min-width:4.5em;text-align:right}
 button{font:inherit;color:inherit;background:var(--card);border:1px solid var(--rule);border-radius:6px;
 padding:3px 14px}
 :focus-visible{outline:2px solid var(--accent);outline-offset:2px}
 svg.plot{width:100%;max-width:820px;height:auto;display:block}
 svg .grid{stroke:var(--rule);stroke-width:1}svg text{fill:var(--soft);font-size:12px}
 svg .end{text-anchor:end}svg .centre{text-anchor:middle}svg .mid{dominant-baseline:central}
+svg .now{display:none;stroke:var(--fg);stroke-width:1.2}.timeline svg .now{display:inline}
+.timeline svg{cursor:crosshair;touch-action:pan-y}
 svg .line{fill:none;stroke-width:1.8;stroke-linejoin:round}
 .legend{display:flex;flex-wrap:wrap;gap:2px 18px;margin:4px 0 10px;font-size:.9rem;color:var(--soft)}
 .key{display:inline-block;width:22px;height:4px;border-radius:2px;margin-right:7px;vertical-align:middle}
 .ramp{width:120px;height:10px;image-rendering:pixelated;vertical-align:middle}
 details{margin:10px 0}summary{cursor:pointer}
-@media(max-width:720px){th[scope=row],td.n{white-space:normal;overflow-wrap:normal}table{font-size:.88rem}}
+@media(max-width:720px){.panes{flex-direction:column}.pictures{max-width:none}th[scope=row],td.n{white-space:normal;overflow-wrap:normal}table{font-size:.88rem}}
 """ + "".join(f".s{k}{{stroke:var(--c{k})}}.d{k}{{fill:var(--c{k})}}.k{k}{{background:var(--c{k})}}" for k in range(8))
 
-# Without scripts every frame of a strip is shown, one below the other, and the controls are not.
-NO_SCRIPT = "<noscript><style>.strip .frame{display:block}.strip .controls{display:none}</style></noscript>"
-
-SCRIPT = """
-for (const strip of document.querySelectorAll('.strip')) {
-  const frames = strip.querySelectorAll('.frame'), slider = strip.querySelector('input');
-  const button = strip.querySelector('button');
-  let timer = null;
-  const show = k => frames.forEach((frame, n) => frame.classList.toggle('on', n === k));
-  const stop = () => { clearInterval(timer); timer = null; button.textContent = 'Play'; };
-  slider.addEventListener('input', () => { show(+slider.value); });
-  slider.addEventListener('pointerdown', stop);
-  button.addEventListener('click', () => {
-    if (timer) { stop(); return; }
-    button.textContent = 'Stop';
-    timer = setInterval(() => {
-      slider.value = (+slider.value + 1) % frames.length;
-      show(+slider.value);
-    }, 350);
-  });
-}
-"""
+# Without scripts every frame is shown, one below the other, and what needs them is not.
+NO_SCRIPT = "<noscript><style>.frame{display:block}.scrub,.space,.timeline svg .now{display:none}</style></noscript>"
 
 
-def page(title: str, lead: str, sections: Sequence[tuple[str, str]]) -> str:
-    """Join a whole page from a title (text), a lead (HTML) and sections of (heading text, HTML)."""
+def script(name: str) -> str:
+    """The text of one of the page's scripts, view/web/`name`."""
+    return (files("flowing_puppet_ros.view") / "web" / name).read_text("utf8")
+
+
+def page(title: str, lead: str, sections: Sequence[tuple[str, str]], scripts: Sequence[str] = ()) -> str:
+    """Join a whole page from a title (text), a lead (HTML), sections of (heading text, HTML) and names of scripts."""
+    code = "".join(f"<script>{script(name)}</script>" for name in scripts)
     ids = [f"part{index + 1}" for index in range(len(sections))]
     links = "".join(
         f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in zip(ids, sections, strict=True)
@@ -87,7 +84,7 @@ def page(title: str, lead: str, sections: Sequence[tuple[str, str]]) -> str:
         '<meta name="color-scheme" content="light dark">'
         f"<title>{escape(title)}</title><style>{CSS}</style>{NO_SCRIPT}</head>\n<body><header><h1>{escape(title)}</h1>"
         f'{lead}</header>\n<nav aria-label="Sections"><ul>{links}</ul></nav>\n<main>\n{body}</main>\n'
-        f"<script>{SCRIPT}</script></body></html>\n"
+        f"{code}</body></html>\n"
     )
 
 
@@ -125,17 +122,11 @@ def row(figures: Sequence[str], kind: str = "") -> str:
     return f'<div class="row {kind}">{"".join(figures)}</div>'
 
 
-def strip(frames: Sequence[tuple[np.ndarray, str]], label: str) -> str:
-    """Make a strip of (image, caption) that a slider or a button goes through; `label` says what the slider moves."""
-    pictures = "".join(
-        f'<div class="frame{"" if index else " on"}">{figure(image, caption, caption)}</div>'
-        for index, (image, caption) in enumerate(frames)
-    )
-    return (
-        f'<div class="strip"><div class="controls"><button type="button">Play</button>'
-        f'<input type="range" min="0" max="{len(frames) - 1}" value="0" aria-label="{escape(label)}"></div>'
-        f"{pictures}</div>"
-    )
+def json_block(name: str, value: Any) -> str:
+    """Data for the page's scripts, in an element with the attribute data-`name`."""
+    # A slash after an angle bracket would end the element.
+    text = json.dumps(value, separators=(",", ":")).replace("</", "<\\/")
+    return f'<script type="application/json" data-{name}>{text}</script>'
 
 
 def details(summary: str, html: str) -> str:

@@ -64,7 +64,7 @@ def line_plot(series: Sequence[Series], title: str, x_label: str, y_label: str, 
     body = [frame.axes(x_label, y_label)]
     body += [frame.line(line, index % SERIES_CLASSES) for index, line in enumerate(thinned)]
     names = ", ".join(line.name for line in thinned)
-    svg = _svg(f"{title}: {names}", HEIGHT, "".join(body))
+    svg = _svg(f"{title}: {names}", HEIGHT, "".join(body), (LEFT, WIDTH - RIGHT, frame.x_low, frame.x_high))
     return svg + _legend([line.name for line in thinned])
 
 
@@ -95,7 +95,7 @@ def heat_strip(names: Sequence[str], values: np.ndarray, x: np.ndarray, title: s
         at = left + width * (value - x[0]) / (high - x[0])
         body.append(f'<text x="{at:.1f}" y="{height - BOTTOM + 15}" class="tick centre">{value:g}</text>')
     body.append(f'<text x="{left + width / 2:.1f}" y="{height - 6}" class="tick centre">{escape(x_label)}</text>')
-    return _svg(title, height, "".join(body)) + _scale()
+    return _svg(title, height, "".join(body), (left, WIDTH - RIGHT, x[0], high)) + _scale()
 
 
 def ramp(values: np.ndarray) -> np.ndarray:
@@ -173,10 +173,13 @@ def _range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
     return float(values.min()), float(values.max())
 
 
-def _svg(title: str, height: float, body: str) -> str:
+def _svg(title: str, height: float, body: str, span: tuple[float, float, float, float]) -> str:
+    """A plot; `span` are the columns of its left and right end and what x is there, which the timeline's mark needs."""
+    ends = " ".join(f"{value:.6g}" for value in span)
+    mark = f'<line class="now" x1="{span[0]}" x2="{span[0]}" y1="{TOP}" y2="{height - BOTTOM}"/>'
     return (
-        f'<svg class="plot" viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(title)}">'
-        f"<title>{escape(title)}</title>{body}</svg>"
+        f'<svg class="plot" viewBox="0 0 {WIDTH} {height}" role="img" aria-label="{escape(title)}" data-time="{ends}">'
+        f"<title>{escape(title)}</title>{body}{mark}</svg>"
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.view.page import details, figure, page, paragraph, row, strip
+from flowing_puppet_ros.view.page import details, figure, page, paragraph, row
 from flowing_puppet_ros.view.pictures import caption, save, to_height
 from flowing_puppet_ros.view.pictures import row as joined
 from flowing_puppet_ros.view.plots import Series, heat_strip, line_plot
@@ -23,6 +23,7 @@ from flowing_puppet_ros.view.report_tables import (
     percent,
     settings_tables,
 )
+from flowing_puppet_ros.view.timeline import SCRIPTS, timeline
 
 PICTURE_HEIGHT = 440
 
@@ -54,10 +55,10 @@ def report_page(data: ReportData) -> str:
     """Make the page from what was gathered."""
     sections = [
         ("Figures", figures_table(data) + _warnings(data) + settings_tables(data.summary)),
+        ("Over time", _time_section(data)),
         ("Tracked puppets", _track_section(data)),
         ("Optical flow and puppet flow", _flow_section(data)),
         ("Bodies", _body_section(data)),
-        ("Over time", _time_section(data)),
         ("Joint by joint", _joints_section(data)),
     ]
     topics = ", ".join(f"{name} ({count})" for name, count in sorted(data.counts.items()))
@@ -67,7 +68,7 @@ def report_page(data: ReportData) -> str:
         "algorithms of the nodes: people as 2D flowing puppets in every image, and as 3D stitched puppets where there "
         "are clouds. Left and right are the person's; warm colours are left, cool ones right.</p>"
     )
-    return page("Flowing puppet report", lead, sections)
+    return page("Flowing puppet report", lead, sections, SCRIPTS)
 
 
 def _warnings(data: ReportData) -> str:
@@ -81,15 +82,7 @@ def _warnings(data: ReportData) -> str:
 def _track_section(data: ReportData) -> str:
     if not data.cameras:
         return paragraph("The output bag has no puppets, so there is no track to show.")
-    if not data.strip:
-        return paragraph("The input bag has no images at the stamps of the puppets, so the track cannot be drawn.")
-    text = (
-        f"Camera {data.shown_camera}, the one that sees the person most frontally, cut to where the largest puppet is. "
-        "Filled outlines are the parts of the puppet, nearer parts over farther ones; dots are joints: larger is "
-        "surer, hollow is below one half."
-    )
-    frames = [(image, f"{data.shown_camera}, {data.seconds(stamp):.2f} s") for stamp, image in data.strip]
-    return paragraph(text) + strip(frames, "Frame") + cameras_table(data)
+    return cameras_table(data)
 
 
 def _flow_section(data: ReportData) -> str:
@@ -133,6 +126,29 @@ def _body_section(data: ReportData) -> str:
 
 
 def _time_section(data: ReportData) -> str:
+    """Pictures, 3D view and plots, moved by one slider."""
+    notes, frames = [], []
+    if data.strip:
+        notes.append(
+            f"Camera {data.shown_camera}, the one that sees the person most frontally. Filled outlines are the parts "
+            "of the puppet, nearer parts over farther ones; dots are joints: larger is surer, hollow is below one half."
+        )
+        frames = [(data.seconds(s), image, f"{data.shown_camera}, {data.seconds(s):.2f} s") for s, image in data.strip]
+    elif data.cameras:
+        notes.append("The input bag has no images at the stamps of the puppets, so the track cannot be drawn.")
+    if data.scene is not None:
+        notes.append(
+            "The 3D view has the fitted meshes, and in blue the points that they were fitted to at the stamps that "
+            "have some. A press in a plot goes to its time."
+        )
+    plots = _plots(data)
+    if not plots and not frames and data.scene is None:
+        return paragraph("There is nothing that changes over time in this bag.")
+    shown = timeline(frames, data.scene, plots, "Time") if frames or data.scene is not None else plots
+    return "".join(map(paragraph, notes)) + shown
+
+
+def _plots(data: ReportData) -> str:
     html = ""
     axis = "time [s]"
     errors = line_plot(error_series(data), "Joint error of the puppets", axis, "mean error [px]")
@@ -149,7 +165,7 @@ def _time_section(data: ReportData) -> str:
         html += f"<h3>Confidence of the parts, {escape(shown.name)}</h3>{strip_plot}" if strip_plot else ""
     if data.bodies is not None:
         html += _bodies_over_time(data.bodies, axis)
-    return html or paragraph("There is nothing that changes over time in this bag.")
+    return html
 
 
 def _bodies_over_time(bodies: BodiesData, axis: str) -> str:

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.bag.reader import Bag, open_bag
+from flowing_puppet_ros.bag.replay import NOTE
+from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.from_bag import (
     CameraRecord,
     Joints,
@@ -30,12 +34,17 @@ from flowing_puppet_ros.evaluate.joints import (
     joint_errors,
     swapped_share,
 )
+from flowing_puppet_ros.stream.images import decode_image
+from flowing_puppet_ros.view.pictures import shrink
 from flowing_puppet_ros.view.plots import Series
 from flowing_puppet_ros.view.report_pictures import (
+    STRIP_HEIGHT,
     BodyShot,
     FlowShot,
-    body_mesh,
+    body_meshes,
     body_shot,
+    each,
+    facing,
     fetch,
     flow_shot,
     moving_stamps,
@@ -44,8 +53,9 @@ from flowing_puppet_ros.view.report_pictures import (
     spread_over,
     track_shot,
 )
+from flowing_puppet_ros.view.report_scene import SceneFrame, frames_in_budget, scene_data
 
-STRIP_FRAMES, FLOW_FRAMES, BODY_FRAMES, MOST_VIEWS = 12, 4, 3, 6
+STRIP_FRAMES, FLOW_FRAMES, BODY_FRAMES, MOST_VIEWS = 120, 4, 3, 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +104,7 @@ class ReportData:
     flow: list[FlowShot] = field(default_factory=list)
     bodies: BodiesData | None = None
     body_shots: list[BodyShot] = field(default_factory=list)
+    scene: Mapping[str, Any] | None = None
 
     def seconds(self, stamp: int) -> float:
         """Time since the first stamp."""
@@ -111,17 +122,29 @@ def gather(input_bag: Path, output_bag: Path, summary: Mapping[str, Any] | None 
     """
     with open_bag(input_bag, salvage=True) as given, open_bag(output_bag, salvage=True) as made:
         recording = read_recording(given, made)
-        data = ReportData(input_bag.name, output_bag.name, summary or {}, recording.start, recording.counts)
+        told = _recorded(made) | dict(summary or {})
+        data = ReportData(input_bag.name, output_bag.name, told, recording.start, recording.counts)
         tracked = [camera for camera in recording.cameras.values() if camera.puppets]
         data.cameras = [_camera_data(camera, recording.start) for camera in tracked]
         if tracked:
             shown = max(tracked, key=lambda camera: frontality(camera.puppets))
             data.shown_camera = shown.name
             _add_track(data, shown, given)
+            if not data.strip:
+                _add_overlays(data, shown, made)
         if recording.bodies:
             data.bodies = _bodies_data(recording)
             _add_bodies(data, recording, given, made)
+            _add_scene(data, recording, given, made)
     return data
+
+
+def _recorded(made: Bag) -> dict[str, Any]:
+    """What the replay wrote into its bag about itself."""
+    try:
+        return dict(json.loads(made.note(NOTE).get("replay", "{}")))
+    except (ValueError, TypeError):
+        return {}
 
 
 def _camera_data(camera: CameraRecord, start: int) -> CameraData:
@@ -193,42 +216,84 @@ def _bodies_data(recording: Recording) -> BodiesData:
 
 
 def _add_track(data: ReportData, camera: CameraRecord, given: Bag) -> None:
-    """Pictures of one camera: the strip of frames with puppets, and the flow at its liveliest frames."""
+    """Pictures of one camera: the frames with puppets, and the flow at its liveliest frames."""
     stamps = sorted(camera.puppets)
     moving = moving_stamps(camera, FLOW_FRAMES)
     following = {stamp: stamps[stamps.index(stamp) + 1] for stamp in moving}
     seen = [stamp for stamp in stamps if camera.puppets[stamp]]
     strip = spread_over([stamp for stamp in stamps if seen and seen[0] <= stamp <= seen[-1]], STRIP_FRAMES)
-    images = fetch(given, {camera.image_topic: {*strip, *following, *following.values()}})
-    shown = {stamp: camera.puppets[stamp] for stamp in (*strip, *moving)}
-    for stamp in strip:
-        image = picture_of(images, camera.image_topic, stamp)
-        if image is not None:
-            data.strip.append((stamp, track_shot(image, shown[stamp], people_box(shown.values(), image.shape))))
+    people = [camera.puppets[stamp] for stamp in (*strip, *moving)]
+    for (_, stamp), message in each(given, {camera.image_topic: strip}):
+        with suppress(InputError):
+            image = decode_image(message)
+            picture = track_shot(image, camera.puppets[stamp], people_box(people, image.shape))
+            data.strip.append((stamp, picture))
+    images = fetch(given, {camera.image_topic: {*following, *following.values()}})
     for stamp in moving:
         pair = [picture_of(images, camera.image_topic, s) for s in (stamp, following[stamp])]
         if pair[0] is not None and pair[1] is not None and pair[0].shape == pair[1].shape:
-            box = people_box(shown.values(), pair[0].shape)
-            data.flow.append(flow_shot(stamp, pair[0], pair[1], shown[stamp], box))
+            box = people_box(people, pair[0].shape)
+            data.flow.append(flow_shot(stamp, pair[0], pair[1], camera.puppets[stamp], box))
+
+
+def _add_overlays(data: ReportData, camera: CameraRecord, made: Bag) -> None:
+    """The overlays that the replay made, for want of the input's images."""
+    for topic in (f"{camera.namespace}/overlay/compressed", f"{camera.namespace}/overlay"):
+        for (_, stamp), message in each(made, {topic: spread_over(list(camera.puppets), STRIP_FRAMES)}):
+            with suppress(InputError):
+                data.strip.append((stamp, shrink(decode_image(message), STRIP_HEIGHT)))
+        if data.strip:
+            return
 
 
 def _add_bodies(data: ReportData, recording: Recording, given: Bag, made: Bag) -> None:
     """Pictures of a few bodies, spread over those that were found."""
     bodies = first_bodies(recording)
     stamps = spread_over(list(bodies), BODY_FRAMES)
-    topics = recording.cloud_topics
-    clouds = fetch(made, dict.fromkeys(topics.values(), stamps))
+    clouds = _clouds(recording, given, made, stamps)
     views = [c for c in recording.cameras.values() if c.camera is not None and c.image_topic][:MOST_VIEWS]
     images = fetch(given, {camera.image_topic: stamps for camera in views})
     for stamp in stamps:
-        vertices = clouds.get((topics.get("body_vertices", ""), stamp))
-        hull = clouds.get((topics.get("hull", ""), stamp))
-        mesh = body_mesh(bodies[stamp], vertices, recording.triangles, hull)
-        if mesh is None:
+        meshes = body_meshes([bodies[stamp]], clouds.vertices.get(stamp), recording.triangles, clouds.points.get(stamp))
+        if not meshes:
             continue
         shown = [(c, picture_of(images, c.image_topic, stamp)) for c in views]
         placed = [(c.name, c.camera, image) for c, image in shown if c.camera is not None and image is not None]
-        data.body_shots.append(body_shot(stamp, bodies[stamp], mesh, placed))
+        data.body_shots.append(body_shot(stamp, bodies[stamp], meshes[0], placed))
+
+
+def _add_scene(data: ReportData, recording: Recording, given: Bag, made: Bag) -> None:
+    """The meshes of as many stamps as one page can hold."""
+    found = [stamp for stamp, bodies in recording.bodies.items() if bodies]
+    if not found or not len(recording.triangles):
+        return
+    most = max(len(recording.bodies[stamp]) for stamp in found)
+    stamps = spread_over(found, frames_in_budget(most, int(recording.triangles.max()) + 1))
+    clouds = _clouds(recording, given, made, stamps)
+    frames = []
+    for stamp in stamps:
+        vertices, points = clouds.vertices.get(stamp), clouds.points.get(stamp)
+        meshes = body_meshes(recording.bodies[stamp], vertices, recording.triangles, points)
+        if meshes:
+            frames.append(SceneFrame(data.seconds(stamp), meshes))
+    if frames:
+        forward, _, up = facing(body_joints(recording.bodies[stamps[0]][0]))
+        data.scene = scene_data(frames, forward, up)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Clouds:
+    """Messages by stamp: the vertices of the bodies, and the points that they were fitted to."""
+
+    vertices: dict[int, Any]
+    points: dict[int, Any]
+
+
+def _clouds(recording: Recording, given: Bag, made: Bag, stamps: list[int]) -> _Clouds:
+    topics = recording.cloud_topics
+    vertices = fetch(made, {topics.get("body_vertices", ""): stamps})
+    points = fetch(made, {topics.get("hull", ""): stamps}) or fetch(given, {topics.get("points", ""): stamps})
+    return _Clouds({stamp: one for (_, stamp), one in vertices.items()}, {s: one for (_, s), one in points.items()})
 
 
 def energy_series(data: ReportData) -> list[Series]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -30,7 +30,7 @@ from flowing_puppet_ros.view.overlay import DrawnPuppet, draw_puppets
 from flowing_puppet_ros.view.palette import part_colours
 from flowing_puppet_ros.view.pictures import shrink, to_height
 
-STRIP_HEIGHT, FLOW_HEIGHT, VIEW_HEIGHT = 760, 400, 400
+STRIP_HEIGHT, FLOW_HEIGHT, VIEW_HEIGHT = 560, 400, 400
 BODY_SIZE = (360, 520)
 VIEW_ASPECT = 0.75
 POINT_COLOUR = (20, 90, 200)
@@ -60,14 +60,17 @@ class BodyShot:
 
 def fetch(bag: Bag, wanted: Mapping[str, Iterable[int]]) -> dict[tuple[str, int], Any]:
     """Messages {(topic, stamp)} of the wanted stamps (ns) of each topic; missing and damaged ones are left out."""
+    return dict(each(bag, wanted))
+
+
+def each(bag: Bag, wanted: Mapping[str, Iterable[int]]) -> Iterator[tuple[tuple[str, int], Any]]:
+    """Yield ((topic, stamp), message) as `fetch` does, one after the other, so that many images need little memory."""
     stamps = {topic: set(values) for topic, values in wanted.items() if topic}
-    found: dict[tuple[str, int], Any] = {}
     for record in bag.messages([topic for topic in stamps if topic in bag.topics]):
         with suppress(InputError):
             message = record.message
             if stamp_ns(message) in stamps[record.topic]:
-                found[record.topic, stamp_ns(message)] = message
-    return found
+                yield (record.topic, stamp_ns(message)), message
 
 
 def spread_over(stamps: Sequence[int], count: int) -> list[int]:
@@ -139,7 +142,7 @@ def people_box(people: Iterable[Sequence[Any]], shape: tuple[int, ...], margin: 
 
 
 def track_shot(image: np.ndarray, people: Sequence[Any], box: Box) -> np.ndarray:
-    """The part `box` of an image with its puppets drawn over it, the first with labels; at most 760 rows."""
+    """The part `box` of an image with its puppets drawn over it, the first with labels; at most 560 rows."""
     part = box.cut(image)
     small = shrink(part, STRIP_HEIGHT)
     factor = small.shape[0] / part.shape[0]
@@ -193,26 +196,31 @@ class BodyMesh:
     points: np.ndarray  # (N,3), may be empty
 
 
-def body_mesh(body: Any, vertices: Any, triangles: np.ndarray, hull: Any | None) -> BodyMesh | None:
-    """The first body's mesh from the messages of its stamp (clouds of the vertices and of the hull), None without one.
+def body_meshes(bodies: Sequence[Any], vertices: Any, triangles: np.ndarray, cloud: Any | None) -> list[BodyMesh]:
+    """The meshes of a stamp's bodies from its messages: the cloud of all their vertices, and what they were fitted to.
 
-    The cloud holds the vertices of all bodies one after the other.
+    Empty when the cloud of the vertices is missing or is not one body after the other.
     """
-    if vertices is None or not len(triangles):
-        return None
+    if vertices is None or not len(triangles) or not bodies:
+        return []
     count = int(triangles.max()) + 1
-    points = decode_cloud(vertices)[0][:count]
-    if len(points) < count:
-        return None
-    colours = np.full((count, 3), 205.0)
-    try:
+    places = decode_cloud(vertices)[0]
+    if len(places) < count * len(bodies):
+        return []
+    points = decode_cloud(cloud)[0] if cloud is not None else np.zeros((0, 3))
+    return [
+        BodyMesh(places[count * k : count * (k + 1)], triangles, _colours(body, count), points)
+        for k, body in enumerate(bodies)
+    ]
+
+
+def _colours(body: Any, count: int) -> np.ndarray:
+    """Colours (V, 3) of the parts; a body of a model that is not installed here is grey."""
+    with suppress(PuppetError):
         model = StitchedPuppet.load(body.model)
         if len(model.part_of_vertex) == count:
-            colours = part_colours(model.tree.names)[model.part_of_vertex].astype(float)
-    except PuppetError:
-        pass  # a body of a model that is not installed here is shown in grey
-    cloud = decode_cloud(hull)[0] if hull is not None else np.zeros((0, 3))
-    return BodyMesh(points, triangles, colours, cloud)
+            return part_colours(model.tree.names)[model.part_of_vertex].astype(float)
+    return np.full((count, 3), 205.0)
 
 
 def body_shot(stamp: int, body: Any, mesh: BodyMesh, images: Sequence[tuple[str, Camera, np.ndarray]]) -> BodyShot:

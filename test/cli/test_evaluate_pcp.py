@@ -42,7 +42,7 @@ def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.Captur
         images = {f"im{k}.png": [{"joints": people[0]}] for k in (0, 1)}
         truth.write_text(json.dumps({"joint_names": MODEL.joint_names, "images": images}))
     assert main(["evaluate", "pcp", str(poses), "--truth", str(truth), "--json", "--pixels", "10"]) == 0
-    figures = json.loads(capsys.readouterr().out)[str(poses)]
+    figures = json.loads(capsys.readouterr().out)["poses"]
     assert figures["people"] == 2 and figures["found"] == 100
     assert figures["strict lower arms"] == 50 and figures["strict torso"] == 100
     assert figures["wrists within 10 px"] == 50 and figures["wrists of the best solution"] == 100
@@ -58,13 +58,15 @@ def test_one_command_measures_every_method(tmp_path: Path, capsys: pytest.Captur
     header, *lines = capsys.readouterr().out.splitlines()
     assert all(method in header for method in (DETECTOR, *METHODS))
     assert any(line.startswith("strict lower arms") for line in lines)
-    figures = json.loads((out / "pcp.json").read_text())
+    figures = json.loads((out / "pcp.json").read_text())["figures"]
     assert list(figures) == [DETECTOR, *METHODS]
     assert all(row["people"] == 2 for row in figures.values())
     with (out / "pcp.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["method"] for row in rows] == list(figures)
-    assert float(rows[0]["found"]) == figures[DETECTOR]["found"]
+    assert list(rows[0]) == ["figure", *figures]
+    (found,) = (row for row in rows if row["figure"] == "found")
+    assert float(found[DETECTOR]) == figures[DETECTOR]["found"]
+    assert {path.name for path in out.glob("*.png")} == {"pcp-strict.png", "pcp-loose.png"}
 
 
 @pytest.mark.parametrize("case", ["no truth", "no poses", "broken", "strangers", "pixels", "nobody", "no image"])

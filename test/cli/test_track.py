@@ -233,3 +233,39 @@ def test_a_bag_with_damaged_messages_or_without_its_end_is_tracked(
     tracks = json.loads(out.read_text())
     assert [frame["index"] for frame in tracks["frames"]] == [0, 1, 3, 4, 5, 6, 7]
     assert all(frame["puppets"] for frame in tracks["frames"])
+
+
+def test_overlay_shows_what_was_tracked_and_plays_back(
+    frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    init = write_keypoints(tmp_path / "k.json", {"0": [start()]})
+    command = ["track", str(frames), "--init", str(init), "--out", str(tmp_path / "t.json")]
+    assert main([*command, "--overlay", str(tmp_path / "o.mp4")]) == 0
+    capture = cv2.VideoCapture(str(tmp_path / "o.mp4"))
+    shown = [capture.read() for _ in range(7)]
+    assert [read for read, _ in shown] == [True] * 6 + [False]
+    picture = shown[2][1]
+    assert picture.shape == (240, 640, 3)
+    x, y = PUPPET.contours[0].mean(axis=0).astype(int)
+    assert np.abs(picture[y, x].astype(int) - draw(4.0)[y, x]).max() > 20, "the puppet is painted over the frame"
+    assert main([*command, "--overlay", str(tmp_path / "o.gif")]) == 2
+    assert "must end in .mp4" in capsys.readouterr().err
+
+
+def test_broken_images_cuts_and_single_frames_do_not_stop_the_run(
+    frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (frames / "1.png").write_bytes(b"\x89PNG")
+    for k in (3, 4, 5):
+        cv2.imwrite(str(frames / f"{k}.png"), draw(0.0)[::-1, ::-1] // 3)
+    init = write_keypoints(tmp_path / "k.json", {"0": [start()], "4": [start()]})
+    assert main(["track", str(frames), "--init", str(init), "--out", str(tmp_path / "t.json")]) == 0
+    said = capsys.readouterr().err
+    assert "1.png is no readable image and is left out" in said
+    assert "frame 3: the picture changes as at a cut" in said
+    tracks = json.loads((tmp_path / "t.json").read_text())["frames"]
+    assert [frame["index"] for frame in tracks] == [0, 2, 3, 4, 5]
+    assert [[p["id"] for p in frame["puppets"]] for frame in tracks] == [["a1"], ["a1"], [], ["a2"], ["a2"]]
+    one = write_keypoints(tmp_path / "one.json", {"0": [start()]})
+    assert main(["track", str(frames / "0.png"), "--init", str(one), "--out", str(tmp_path / "s.json")]) == 0
+    assert len(json.loads((tmp_path / "s.json").read_text())["frames"]) == 1

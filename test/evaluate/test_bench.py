@@ -2,14 +2,18 @@
 """`flowing-puppet bench`: that every part measures what it says, not how fast this machine is."""
 
 import json
+import sys
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.cli.bench import PARTS
-from flowing_puppet_ros.evaluate import bench
+from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.evaluate import bench, bench_peers, bench_streams
 
 
 @pytest.fixture(autouse=True)
@@ -21,6 +25,10 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bench, "PLAIN_SIZE", (4, 1))
     monkeypatch.setattr(bench, "TRACKED_POINTS", 600)
     monkeypatch.setattr(bench, "TRACKED_FRAMES", 2)
+    monkeypatch.setattr(bench_streams, "SIZES", ((160, 120), (200, 150)))
+    monkeypatch.setattr(bench_streams, "PEOPLE", (1, 2))
+    monkeypatch.setattr(bench_streams, "MIDDLE", (200, 150))
+    monkeypatch.setattr(bench_streams, "FRAMES", 3)
 
 
 def test_each_step_is_compared_with_the_plain_one(capsys: pytest.CaptureFixture[str]) -> None:
@@ -56,6 +64,62 @@ def test_tracking_is_measured_without_the_first_search(monkeypatch: pytest.Monke
     assert [row["searched"] for row in rows] == [1, 1]
     assert searched == [True, False]
     assert all(row["milliseconds_a_frame"] > 0 for row in rows)
+
+
+def test_images_are_measured_by_size_and_people_who_are_all_tracked(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench", "images", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["images"]
+    assert [(row["width"], row["people"]) for row in rows] == [(160, 1), (200, 1), (200, 2)]
+    assert all(row["tracked"] == row["people"] and row["milliseconds_an_image"] > 0 for row in rows)
+
+
+def test_a_fit_is_compared_with_gradients_at_equal_time_and_at_equal_error() -> None:
+    curve = np.array([[1.0, 0.30], [2.0, 0.10], [4.0, 0.04], [9.0, 0.02]])
+    row = bench_peers.gradient_row(0.05, 3.0, curve)
+    assert row["gradient_cm_then"] == pytest.approx(10)
+    assert row["gradient_seconds_as_good"] == 4.0
+    assert row["gradient_cm_end"] == pytest.approx(2)
+    assert bench_peers.gradient_row(0.01, 0.5, curve)["gradient_seconds_as_good"] == float("inf")
+    assert np.isnan(bench_peers.gradient_row(0.01, 0.5, curve)["gradient_cm_then"])
+
+
+def test_a_peer_is_installed_once_and_speaks_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "echo.py").write_text("import json, sys\nprint('noise')\nprint(json.dumps(sys.argv[1:]))\n")
+    (tmp_path / "fail.py").write_text("raise SystemExit('no such thing')\n")
+    monkeypatch.setattr(bench_peers, "SCRIPTS", tmp_path)
+    calls: list[list[str]] = []
+    really = bench_peers._run
+
+    def run(command: list[str]) -> str:
+        calls.append(command)
+        return really(command)
+
+    monkeypatch.setattr(bench_peers, "_run", run)
+    (tmp_path / "echo" / "bin").mkdir(parents=True)
+    (tmp_path / "echo" / "bin" / "python").symlink_to(sys.executable)
+    (tmp_path / "echo" / "installed").write_text("()")
+    assert bench_peers.Peer("echo", "echo.py", ()).run(tmp_path, "a", "b") == ["a", "b"]
+    assert len(calls) == 1
+    (tmp_path / "fail").symlink_to(tmp_path / "echo")
+    with pytest.raises(PuppetError, match="no such thing"):
+        bench_peers.Peer("fail", "fail.py", ()).run(tmp_path)
+    with pytest.raises(InputError, match="source tree"):
+        bench_peers.Peer("echo", "gone.py", ()).run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (["gradient", "--count", "0"], "--count is 0"),
+        (["gradient", "--seed", "-1"], "--seed is -1"),
+        (["mediapipe"], "--clips and --truth"),
+    ],
+)
+def test_unusable_arguments_of_peers_are_named(
+    flags: list[str], named: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["bench", "peers", *flags]) == 2
+    assert named in capsys.readouterr().err
 
 
 def test_tables_are_headed_by_what_was_measured(capsys: pytest.CaptureFixture[str]) -> None:

@@ -51,15 +51,20 @@ def _run(folder: Path, *flags: str) -> int:
 
 def test_true_fits_give_true_correspondence(people: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert _run(people, "--pairs", "all", "--json", "--out", str(people / "out")) == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert (figures["intra"]["pairs"], figures["inter"]["pairs"]) == (4, 8)
-    assert figures["intra"]["mean_cm"] < 0.05
-    assert figures["inter"]["mean_cm"] < 0.05
+    runs = json.loads(capsys.readouterr().out)
+    figures = runs["fits"]
+    assert (figures["intra pairs"], figures["inter pairs"]) == (4, 8)
+    assert figures["intra mean_cm"] < 0.05
+    assert figures["inter mean_cm"] < 0.05
     written = json.loads((people / "out" / "correspondence.json").read_text())
-    assert written["summary"] == figures
-    assert written["cumulative_percent"]["intra"][-1] > 99
-    assert "<svg" in (people / "out" / "correspondence.html").read_text()
-    assert len((people / "out" / "correspondence.csv").read_text().splitlines()) == 13
+    assert written["figures"] == runs
+    assert written["cumulative_percent"]["fits"]["intra"][-1] > 99
+    assert sum(written["histogram_percent"]["fits"]["inter"]) == pytest.approx(100)
+    assert [len(written["pairs"]["fits"][kind]) for kind in ("intra", "inter")] == [4, 8]
+    assert len((people / "out" / "correspondence.csv").read_text().splitlines()) == 1 + len(figures)
+    for chart in ("cumulative", "histogram"):
+        assert (people / "out" / f"correspondence-{chart}.png").is_file()
+        assert (people / "out" / f"correspondence-{chart}.svg").is_file()
 
 
 def test_errors_are_in_the_unit_of_the_fit(tmp_path: Path, model: StitchedPuppet) -> None:
@@ -78,7 +83,7 @@ def test_a_crossed_fit_is_seen(tmp_path: Path, model: StitchedPuppet, capsys: py
     fit = dict(np.load(tmp_path / "fits" / "anna1.npz"))
     np.savez(tmp_path / "fits" / "anna1.npz", **fit | {"vertices": fit["vertices"][model.mirror_vertex]})
     assert _run(tmp_path, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["intra"]["mean_percent_of_stature"] > 5
+    assert json.loads(capsys.readouterr().out)["fits"]["intra mean_percent_of_stature"] > 5
 
 
 def test_vertex_lists_name_the_common_points(
@@ -90,9 +95,9 @@ def test_vertex_lists_name_the_common_points(
             path = people / f"tr_reg_0{person}{pose}.vts"
             np.savetxt(path, (common if (person, pose) != (1, 1) else turned) + 1, fmt="%d")
     assert _run(people, "--vts", str(people), "--json", "--subject", r"tr_reg_0(\d)") == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert figures["intra"]["worst_pair_cm"] > 5
-    assert figures["intra"]["median_pair_cm"] < figures["intra"]["worst_pair_cm"]
+    figures = json.loads(capsys.readouterr().out)["fits"]
+    assert figures["intra worst_pair_cm"] > 5
+    assert figures["intra median_pair_cm"] < figures["intra worst_pair_cm"]
     path.write_text("0\n")
     assert _run(people, "--vts", str(people)) == 2
     assert "numbers from 1 to" in capsys.readouterr().err

@@ -96,23 +96,23 @@ def test_arrays_come_back(tmp_path: Path) -> None:
 def test_learning_finds_what_drawn_hands_have_in_common() -> None:
     """Filters learned on drawn arms of some directions judge arms of others."""
     model = DeformableStructures.load()
-    puppet = model.puppet_from_joints(model.mean_joints() * SCALE + [150.0, 60.0], SCALE)
+    puppet = model.puppet_from_joints(model.mean_joints() * SCALE + [80.0, 30.0], SCALE)
     wrist, elbow = (model.joint_names.index(f"left_{name}") for name in ("wrist", "elbow"))
     people = []
-    for k in range(90):
+    for k in range(84):
         angle = 2.4 * k
         joints = puppet.joints.copy()
-        joints[wrist] = 149.5
-        joints[elbow] = 149.5 - 0.24 * SCALE * np.array([np.cos(angle), np.sin(angle)])
-        image = arm(angle)
+        joints[wrist] = 79.5
+        joints[elbow] = 79.5 - 0.24 * SCALE * np.array([np.cos(angle), np.sin(angle)])
+        image = arm(angle, 160)
         shape = model.puppet_from_joints(joints, SCALE)
         seen = np.isin(np.arange(len(joints)), (wrist, elbow)).astype(float)
         people.append(Posed(f"v{k}.avi", image, shape, seen, image))
     learned, boxes = learn(model, lambda: people, HandSettings(wrong=4), lambda _: None)
-    assert boxes.right.sum() == 90
-    maps = HandMaps.of(learned, scene(arm(0.5)), [], SCALE)
-    elbows = np.array([[149.5 - 40 * np.cos(0.5), 149.5 - 40 * np.sin(0.5)], [100.0, 40.0]])
-    score = hand_score(maps, np.array([[149.5, 149.5], [60.0, 60.0]]), elbows, SCALE)
+    assert boxes.right.sum() == 84
+    maps = HandMaps.of(learned, scene(arm(0.5, 160)), [], SCALE)
+    elbows = np.array([[79.5 - 40 * np.cos(0.5), 79.5 - 40 * np.sin(0.5)], [70.0, 20.0]])
+    score = hand_score(maps, np.array([[79.5, 79.5], [40.0, 40.0]]), elbows, SCALE)
     assert score[0] > score[1] + 2.0
     with pytest.raises(InputError, match="too few wrists"):
         learn(model, lambda: people[:3], HandSettings(wrong=4), lambda _: None)

@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import painted_people as painted  # type: ignore[import-not-found]
 import pytest
@@ -10,11 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.region import RegionMap
 from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
 from flowing_puppet_ros.image.detector_parts import COLUMNS, DIMENSIONS, LEFT, OUTSIDE, ROWS, UP, window_at
-from flowing_puppet_ros.image.detector_person import JOINTS, PersonDetection
+from flowing_puppet_ros.image.detector_person import JOINTS, PersonDetection, Place
 from flowing_puppet_ros.image.detector_root import RootFilters, level, overlap, pyramid, respond, suppress
 from flowing_puppet_ros.image.detector_search import propose
+from flowing_puppet_ros.image.detector_skin import skin_measures
 from flowing_puppet_ros.image.keypoints import joints_from_keypoints
 from flowing_puppet_ros.model.ds import DeformableStructures
 
@@ -95,6 +100,50 @@ def test_people_are_reported_once_and_surest_first(detector: PartDetector) -> No
         assert all(np.linalg.norm(one.neck - two.neck) >= 0.5 * max(one.scale, two.scale) for two in people[:i])
     few = detector.detect(painted.picture(np.random.default_rng(5))[0], DetectorSettings(most_people=1))
     assert len(few) <= 1
+
+
+def test_a_pose_is_found_again_where_it_was_found(detector: PartDetector, person: PersonDetection) -> None:
+    image, _, _ = painted.picture(np.random.default_rng(3), 40.0)
+    places = detector.candidates(image, ANYBODY)
+    assert len(places) > 1
+    nearest = min(places, key=lambda place: float(np.linalg.norm(place.neck - person.neck)))
+    (again,) = detector.at(image, [nearest], ANYBODY)
+    assert np.linalg.norm(again.neck - person.neck) < 0.5 * person.scale
+    assert again.scale == pytest.approx(nearest.scale)
+    assert again.confidence == pytest.approx(1 / (1 + np.exp(-nearest.log_odds)))
+
+
+def test_nobody_is_seen_at_a_place_whose_pose_scores_too_little(detector: PartDetector) -> None:
+    image, _, _ = painted.picture(np.random.default_rng(3), 40.0)
+    place = detector.candidates(image, ANYBODY)[0]
+    score = detector.at(image, [place], ANYBODY)[0].pose.score
+    supposed = [replace(place, least=score - 0.1), replace(place, least=score + 0.1)]
+    assert len(detector.at(image, supposed, ANYBODY)) == 1
+
+
+def test_places_of_a_large_image_are_in_its_pixels(detector: PartDetector) -> None:
+    image = painted.picture(np.random.default_rng(3), 40.0)[0]
+    large = cv2.resize(image, None, fx=4, fy=4, interpolation=cv2.INTER_LINEAR)
+    place = max(detector.candidates(large, ANYBODY), key=lambda one: one.log_odds)
+    assert (place.neck < np.array(large.shape[1::-1]) * 1.1).all()
+    (found,) = detector.at(large, [place], ANYBODY)
+    assert np.linalg.norm(found.neck - place.neck) < 0.8 * place.scale
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (20, 300, 3)])
+def test_too_small_an_image_has_no_places(detector: PartDetector, shape: tuple[int, ...]) -> None:
+    image = np.zeros(shape, np.uint8)
+    assert detector.candidates(image) == []
+    assert detector.at(image, [Place(np.zeros(2), np.array([0.0, -20.0]), 40.0, 0.0)]) == []
+
+
+def test_skin_is_measured_on_face_around_it_and_on_the_chest() -> None:
+    values = np.zeros((100, 100))
+    values[15:26, 45:56] = 2.0  # the face
+    values[60:, :] = 1.0
+    measures = skin_measures(RegionMap.of(values), np.array([50.0, 45.0]), np.array([50.0, 20.0]), 25.0)
+    assert measures[0] == pytest.approx(2.0) and 1.0 < measures[1] < 2.0 and 0.1 < measures[2] < 0.9
+    assert (skin_measures(RegionMap.of(values), np.full(2, 900.0), np.full(2, 900.0), 25.0) == 0.0).all()
 
 
 def test_ten_people_are_no_more_work_than_asked(detector: PartDetector) -> None:

@@ -3,6 +3,7 @@
 
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 from drawn_people import NAMES, SCALE, SIZE, CapsuleModel, Floats, detection, draw, error, pose, tracker  # type: ignore[import-not-found]
@@ -199,3 +200,19 @@ def test_ids_begin_with_the_seed() -> None:
     assert [letters(seed) for seed in (0, 1, 25, 26, 701, 702)] == ["a", "b", "z", "aa", "zz", "aaa"]
     (puppet,) = tracker(seed=2).step(draw(pose(0)), 0, [detection(pose(0))]).puppets
     assert puppet.id == "c1"
+
+
+def test_joints_behind_a_nearer_person_are_doubted() -> None:
+    far, near = pose(0, (150, 118)), (pose(0) - [150, 118]) * 1.4 + [175, 118]
+    alone = tracker().step(draw(far), 0, [detection(far)]).puppets[0]
+    both = tracker().step(draw(far, near), 0, [detection(near), detection(far)]).puppets
+    assert len(both) == 2
+    behind, before = sorted(both, key=lambda puppet: puppet.scale)
+    covered = behind.confidence < 0.5 * alone.confidence
+    assert covered.any()
+    assert not covered.all()
+    contours = [np.asarray(contour, np.float32) for contour in before.contours]
+    for point, hidden in zip(behind.joints, covered, strict=True):
+        depths = [cv2.pointPolygonTest(contour, (float(point[0]), float(point[1])), True) for contour in contours]
+        if abs(max(depths)) > 2.0:
+            assert hidden == (max(depths) > 0)

@@ -129,3 +129,16 @@ def test_small_flow_grid_serves_large_images() -> None:
     assert result.flow[0].shape == (240, 320, 2)
     contour = capsule(np.zeros(2), np.ones(2), 1.0)
     assert len(result.puppets[0].contours[0]) == len(contour)
+
+
+def test_a_cut_ends_everybody_and_ids_are_not_used_again() -> None:
+    follower = tracker()
+    shots = [draw(pose(time)) for time in (0, 1, 2)] + [draw(pose(time))[::-1, ::-1] // 3 for time in (2, 3)]
+    ids, warnings = [], []
+    for k, image in enumerate(shots):
+        result = follower.step(np.ascontiguousarray(image), k, [detection(pose(k))])
+        ids.append([puppet.id for puppet in result.puppets])
+        warnings.append(result.warnings)
+    assert ids == [["a1"], ["a1"], ["a1"], ["a2"], ["a2"]]
+    assert [len(said) for said in warnings] == [0, 0, 0, 1, 0]
+    assert "cut" in warnings[3][0]

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames of videos and folders, in order, and one sentence for what cannot be read."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -56,3 +57,29 @@ def test_a_truncated_video_gives_the_frames_it_has(tmp_path: Path) -> None:
     data = (tmp_path / "a.avi").read_bytes()
     (tmp_path / "b.avi").write_bytes(data[: len(data) // 2])
     assert 0 < len(list(open_frames(tmp_path / "b.avi"))) < 40
+
+
+def test_broken_frames_are_told_of_and_left_out_when_somebody_listens(tmp_path: Path) -> None:
+    for k in range(4):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.full((20, 30, 3), k, np.uint8))
+    (tmp_path / "2.png").write_bytes(b"\x89PNG")
+    said: list[str] = []
+    assert [frame.index for frame in open_frames(tmp_path, said.append)] == [0, 1, 3]
+    assert len(said) == 1
+    assert "2.png is no readable image" in said[0]
+    with pytest.raises(InputError, match=r"2\.png"):
+        list(open_frames(tmp_path))
+
+
+def test_a_video_goes_on_after_frames_that_cannot_be_decoded(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.avi", 30)
+    data = bytearray((tmp_path / "a.avi").read_bytes())
+    starts = [at for at in range(len(data)) if data[at : at + 4] == b"00dc"][:30]
+    for start, end in pairwise(starts[10:13]):
+        data[start + 8 : end] = bytes(end - start - 8)
+    (tmp_path / "b.avi").write_bytes(data)
+    said: list[str] = []
+    frames = list(open_frames(tmp_path / "b.avi", said.append))
+    assert frames[-1].index >= 27
+    assert abs(int(frames[-1].image[0, 0, 2]) - (290 - 256)) < 6, "the last image is the last"
+    assert len(frames) == 30 or said

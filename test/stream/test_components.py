@@ -144,6 +144,23 @@ def test_the_flow_node_and_the_tracker_agree(images: list[Any], detections: dict
     assert joined.counters["images without flow"] == 0
 
 
+def test_a_flow_topic_that_stops_is_told_of_and_made_up_for(images: list[Any], detections: dict[int, Any]) -> None:
+    flows = OpticalFlowComponent(FlowSettings(), FACTORY)
+    follower = tracker()
+    for port in ("flow/forward", "flow/backward", "detections"):
+        follower.expects(port, True)
+    stream: Stream = []
+    for number, image in enumerate(images[:6]):
+        made = flows.handle("image", image)
+        stream += [("image", image), *(made if number < 3 else [])]
+        if stamp_ns(image) in detections:
+            stream.append(("detections", detections[stamp_ns(image)]))
+    found = puppets(drive(follower, stream))
+    assert len(found) == 6
+    assert follower.counters["images without flow"] == 3
+    assert [text for text in follower.drain_warnings() if "without the flow" in text]
+
+
 def test_flow_points_along_the_motion_and_starts_anew_after_a_jump_back() -> None:
     rng = np.random.default_rng(0)
     texture = np.repeat(np.repeat(rng.integers(0, 255, (40, 50), dtype=np.uint8), 4, 0), 4, 1)

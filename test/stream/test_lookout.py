@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
+from flowing_puppet_ros.evaluate.drawn_person import DrawnPerson
 from flowing_puppet_ros.flow.estimate import FlowSettings, OpticalFlow
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.stream.component import PUPPETS
@@ -15,7 +16,6 @@ from flowing_puppet_ros.stream.images import make_image
 from flowing_puppet_ros.stream.lookout import FRAME_NS, Lookout, LookoutSettings, carried
 from flowing_puppet_ros.stream.messages import make_header, stamp_ns
 from flowing_puppet_ros.stream.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
-from flowing_puppet_ros.view.drawn_person import DrawnPerson
 
 FACTORY = BagMessageFactory()
 SECOND = 1_000_000_000

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -151,12 +152,11 @@ def test_in_the_background_a_search_holds_nobody_up(
         return quick(fitter, *arguments, **keywords)
 
     monkeypatch.setattr(BodyFitter, "fit", slow)
-    stage.component.search_in_background()
+    beside = ThreadPoolExecutor(1)
+    stage.component.background = beside
 
     def wait() -> None:
-        for thread in threading.enumerate():
-            if thread.name == "full fit":
-                thread.join(60)
+        beside.submit(int).result(60)
 
     gate.set()
     assert stage.show((0, 0)) == {}, "the search runs beside"
@@ -171,6 +171,28 @@ def test_in_the_background_a_search_holds_nobody_up(
     # The new body has followed the person through the clouds that came while it was searched.
     assert stage.show((0.15, 0), (2.3, 0)) == {(0.15, 0): "b1", (2.3, 0): "b2"}
     assert len(fits) == 2
+    beside.shutdown()
+
+
+def test_what_goes_wrong_in_the_background_is_told_and_ends_nothing(
+    person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stage, good = Stage(person, floor), BodyFitter.fit
+
+    def broken(*_: Any, **__: Any) -> BodyFit:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(BodyFitter, "fit", broken)
+    with ThreadPoolExecutor(1) as beside:
+        stage.component.background = beside
+        assert stage.show((0, 0)) == {}
+        beside.submit(int).result(60)
+        with pytest.raises(ZeroDivisionError, match="a defect"):
+            stage.show((0, 0))
+        monkeypatch.setattr(BodyFitter, "fit", good)
+        stage.show((0, 0))
+        beside.submit(int).result(60)
+        assert list(stage.show((0, 0)).values()) == ["b1"]
 
 
 def test_goals_fit_everybody_and_touch_no_track(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A tiny made-up replay for the tests: two cameras, one person of capsules, one box for a body."""
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from flowing_puppet_ros.bag.replay import NOTE
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.body.camera import Camera
@@ -66,6 +68,7 @@ class Content:
     detections: bool = True
     images: bool = True
     bystander: bool = False
+    overlays: bool = False
 
 
 @pytest.fixture
@@ -73,9 +76,15 @@ def replay(tmp_path: Path) -> Replay:
     """Makes the bags of a replay, given what they should hold; returns the paths of the input and the output."""
 
     def make(**content: bool) -> tuple[Path, Path]:
-        return write_replay(tmp_path, Content(**content))
+        return write_bags(tmp_path, Content(**content))
 
     return make
+
+
+@pytest.fixture(scope="session")
+def write_replay() -> Replay:
+    """Makes the bags of a replay in a folder; returns the paths of the input and the output."""
+    return lambda folder: write_bags(folder, Content())
 
 
 def joints_at(frame: int) -> dict[str, np.ndarray]:
@@ -83,13 +92,14 @@ def joints_at(frame: int) -> dict[str, np.ndarray]:
     return {name: point + np.array([0, 0.02 * frame, 0]) for name, point in JOINTS.items()}
 
 
-def write_replay(folder: Path, content: Content) -> tuple[Path, Path]:
+def write_bags(folder: Path, content: Content) -> tuple[Path, Path]:
     """Write the input and the output bag; returns their paths."""
     given, made = folder / "given", folder / "made"
     with BagWriter(given) as bag:
         _write(bag, _inputs(content))
     with BagWriter(made) as bag:
         _write(bag, _outputs(content))
+        bag.note(NOTE, {"replay": json.dumps({"settings": {"front/puppet_tracker": {"particles": 42}}})})
     return given, made
 
 
@@ -146,6 +156,11 @@ def _outputs(content: Content) -> list[tuple[str, str, int, Any]]:
                 header = make_header(FACTORY, stamp, name)
                 people = [_person(pixels_at(frame, view), "a1", shift=3.0)]
                 messages.append(_people(f"/{name}/puppets", header, stamp, people))
+            if content.overlays:
+                kind = "sensor_msgs/msg/CompressedImage"
+                data = jpeg(np.full((64, 48, 3), 40 * frame, np.uint8), 95)
+                image = FACTORY.make(kind, header=make_header(FACTORY, stamp, name), format="jpeg", data=data)
+                messages.append((f"/{name}/overlay/compressed", kind, stamp, image))
         if content.bodies and frame % 2 == 0:
             header = make_header(FACTORY, stamp, "world")
             messages += _body(header, stamp, frame)

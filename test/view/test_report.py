@@ -67,7 +67,7 @@ def test_the_whole_page_stands_alone(replay: Replay) -> None:
     assert not re.search(r"https?:|@import|url\(|file:", html)
     assert all(image.get("alt") for image in page.images)
     assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
-    # 5 frames of the strip, 3 pictures of each of 4 flows, for 3 bodies 2 sides and 2 cameras, 2 colour scales.
+    # 5 frames of the track, 3 pictures of each of 4 flows, for 3 bodies 2 sides and 2 cameras, 2 colour scales.
     assert len(page.images) == 5 + 3 * 4 + 3 * (2 + 2) + 2
     for image in page.images:
         data = base64.b64decode(str(image["src"]).split(",", 1)[1])
@@ -193,6 +193,15 @@ def test_the_same_bags_make_the_same_page(replay: Replay, tmp_path: Path) -> Non
         write_report(given, made, tmp_path / name, {"seconds": 2.0})
         pages.append((tmp_path / name).read_bytes())
     assert pages[0] == pages[1]
+
+
+def test_the_output_alone_shows_its_overlays_bodies_and_settings(replay: Replay) -> None:
+    _, made = replay(overlays=True)
+    data = gather(made, made)
+    assert [round(float(picture.mean()) / 40) for _, picture in data.strip] == [0, 1, 2, 3, 4]
+    assert data.scene is not None and len(data.scene["frames"]) == 3 and data.flow == []
+    text = Page(report_page(data)).text
+    assert "front/puppet_tracker: settings" in text and "particles" in text and "42" in text
 
 
 def test_settings_that_are_alike_stand_in_one_table(replay: Replay) -> None:

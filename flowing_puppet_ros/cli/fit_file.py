@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The fit of one file of `flowing-puppet fit`: unit, axes and view found, the body fitted, and the result written."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.frames import (
+    UNITS,
+    Frame,
+    all_candidates,
+    axis_of,
+    guess_scale,
+    seen_from_origin,
+    up_candidates,
+)
+from flowing_puppet_ros.body.io import Scan, read_scan, storable, write_ply
+from flowing_puppet_ros.body.people import ExtractionSettings
+from flowing_puppet_ros.body.scene import people_of_scene
+from flowing_puppet_ros.body.upright import fit_in_best_frame
+from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.view.palette import part_colours
+
+WRITTEN_SHAPES = 4
+SCENE_POINTS = 300_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Person:
+    """One person's cloud in a scan's frame and unit.
+
+    Attributes:
+        suffix: appended to the input's stem for the result.
+        points: (N, 3).
+        normals: (N, 3) or None.
+        scale: metres a unit.
+        ups: directions (3,) that may be up, the likelier first.
+        sensor: (3,) where the sensor stood if the cloud shows one side.
+    """
+
+    suffix: str
+    points: np.ndarray
+    normals: np.ndarray | None
+    scale: float
+    ups: list[np.ndarray]
+    sensor: np.ndarray | None
+
+
+@dataclass(frozen=True, slots=True)
+class FitOptions:
+    """All that a fit is told; see the flags of `fit`. `settings.threads` alone does not change the result."""
+
+    out: Path = field(repr=False)
+    model: str
+    up: str
+    upright: str
+    unit: str
+    view: str
+    scene: bool
+    settings: FitterSettings
+    extraction: ExtractionSettings
+
+
+def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str, Any]:
+    """Fit the person, or the people of a scene, in one file; write the results and return a summary for JSON.
+
+    `shown` draws a bar of the progress on stderr. Raises PuppetError when the file cannot be used or nobody is in it.
+    """
+    started = time.perf_counter()
+    fitter = _fitter(options.model, options.settings)
+    _refuse_overwriting(source, options)
+    scan = read_scan(source)
+    if not options.scene:
+        person = _whole_scan(scan, fitter, options)
+        return {"input": str(source)} | _fit_person(source, person, fitter, options, started, shown)
+    fits = []
+    for person in _people(scan, source, fitter, options):
+        fits.append(_fit_person(source, person, fitter, options, started, shown))
+        started = time.perf_counter()
+    return {"input": str(source), "people": fits}
+
+
+def files_of(summary: dict[str, Any]) -> list[Path]:
+    """The files that a summary of `fit_file` names."""
+    outputs = [Path(fit["output"]) for fit in summary.get("people", [summary])]
+    return [output.with_suffix(suffix) for output in outputs for suffix in (".npz", ".ply")]
+
+
+@lru_cache(maxsize=1)
+def _fitter(model: str, settings: FitterSettings) -> BodyFitter:
+    """The fitter that all inputs of a process share."""
+    return BodyFitter(StitchedPuppet.load(model), settings)
+
+
+def _refuse_overwriting(source: Path, options: FitOptions) -> None:
+    if not options.scene and source.suffix in (".npz", ".ply") and source.parent.resolve() == options.out.resolve():
+        raise InputError(f"the fit of {source} would overwrite it; choose another folder for --out")
+
+
+def _whole_scan(scan: Scan, fitter: BodyFitter, options: FitOptions) -> Person:
+    """The only person of a scan."""
+    scale = guess_scale(scan) if options.unit == "auto" else UNITS[options.unit]
+    points, normals = scan.surface(fitter.settings.cloud_points, np.random.default_rng(fitter.settings.seed))
+    sensor = _sensor(points, normals, scale, options.view)
+    ups = up_candidates(points, sensor is not None) if options.up == "auto" else [axis_of(options.up)]
+    return Person("", points, normals, scale, _any_way(points, ups, options), sensor)
+
+
+def _people(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> list[Person]:
+    """The people in the cloud of a scene."""
+    scale = UNITS["m" if options.unit == "auto" else options.unit]
+    points, normals = scan.surface(SCENE_POINTS, np.random.default_rng(fitter.settings.seed))
+    ups = [axis_of(name) for name in (("z", "y", "-y") if options.up == "auto" else (options.up,))]
+    sensor = None if options.view == "full" else np.zeros(3)
+    up, found = people_of_scene(points, normals, scale, ups, sensor, options.extraction)
+    if not found:
+        raise PuppetError(
+            f"{path} shows nobody among its {len(points)} points; check --up and --unit, lower --likeness, or cut the"
+            " person out and leave --scene"
+        )
+    people = []
+    for number, cloud in enumerate(found, start=1):
+        seen = _sensor(cloud.points, cloud.normals, scale, options.view)
+        ways = _any_way(cloud.points, [up], options)
+        people.append(Person(f"-{number}", cloud.points, cloud.normals, scale, ways, seen))
+    return people
+
+
+def _any_way(points: np.ndarray, ups: list[np.ndarray], options: FitOptions) -> list[np.ndarray]:
+    return all_candidates(points) if options.upright == "any" else ups
+
+
+def _fit_person(
+    path: Path, person: Person, fitter: BodyFitter, options: FitOptions, started: float, shown: bool
+) -> dict[str, Any]:
+    output = options.out / f"{path.stem}{person.suffix}.npz"
+    with tqdm(total=100, desc=output.stem, unit="%", file=sys.stderr, disable=not shown) as bar:
+        frame, fit = fit_in_best_frame(
+            fitter,
+            person.points,
+            person.normals,
+            scale=person.scale,
+            ups=person.ups,
+            sensor=person.sensor,
+            progress=_shown(bar),
+        )
+    seconds = time.perf_counter() - started
+    try:
+        _write(output, fitter.model, frame, fit, seconds)
+    except OSError as error:
+        raise PuppetError(f"{output} cannot be written: {error.strerror}") from error
+    return {
+        "output": str(output),
+        "model": fitter.model.name,
+        "energy": fit.energy,
+        "confidence": fit.confidence,
+        "reliable": fit.reliable,
+        "two_way_distance_m": fit.two_way_distance,
+        "metres_per_unit": frame.scale,
+        "up": np.round(frame.up, 6).tolist(),
+        "view": "full" if person.sensor is None else "single",
+        "seconds": seconds,
+    }
+
+
+def _shown(bar: tqdm) -> Callable[[float], None]:
+    return lambda done: bar.update(int(100 * done) - bar.n) and None
+
+
+def _sensor(points: np.ndarray, normals: np.ndarray | None, scale: float, view: str) -> np.ndarray | None:
+    """Where the sensor of a cloud from one side stood, None for one from all sides.
+
+    It stood at the origin when that lies outside the cloud, otherwise where the normals look.
+    """
+    if view == "full" or (view == "auto" and not seen_from_origin(scale * points)):
+        return None
+    low, high = points.min(axis=0), points.max(axis=0)
+    if np.any((low > 0) | (high < 0)):
+        return np.zeros(3)
+    if normals is None:
+        raise InputError("--view single needs the sensor at the origin of the input's frame, or normals; give either")
+    mean = normals.mean(axis=0)
+    return points.mean(axis=0) + 3 * float(np.ptp(points, axis=0).max()) * mean / max(float(np.linalg.norm(mean)), 1e-9)
+
+
+def _write(output: Path, model: StitchedPuppet, frame: Frame, fit: BodyFit, seconds: float) -> None:
+    """Write the fit in the scan's frame and unit as `output` and as a mesh beside it."""
+    vertices = storable(frame.to_scan(fit.vertices))
+    arrays: dict[str, Any] = {
+        "vertices": vertices,
+        "faces": model.faces,
+        "part_of_vertex": model.part_of_vertex,
+        "part_names": np.array(model.tree.names),
+        "part_rotation": (frame.rotation.T @ fit.state.rotation).astype(np.float32),
+        "part_center": frame.to_scan(fit.state.center).astype(vertices.dtype),
+        "part_confidence": fit.part_confidence.astype(np.float32),
+        "joint_names": np.array(model.joint_names),
+        "joints": frame.to_scan(fit.joints).astype(vertices.dtype),
+        "shape_coefficients": fit.state.shape[:, :WRITTEN_SHAPES].astype(np.float32),
+        "all_shape_coefficients": fit.state.shape.astype(np.float32),
+        "pose_coefficients": fit.state.pose.astype(np.float32),
+        "energy": fit.energy,
+        "confidence": fit.confidence,
+        "reliable": fit.reliable,
+        "two_way_distance": fit.two_way_distance / frame.scale,
+        "seconds": seconds,
+        "model": model.name,
+    }
+    # A result is there whole or not at all, even if two machines make it at once or one is stopped.
+    unfinished = output.with_name(f".{output.stem}.{os.getpid()}")
+    try:
+        with unfinished.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
+        unfinished.replace(output)
+        colours = part_colours(model.tree.names)[model.part_of_vertex]
+        write_ply(unfinished, vertices, model.faces, colours)
+        unfinished.replace(output.with_suffix(".ply"))
+    finally:
+        unfinished.unlink(missing_ok=True)

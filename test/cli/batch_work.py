@@ -1,0 +1,30 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work for the tests of batches, which the processes that they start can import."""
+
+import os
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flowing_puppet_ros.errors import InputError
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What the work below does with some inputs."""
+
+    marks: Path
+
+
+def work(source: Path, plan: Plan) -> dict[str, Any]:
+    """Return the process; die, once or always, or fail for inputs that are called so."""
+    mark = plan.marks / source.name
+    if source.name == "dies" or (source.name == "dies_once" and not mark.exists()):
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    if source.name == "unusable":
+        raise InputError("it is unusable")
+    if source.name == "broken":
+        raise ZeroDivisionError("oh")
+    return {"process": os.getpid(), "threads": os.environ["NUMBA_NUM_THREADS"]}

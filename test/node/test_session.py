@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A session's topics: those of people come and go with them, and what is set for one topic is not set for another."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from std_msgs.msg import String
+
+from flowing_puppet_ros.node.diagnostics import Diagnostics
+from flowing_puppet_ros.node.factory import RosMessageFactory
+from flowing_puppet_ros.node.session import Session
+from flowing_puppet_ros.settings import Settings
+from flowing_puppet_ros.stream.component import Component, Output, Port
+
+pytestmark = pytest.mark.ros
+TEXT = "std_msgs/msg/String"
+
+
+class Names(Component):
+    """Says who is there: a message names the people, and each of them gets a topic of their own."""
+
+    settings_type = Settings
+    inputs = (Port("names", TEXT, "sensor"), Port("other", TEXT, "sensor"))
+    outputs = (Port("all", TEXT), Port("more", TEXT), Port("people/{id}/name", TEXT, "latched"))
+
+    def __init__(self) -> None:
+        """Know nobody."""
+        super().__init__(Settings(), RosMessageFactory())
+        self._known: list[str] = []
+
+    def _process(self, port: str, message: Any) -> Output:
+        (_, _, own), names = self.outputs, message.data.split()
+        gone: Output = [(own.of(name), None) for name in self._known if name not in names]
+        self._known = names
+        return [*gone, ("all", message), *((own.of(name), String(data=name)) for name in names)]
+
+
+@pytest.fixture
+def open_session() -> Iterator[Callable[..., tuple[Node, Session[Names]]]]:
+    """Return a function that opens and activates a session on a node with these parameters."""
+    rclpy.init()
+    opened: list[tuple[Node, Session[Names]]] = []
+
+    def run(**parameters: Any) -> tuple[Node, Session[Names]]:
+        given = [Parameter(name, value=value) for name, value in parameters.items()]
+        node = Node("names", parameter_overrides=given)
+        session = Session(node, Names(), 10, Diagnostics("/names", "names"))
+        opened.append((node, session))
+        session.activate()
+        return node, session
+
+    yield run
+    for node, session in opened:
+        session.close()
+        node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def people(node: Node) -> set[str]:
+    """The people whose topics this node has open."""
+    topics = [publisher.topic_name for publisher in node.publishers if publisher.topic_name.startswith("/people/")]
+    assert len(set(topics)) == len(topics)
+    return {topic.split("/")[2] for topic in topics}
+
+
+def tell(session: Session[Names], text: str) -> None:
+    """Publish what the component says of a message."""
+    session.publish(session.component.handle("names", String(data=text)))
+
+
+def test_a_persons_topic_is_there_while_the_person_is(open_session: Callable[..., tuple[Node, Session[Names]]]) -> None:
+    node, session = open_session()
+    assert people(node) == set()
+    tell(session, "ann bob")
+    before = len(node._parameters)
+    assert people(node) == {"ann", "bob"}
+    tell(session, "bob cid")
+    assert people(node) == {"bob", "cid"}
+    assert len(node._parameters) == before, "people who come and go leave nothing behind"
+    own = next(publisher for publisher in node.publishers if publisher.topic_name == "/people/bob/name")
+    assert own.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+
+
+def test_people_who_are_forgotten_have_no_topics(open_session: Callable[..., tuple[Node, Session[Names]]]) -> None:
+    node, session = open_session()
+    tell(session, "ann")
+    session.deactivate()
+    done: list[bool] = []
+    session.worker.call(lambda: done.append(True))
+    while not done:
+        pass
+    assert people(node) == set() and [p.topic_name for p in node.publishers][-2:] == ["/all", "/more"]
+    tell(session, "ann")
+    assert people(node) == set(), "an inactive session publishes nothing"
+    session.activate()
+    tell(session, "bob")
+    assert people(node) == {"bob"}
+    session.close()
+    assert not [p for p in node.publishers if p.topic_name in ("/all", "/more", "/people/bob/name")]
+
+
+def test_a_closed_session_stops_what_runs_in_the_background(
+    open_session: Callable[..., tuple[Node, Session[Names]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, session = open_session()
+    assert isinstance(session.component.background, Executor)
+    stopped: list[bool] = []
+    monkeypatch.setattr(session.component, "reset", lambda: stopped.append(True))
+    session.close()
+    assert stopped
+
+
+def test_an_override_changes_its_own_topic_only(open_session: Callable[..., tuple[Node, Session[Names]]]) -> None:
+    overrides = {
+        "qos_overrides./names.subscription.reliability": "reliable",
+        "qos_overrides./all.publisher.reliability": "best_effort",
+    }
+    for parameters, first in ((overrides, ReliabilityPolicy.RELIABLE), ({}, ReliabilityPolicy.BEST_EFFORT)):
+        node, _ = open_session(**parameters)
+        subscribed = {made.topic_name: made.qos_profile.reliability for made in node.subscriptions}
+        published = {made.topic_name: made.qos_profile.reliability for made in node.publishers}
+        assert subscribed["/names"] == first and subscribed["/other"] == ReliabilityPolicy.BEST_EFFORT
+        assert (published["/all"] == ReliabilityPolicy.BEST_EFFORT) == bool(parameters)
+        assert published["/more"] == ReliabilityPolicy.RELIABLE
