@@ -120,9 +120,9 @@ class PartDetector:
             poses = self.look(small, _smallest(small, factor, settings), settings.places)
         scores = self.ranking.scores(poses)
         found = []
-        for pose, score in zip(poses, scores, strict=True):
+        for index, (pose, score) in enumerate(zip(poses, scores, strict=True)):
             neck, face = ((pose.points[PARTS.index(name)] + 0.5) / factor - 0.5 for name in ("neck", "face"))
-            scale = self.ranking.corrected_scale(pose, pose.scale) / factor
+            scale = self.ranking.corrected_scale(pose, agreed_scale(poses, scores, index)) / factor
             found.append(Place(neck, face, scale, self.ranking.log_odds(float(score)), pose.score))
         return found
 
