@@ -107,6 +107,15 @@ class BodyFitter:
 
     def cloud(self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None) -> Cloud:
         """Thin and index the points; InputError when they cannot be the surface of a person."""
+        points, normals = self.person_points(points, normals, viewpoint)
+        if normals is None:
+            normals = estimated_normals(points, viewpoint)
+        return Cloud.of(points, normals) if viewpoint is None else ViewCloud.seen_from(points, normals, viewpoint)
+
+    def person_points(
+        self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Thin the points; InputError when they cannot be the surface of a person."""
         extent = float(np.ptp(points, axis=0).max())
         if not PERSON_EXTENT[0] <= extent <= PERSON_EXTENT[1]:
             raise InputError(
@@ -119,9 +128,7 @@ class BodyFitter:
             raise InputError(
                 f"the cloud's points lie in {places} places and a fit needs {MIN_POINTS}; give the surface of a person"
             )
-        if normals is None:
-            normals = estimated_normals(points, viewpoint)
-        return Cloud.of(points, normals) if viewpoint is None else ViewCloud.seen_from(points, normals, viewpoint)
+        return points, normals
 
     def promise(self, points: np.ndarray, viewpoint: np.ndarray | None = None) -> float:
         """How well, in metres, any upright body may explain a cloud (N, 3) in metres; lower is better, and fast.

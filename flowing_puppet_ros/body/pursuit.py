@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -12,9 +11,6 @@ import numpy as np
 
 from flowing_puppet_ros.body.tracker import BodyTracker
 from flowing_puppet_ros.errors import InputError
-
-LONGEST_QUEUE = 40
-"""Clouds that wait for the fit; of more every other is left out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,24 +34,23 @@ class _Run:
     def __init__(self, number: int, tracker: BodyTracker, task: Task) -> None:
         self.number = number
         self.tracker = tracker
-        self.queue: deque[Task] = deque([task])
+        self.first = task
+        self.newest: Task | None = None
         self.lock = threading.Lock()
         self.stopped = False
         self.done = False
         self.problem: Exception | None = None
 
     def add(self, task: Task) -> bool:
-        """Queue the next cloud; False when the run is through."""
+        """Keep the newest cloud for when the fit is made; False when the run is through."""
         with self.lock:
             if self.done:
                 return False
-            self.queue.append(task)
-            if len(self.queue) > LONGEST_QUEUE:
-                self.queue = deque(list(self.queue)[::-2][::-1])
+            self.newest = task
             return True
 
     def run(self) -> None:
-        """Fit the first cloud, follow the others; `done` once nothing waits, or a `problem` has ended it."""
+        """Make the fit and catch up; `done` when that is through, or a `problem` has ended it."""
         try:
             self._run()
         except Exception as error:
@@ -63,21 +58,33 @@ class _Run:
                 self.problem, self.done = error, True
 
     def _run(self) -> None:
-        first = True
-        while True:
+        """Fit the first cloud that can be, then follow to the newest, from where whoever takes the body goes on.
+
+        A stream may be faster than the tracker, so to follow every cloud might never come to an end.
+        """
+        fitted = self._took(self.first, search=True)
+        while not self.stopped:
             with self.lock:
-                if not self.queue or self.stopped:
-                    self.done = True
-                    return
-                task = self.queue.popleft()
-            try:
-                self._take(task, first)
-            except _Stopped:
-                self.stopped = True
-            except InputError:
-                pass  # the next cloud may do
-            else:
-                first = False
+                task, self.newest = self.newest, None
+                self.done = task is None
+            if task is None:
+                return
+            followed = self._took(task, search=not fitted)
+            if fitted:
+                self.done = True
+                return
+            fitted = followed
+        self.done = True
+
+    def _took(self, task: Task, search: bool) -> bool:
+        """Whether this cloud could be used."""
+        try:
+            self._take(task, search)
+        except _Stopped:
+            self.stopped = True
+        except InputError:
+            return False  # the next cloud may do
+        return not self.stopped
 
     def _take(self, task: Task, search: bool) -> None:
         if search:

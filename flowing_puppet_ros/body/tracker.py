@@ -127,6 +127,10 @@ class BodyTracker:
 
         `lost` tells whether the body is not where the person is.
         """
+        if self._last is None:
+            # Normals take long, and nobody would use them.
+            self._fitter.person_points(*checked_cloud(points, normals), viewpoint)
+            return None
         with threadpool_limits(limits=1):
             cloud = self._next_cloud(points, normals, stamp, viewpoint)
             fit = self._followed(cloud, stamp)
