@@ -57,7 +57,7 @@ class PuppetTrackerComponent(Component):
         Port("flow/backward", IMAGE, optional=True),
         Port("detections", PUPPETS, "sensor", optional=True),
     )
-    outputs = (
+    outputs: tuple[Port, ...] = (
         Port("puppets", PUPPETS),
         Port("part_labels", IMAGE, lazy=True),
         Port("overlay", IMAGE, lazy=True, compressed=True),
