@@ -139,7 +139,7 @@ class ScenePeople:
         if not len(view.points):
             raise InputError("the cloud has no finite point in the region of interest")
         distance = np.linalg.norm(view.points, axis=1)
-        if self._sensor() is not None and distance.min() > self._settings.reach:
+        if self._sensor(view) is not None and distance.min() > self._settings.reach:
             raise InputError(
                 f"the nearest point of the cloud is {distance.min():.3g} m from the origin of its frame, beyond the"
                 f" reach of {self._settings.reach:g} m; check the unit, or widen reach"
