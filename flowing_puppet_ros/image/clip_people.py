@@ -26,6 +26,7 @@ SUPPOSED = 15  # looks before and after a path through which the person is suppo
 LOSS = 1.5  # score that a pose may lack where a person is only supposed to be, in units of the margin
 ABSENT = 0.5  # cost of a look in which a person is missed
 SURE, LEAST_ODDS = 4.0, -3.5  # log-odds above which a place counts no more, and from which it counts
+LASTING = 0.5  # log-odds that a path of twice as many looks has more than its places have on average
 SPAN = 15  # looks before and after one over which the scale is averaged
 
 
@@ -78,7 +79,7 @@ class ClipPeople:
             log_odds = float(np.mean([place.log_odds for place in path.values()]))
             if found and 1 / (1 + np.exp(-log_odds)) < self.least:
                 break
-            steady = zip(path, _steady(list(path.values()), log_odds), strict=True)
+            steady = zip(path, _steady(list(path.values()), log_odds + LASTING * np.log2(len(path))), strict=True)
             found.append(PersonPath({images[number]: place for number, place in steady}, self.step))
             for number, place in path.items():
                 looks[number] = [other for other in looks[number] if other.apart(place) >= SAME_PLACE]

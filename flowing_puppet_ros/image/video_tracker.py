@@ -122,11 +122,11 @@ class VideoTracker:
         self._arms = {identity: self._arms.get(identity, ArmFilter(self.path)) for identity in sights}
         places: dict[str, dict[int, tuple[NDArray[np.float64], float]]] = {}
         for puppet in result.puppets:
-            arms = self._arms[puppet.id].step(
-                sights[puppet.id], result.flow, result.grid, puppet.scale * model.shoulder_width
-            )
+            sight = sights[puppet.id]
+            arms = self._arms[puppet.id].step(sight, result.flow, result.grid, puppet.scale * model.shoulder_width)
+            person = 1.0 if sight.detection is None else sight.detection.confidence
             places[puppet.id] = {
-                model.joint_names.index(f"{side}_{name}"): (ends[k], sure)
+                model.joint_names.index(f"{side}_{name}"): (ends[k], person * sure)
                 for side, (ends, sure) in arms.items()
                 for k, name in enumerate(ENDS)
             }

@@ -66,7 +66,7 @@ def test_an_unsure_second_person_is_none_but_an_unsure_first_one_is_told() -> No
     looks = [[place(100, log_odds=-2.0), place(300, log_odds=-2.5)] for _ in range(5)]
     paths = people(looks).paths()
     assert [path.places[0].neck[0] for path in paths] == [100.0]
-    assert paths[0].places[0].log_odds == pytest.approx(-2.0)
+    assert -2.0 < paths[0].places[0].log_odds < 0.0
 
 
 def test_a_path_does_not_jump() -> None:
