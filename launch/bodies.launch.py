@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit bodies: `ros2 launch flowing_puppet_ros bodies.launch.py points:=/camera/points`, or from calibrated cameras.
 
+`depth:=/camera/depth/image_rect_raw camera_info:=/camera/depth/camera_info` fits to depth images instead of clouds.
 With `cameras:=cam01,cam02,cam03` the images of these namespaces are tracked, one person is cut out of them and carved
 as a visual hull, and a body is fitted to the silhouettes; the poses of the cameras are read from /tf_static.
 """
@@ -20,10 +21,12 @@ except ImportError as error:
 
 CONFIG = Path(__file__).resolve().parent.parent / "config"
 
+INPUTS = ("points", "depth", "camera_info", "initial")
+
 
 def nodes(context: LaunchContext) -> list[Node]:
     """Return the body fitter, and in front of it the trackers and the silhouettes of the named cameras."""
-    given = {name: LaunchConfiguration(name).perform(context) for name in ("cameras", "points", "initial", "image")}
+    given = {name: LaunchConfiguration(name).perform(context) for name in ("cameras", "image", *INPUTS)}
     folder = Path(LaunchConfiguration("config").perform(context))
     clock = {"use_sim_time": LaunchConfiguration("use_sim_time")}
 
@@ -42,7 +45,7 @@ def nodes(context: LaunchContext) -> list[Node]:
 
     cameras = [name for name in given["cameras"].split(",") if name]
     if not cameras:
-        return [node("body_fitter", remappings=[("points", given["points"]), ("initial", given["initial"])])]
+        return [node("body_fitter", remappings=[(name, given[name]) for name in INPUTS])]
     of_cameras = [(f"{camera}/image", f"{camera}/{given['image']}") for camera in cameras]
     return [
         *(node("puppet_tracker", camera, [("image", given["image"])]) for camera in cameras),
@@ -57,6 +60,8 @@ def generate_launch_description() -> LaunchDescription:
         "cameras": ("", "namespaces of calibrated cameras, separated by commas; empty to fit the clouds on `points`"),
         "image": ("image", "image topic in the namespace of each camera"),
         "points": ("points", "cloud topic when there are no cameras"),
+        "depth": ("depth", "rectified depth topic (16UC1 mm, 32FC1 m) instead of clouds"),
+        "camera_info": ("camera_info", "calibration of the depth camera"),
         "initial": ("initial", "joints that start the fit (BodyArray), optional"),
         "config": (str(CONFIG), "folder of the parameter files"),
         "use_sim_time": ("false", "take the time from /clock"),

@@ -10,8 +10,8 @@ import argparse
 import json
 import sys
 
+from flowing_puppet_ros.cli import bench_live
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate import bench_live
 from flowing_puppet_ros.evaluate.bench import Bench
 from flowing_puppet_ros.evaluate.tables import text_table
 

@@ -89,9 +89,14 @@ def test_tracking_starts_flow_and_tracker() -> None:
 
 @pytest.mark.usefixtures("stand_ins")
 def test_bodies_from_points() -> None:
-    (fitter,) = described("bodies.launch.py", points="/lidar")
+    (fitter,) = described("bodies.launch.py", points="/lidar", depth="/camera/depth")
     assert fitter.named["executable"] == "body_fitter"
-    assert dict(fitter.named["remappings"])["points"] == "/lidar"
+    remapped = dict(fitter.named["remappings"])
+    assert (remapped["points"], remapped["depth"], remapped["camera_info"]) == (
+        "/lidar",
+        "/camera/depth",
+        "camera_info",
+    )
 
 
 @pytest.mark.usefixtures("stand_ins")
