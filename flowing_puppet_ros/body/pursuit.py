@@ -50,11 +50,7 @@ class _Run:
             return True
 
     def run(self) -> None:
-        """Fit the first cloud that can be, then follow to the newest, from where whoever takes the body goes on.
-
-        A stream may be faster than the tracker, so to follow every cloud might never come to an end. The run is `done`
-        at its end, also when a `problem` has ended it.
-        """
+        """Make the fit and catch up; `done` when that is through, or a `problem` has ended it."""
         try:
             self._run()
         except Exception as error:
@@ -62,6 +58,10 @@ class _Run:
                 self.problem, self.done = error, True
 
     def _run(self) -> None:
+        """Fit the first cloud that can be, then follow to the newest, from where whoever takes the body goes on.
+
+        A stream may be faster than the tracker, so to follow every cloud might never come to an end.
+        """
         fitted = self._took(self.first, search=True)
         while not self.stopped:
             with self.lock:

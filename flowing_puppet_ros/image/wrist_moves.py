@@ -55,7 +55,9 @@ class WristMoves:
                 continue
             chosen = [np.searchsorted(self.sums[which[r]], drawn[r] * self.sums[which[r]][-1]) for r in rows]
             wrist = self.places[np.minimum(chosen, len(self.places) - 1)]
-            moved[rows] = self._laid(moved[rows], joints[rows], scale[rows], name, wrist, 2.0 * bend[rows] - 1.0)
+            moved[rows] = self._laid(
+                moved[rows], joints[rows], scale[rows], name, wrist, np.where(bend[rows] == 1, 1.0, -1.0)
+            )
         return moved
 
     def _laid(self, vectors: Floats, joints: Floats, scale: Floats, side: str, wrist: Floats, bend: Floats) -> Floats:

@@ -79,7 +79,7 @@ def gather(
     likelihood, hands, optical_flow = PartLikelihood.load(), HandDetectors.load(), OpticalFlow()
     bodies = {"front": UpperBody(model, "front"), "back": UpperBody(model, "back")}
     rng = np.random.default_rng(settings.seed)
-    rows = []
+    rows: list[tuple[Array, Array, int]] = []
     for posed in people:
         arms = [model.joint_names.index(f"{s}_{j}") for s in ("right", "left") for j in ("elbow", "wrist")]
         sure = [joint for joint in arms if posed.confidence[joint] >= SURE]
@@ -95,8 +95,7 @@ def gather(
     if len(rows) < FEWEST:
         raise InputError(f"the annotations show {len(rows)} people with an image before theirs; {FEWEST} are needed")
     say(f"{len(rows)} people")
-    terms, misses, halves = zip(*rows, strict=True)
-    return Choices(np.stack(terms), np.stack(misses), np.array(halves))
+    return Choices(*(np.stack([row[k] for row in rows]) for k in range(3)))
 
 
 def _of_person(

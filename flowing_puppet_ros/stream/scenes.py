@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.body.crowd import Crowd, CrowdSettings
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.people import ExtractionSettings, PersonCloud, extract_people
 from flowing_puppet_ros.body.planes import PlaneMemory
 from flowing_puppet_ros.body.viewpoint import one_sided
@@ -38,8 +38,8 @@ class RegionSettings(Settings):
 
 
 @dataclass(frozen=True)
-class SceneSettings(CrowdSettings, ExtractionSettings, RegionSettings):
-    """Where the people are looked for, how they are seen, and whether they are followed."""
+class SceneSettings(FitterSettings, CrowdSettings, ExtractionSettings, RegionSettings):
+    """How people are found in clouds, fitted and followed."""
 
     view: str = setting("auto", "people are seen from all sides (full) or from one sensor at the frame's origin"
                                 " (single); auto: as their first points look",
@@ -77,7 +77,7 @@ class ScenePeople:
         """Fit with `fitter`."""
         self._fitter = fitter
         self._settings = settings
-        self._crowd = Crowd(fitter, settings, fitter.settings.seed)
+        self._crowd = Crowd(fitter, settings, settings.seed)
         self._single: bool | None = None
         self._planes = PlaneMemory()
 
@@ -139,7 +139,7 @@ class ScenePeople:
         if not len(view.points):
             raise InputError("the cloud has no finite point in the region of interest")
         distance = np.linalg.norm(view.points, axis=1)
-        if self._sensor() is not None and distance.min() > self._settings.reach:
+        if self._sensor(view) is not None and distance.min() > self._settings.reach:
             raise InputError(
                 f"the nearest point of the cloud is {distance.min():.3g} m from the origin of its frame, beyond the"
                 f" reach of {self._settings.reach:g} m; check the unit, or widen reach"
