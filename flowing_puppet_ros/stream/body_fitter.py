@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.frames import axis_of, upright
 from flowing_puppet_ros.body.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.errors import InputError
@@ -40,7 +40,7 @@ OPTICAL = re.compile(r"optical(_frame)?$")
 
 
 @dataclass(frozen=True)
-class BodyFitterSettings(SceneSettings, SilhouetteFitterSettings, BodyOutputSettings):
+class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings, SceneSettings, BodyOutputSettings):
     """Settings of the fits, and of what the component reads, waits for and publishes."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
@@ -67,7 +67,7 @@ class BodyFitterComponent(Component):
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),
     )
-    outputs: tuple[Port, ...] = BodyOutputs.ports
+    outputs = BodyOutputs.ports
 
     def __init__(self, settings: BodyFitterSettings, factory: MessageFactory) -> None:
         """Load the body model."""
@@ -200,8 +200,8 @@ class BodyFitterComponent(Component):
         self.counters["bodies"] += len(fits)
         counted, errors = self._people.drain()
         self.counters.update(counted)
-        for reason in errors:
-            self._unusable(reason)
+        for error in errors:
+            self._unusable(error)
         return self._outputs.make(cloud.header, fits, held, self._wanted)
 
     def _fit_silhouettes(self, message: Any) -> Output:
