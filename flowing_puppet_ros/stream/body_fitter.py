@@ -67,7 +67,7 @@ class BodyFitterComponent(Component):
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),
     )
-    outputs = BodyOutputs.ports
+    outputs: tuple[Port, ...] = BodyOutputs.ports
 
     def __init__(self, settings: BodyFitterSettings, factory: MessageFactory) -> None:
         """Load the body model."""
@@ -200,8 +200,8 @@ class BodyFitterComponent(Component):
         self.counters["bodies"] += len(fits)
         counted, errors = self._people.drain()
         self.counters.update(counted)
-        for error in errors:
-            self._unusable(error)
+        for reason in errors:
+            self._unusable(reason)
         return self._outputs.make(cloud.header, fits, held, self._wanted)
 
     def _fit_silhouettes(self, message: Any) -> Output:
