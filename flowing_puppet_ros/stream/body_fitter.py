@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.frames import axis_of, upright
 from flowing_puppet_ros.body.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.errors import InputError
@@ -40,7 +40,7 @@ OPTICAL = re.compile(r"optical(_frame)?$")
 
 
 @dataclass(frozen=True)
-class BodyFitterSettings(SceneSettings, SilhouetteFitterSettings, BodyOutputSettings):
+class BodyFitterSettings(FitterSettings, SilhouetteFitterSettings, SceneSettings, BodyOutputSettings):
     """Settings of the fits, and of what the component reads, waits for and publishes."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))

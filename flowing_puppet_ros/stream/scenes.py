@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.body.crowd import Crowd, CrowdSettings
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings, Progress
+from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.people import ExtractionSettings, PersonCloud, extract_people
 from flowing_puppet_ros.body.planes import PlaneMemory
 from flowing_puppet_ros.body.viewpoint import one_sided
@@ -38,8 +38,8 @@ class RegionSettings(Settings):
 
 
 @dataclass(frozen=True)
-class SceneSettings(FitterSettings, CrowdSettings, ExtractionSettings, RegionSettings):
-    """How people are found in clouds, fitted and followed."""
+class SceneSettings(CrowdSettings, ExtractionSettings, RegionSettings):
+    """Where the people are looked for, how they are seen, and whether they are followed."""
 
     view: str = setting("auto", "people are seen from all sides (full) or from one sensor at the frame's origin"
                                 " (single); auto: as their first points look",
@@ -77,7 +77,7 @@ class ScenePeople:
         """Fit with `fitter`."""
         self._fitter = fitter
         self._settings = settings
-        self._crowd = Crowd(fitter, settings, settings.seed)
+        self._crowd = Crowd(fitter, settings, fitter.settings.seed)
         self._single: bool | None = None
         self._planes = PlaneMemory()
 
