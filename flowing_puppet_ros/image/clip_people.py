@@ -110,7 +110,8 @@ def _best_path(looks: Sequence[Sequence[Place]]) -> dict[int, Place]:
     best: list[Floats] = []
     before: list[list[tuple[int, int] | None]] = []
     for number, places in enumerate(looks):
-        total, origin = np.zeros(len(places)), [None] * len(places)  # type: list[tuple[int, int] | None]
+        total = np.zeros(len(places))
+        origin: list[tuple[int, int] | None] = [None] * len(places)
         for gap in range(1, min(LONGEST_GAP, number) + 1):
             for k, last in enumerate(looks[number - gap]):
                 for own, place in enumerate(places):

@@ -28,6 +28,7 @@ from flowing_puppet_ros.settings import Settings, setting
 SURE_SIZES, SIZES = 3, 9
 """Searches that must have found a person before only their place is looked at; those whose median tells the size."""
 LEAST_ODDS = 1e-6
+FIRST = 1 / 3  # of `least_person`: how probable the surest person of an image must be
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,9 @@ class DetectionSettings(Settings):
     """When the detector looks at an image of a video."""
 
     detect_every: int = setting(1, "images from one look of the detector to the next", low=1, high=10000)
-    least_person: float = setting(0.3, "probability from which a detected person is tracked", low=0.0, high=1.0)
+    least_person: float = setting(
+        0.3, "probability from which a detected person is tracked; the surest needs a third of it", low=0.0, high=1.0
+    )
     search_every: int = setting(
         2, "images from one search for people to the next where a whole clip is known", low=1, high=10000
     )
@@ -181,11 +184,10 @@ class VideoTracker:
             return {puppet.id: self._sight(puppet, colour, found) for puppet in result.puppets}
 
     def detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
-        """The people in an image who are sure enough to be tracked."""
-        people = self.tracker.settings.most_people
-        return self.detector.detect(
-            image, DetectorSettings(least_confidence=self.settings.least_person, most_people=min(people, 80))
-        )
+        """The people in an image who are sure enough to be tracked; the surest one may be less sure."""
+        people, least = min(self.tracker.settings.most_people, 80), self.settings.least_person
+        found = self.detector.detect(image, DetectorSettings(least_confidence=FIRST * least, most_people=people))
+        return [person for turn, person in enumerate(found) if turn == 0 or person.confidence >= least]
 
     def _sight(self, puppet: TrackedPuppet, image: NDArray[np.uint8], found: Sequence[PersonDetection]) -> Sight:
         window = window_of(self.tracker.model, self.likelihood, image, puppet)

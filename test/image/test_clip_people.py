@@ -21,7 +21,8 @@ def people(looks: list[list[Place]], step: int = 1, least: float = 0.3, most: in
 
 def test_the_place_that_is_always_there_beats_surer_ones_that_jump() -> None:
     rng = np.random.default_rng(0)
-    looks = [[place(100 + k, log_odds=0.0), place(*rng.uniform(150, 900, 2), log_odds=1.5)] for k in range(20)]
+    elsewhere = rng.uniform(150, 900, (20, 2))
+    looks = [[place(100 + k, log_odds=0.0), place(x, y, log_odds=1.5)] for k, (x, y) in enumerate(elsewhere)]
     first = people(looks).paths()[0]
     assert [first.places[k].neck[0] for k in range(20)] == pytest.approx([100 + k for k in range(20)])
 
