@@ -132,7 +132,7 @@ class McapFile:
             stream.seek(place)
             code, length = _HEAD.unpack(stream.read(_HEAD.size))
             end = place + _HEAD.size + length
-            if code in (Opcode.DATA_END, Opcode.FOOTER) and length < 64:
+            if code == Opcode.FOOTER and length < 64:
                 return
             known = 0 < code <= Opcode.DATA_END or code >= 0x80
             if not known or end > self._size or length > LARGEST:

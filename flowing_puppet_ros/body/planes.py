@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import label
 from scipy.spatial import cKDTree
 
 TRIALS = (200, 3000)
@@ -147,12 +148,23 @@ def _best(
     for _ in range(2):
         on = points[np.abs(plane.height(points)) < thickness]
         plane, middle, axes = _fitted(plane, on)
+    # One piece, or the front of a cupboard and a person beside it would be a wall.
+    along = _largest_piece((on - middle) @ axes[:, :2])
     # Percentiles, or single points far off would stretch a person's back to a wall.
-    along = (on - middle) @ axes[:, :2]
     longer, shorter = np.ptp(np.percentile(along, (5, 95), axis=0), axis=0)
     covered = CELL**2 * len(np.unique(np.floor(along / CELL), axis=0))
     wide = longer >= size[0] and shorter >= size[1]
     return plane if wide and covered >= COVERED * longer * shorter else None
+
+
+def _largest_piece(along: np.ndarray) -> np.ndarray:
+    """The points (M, 2) in metres of the piece with most cells; cells that touch, also at corners, are one piece."""
+    cell = np.floor((along - along.min(axis=0)) / CELL).astype(np.int64)
+    filled = np.zeros(cell.max(axis=0) + 1, dtype=bool)
+    filled[tuple(cell.T)] = True
+    pieces, _ = label(filled, np.ones((3, 3)))
+    sizes = np.bincount(pieces[filled])
+    return np.asarray(along[pieces[tuple(cell.T)] == sizes.argmax()])
 
 
 def _fitted(plane: Plane, points: np.ndarray) -> tuple[Plane, np.ndarray, np.ndarray]:
