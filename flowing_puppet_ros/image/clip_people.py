@@ -113,11 +113,13 @@ def _best_path(looks: Sequence[Sequence[Place]]) -> dict[int, Place]:
         total = np.zeros(len(places))
         origin: list[tuple[int, int] | None] = [None] * len(places)
         for gap in range(1, min(LONGEST_GAP, number) + 1):
-            for k, last in enumerate(looks[number - gap]):
-                for own, place in enumerate(places):
-                    score = best[number - gap][k] - _cost(last, place, gap)
-                    if score > total[own]:
-                        total[own], origin[own] = score, (number - gap, k)
+            last = looks[number - gap]
+            if not last or not places:
+                continue
+            score = best[number - gap][:, None] - _costs(last, places, gap)
+            for own in np.flatnonzero(score.max(axis=0) > total).tolist():
+                k = int(score[:, own].argmax())
+                total[own], origin[own] = score[k, own], (number - gap, k)
         best.append(total + np.array([_gain(place) for place in places]))
         before.append(origin)
     tops = [float(total.max(initial=-np.inf)) for total in best]
@@ -136,9 +138,11 @@ def _gain(place: Place) -> float:
     return min(place.log_odds, SURE) - LEAST_ODDS
 
 
-def _cost(last: Place, place: Place, gap: int) -> float:
-    """Cost of going from one place to another one `gap` looks later; infinite where nobody moves so fast."""
-    moved = last.apart(place) / gap
-    if moved > FASTEST:
-        return float("inf")
-    return ABSENT * (gap - 1) + MOVE * moved + GROW * abs(float(np.log2(place.scale / last.scale)))
+def _costs(last: Sequence[Place], places: Sequence[Place], gap: int) -> Floats:
+    """Costs (L, P) of going from one place to another one `gap` looks later; infinite where nobody moves so fast."""
+    scale, own_scale = (np.array([place.scale for place in those]) for those in (last, places))
+    neck, own_neck = (np.array([place.neck for place in those]) for those in (last, places))
+    step = neck[:, None] - own_neck
+    moved = np.hypot(step[..., 0], step[..., 1]) / np.maximum(scale[:, None], own_scale) / gap
+    costs = ABSENT * (gap - 1) + MOVE * moved + GROW * np.abs(np.log2(own_scale / scale[:, None]))
+    return np.where(moved > FASTEST, np.inf, costs)
