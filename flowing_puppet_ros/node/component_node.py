@@ -135,6 +135,7 @@ class ComponentNode[C: Component](LifecycleNode):
         """Make the component out of the settings as they are, and put it to work on the topics."""
         kind: Any = COMPONENTS[self._component]
         component: C = kind(self._settings, RosMessageFactory())
+        component.warm()
         self.session = Session(self, component, self._own.queue, self._diagnostics)
 
     def _activate(self) -> None:

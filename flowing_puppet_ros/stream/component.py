@@ -109,6 +109,9 @@ class Component:
         """Return what was still waiting for a partner when the input ended."""
         return []
 
+    def warm(self) -> None:
+        """Do beforehand what the first messages of a live stream would wait for."""
+
     def reset(self) -> None:
         """Forget the past: the next message starts a new recording."""
 
