@@ -12,8 +12,8 @@ import numpy as np
 from flowing_puppet_ros.body.tracker import BodyTracker
 from flowing_puppet_ros.errors import InputError
 
-CHASE_NS, MOST_KEPT, FEW = 300_000_000, 100, 2
-"""Time between the clouds kept while a fit is made, how many are, and so few that the body is nearly there."""
+CHASE_NS, MOST_KEPT, FEW = 300_000_000, 8, 2
+"""Least time between the clouds kept while a fit is made, how many are, and so few that the body is nearly there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,21 +39,24 @@ class _Run:
         self.tracker = tracker
         self.first = task
         self.coming: list[Task] = []
+        self.apart = CHASE_NS
         self.lock = threading.Lock()
         self.stopped = False
         self.done = False
         self.problem: Exception | None = None
 
     def add(self, task: Task) -> bool:
-        """Keep clouds for when the fit is made, `CHASE_NS` apart, and the newest; False when the run is through."""
+        """Keep a few clouds for when the fit is made, and the newest; False when the run is through."""
         with self.lock:
             if self.done:
                 return False
             before = self.coming[-2] if len(self.coming) > 1 else self.first
-            if self.coming and self.coming[-1].stamp - before.stamp < CHASE_NS:
+            if self.coming and self.coming[-1].stamp - before.stamp < self.apart:
                 self.coming.pop()
             self.coming.append(task)
-            del self.coming[:-MOST_KEPT]
+            if len(self.coming) > MOST_KEPT:
+                # Evenly spread still, so that the longest fit leaves no more to follow.
+                self.coming, self.apart = [*self.coming[1::2], task], 2 * self.apart
             return True
 
     def run(self) -> None:
@@ -73,7 +76,7 @@ class _Run:
         fitted, before = self._took(self.first, search=True), MOST_KEPT + 1
         while not self.stopped:
             with self.lock:
-                tasks, self.coming = self.coming, []
+                tasks, self.coming, self.apart = self.coming, [], CHASE_NS
                 self.done = not tasks
             for task in tasks:
                 if not self.stopped:
