@@ -191,7 +191,9 @@ class Crowd:
         member.searches, member.searched = member.searches + 1, task.stamp
         self.counters["searches"] += 1
         known = member.tracker.last
-        self._pursuit.start(member.number, member.tracker.fork(), task, background)
+        # Live, a body that may have a limb wrong is shown and followed while a better one is searched.
+        quick = background is not None and known is None
+        self._pursuit.start(member.number, member.tracker.fork(quick), task, background)
         self._collect()
         fit = member.tracker.last
         return [(member.id, fit)] if known is None and fit is not None else []

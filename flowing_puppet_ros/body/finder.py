@@ -98,7 +98,7 @@ class BodyFinder:
     def find(self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False) -> BodyState:
         """The body of a cloud of which nothing but the upright is known.
 
-        `quick` tries a small search first, and is content when its body lies close with no limb in doubt.
+        `quick` tries a small search first and is content when its body lies close, whatever its limbs do.
         """
         if isinstance(cloud, ViewCloud):
             return self._view_search.run(cloud, rng, self._settings.refine_iterations, progress)
@@ -106,7 +106,7 @@ class BodyFinder:
         none, steps = JointTargets.none(self._model), self._settings.refine_iterations
         if quick:
             best = self._two_bodies(cloud, grid, rng, part_of(progress, 0.0, 0.3), QUICK)[0]
-            if self._is_close(best) and not best.judgement.doubtful:
+            if self._is_close(best):
                 return self.finish(best.state, cloud, none, steps)
         tries = 1 + self._settings.restarts
         tried: list[Candidate] = []

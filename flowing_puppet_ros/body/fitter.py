@@ -97,6 +97,7 @@ class BodyFitter:
         viewpoint: np.ndarray | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
+        own_surface: bool = True,
         quick: bool = False,
     ) -> BodyFit:
         """Fit the model to a cloud.
@@ -109,7 +110,8 @@ class BodyFitter:
             viewpoint: (3,) where the sensor stood when the cloud shows one side only.
             seed: overrides the settings' seed.
             progress: called with the fraction done, 0 to 1.
-            quick: start a track: without initial joints try a small search first, and leave the surface the model's.
+            own_surface: let vertices follow a dense whole cloud closer than the model can.
+            quick: without initial joints try a small search first, whose limbs may still be wrong.
 
         Raises:
             InputError: when the cloud cannot be the surface of a person or the initial joints place no body.
@@ -124,7 +126,7 @@ class BodyFitter:
                 if not self._follows_surface(cloud):
                     return self.result(state, cloud)
                 state = with_hands(self.model, self._finder.refiner, state, cloud)
-                if quick:
+                if not own_surface:
                     return self.result(state, cloud)
                 return self._with_own_surface(self.result(state, cloud), cloud)
             return self._fit_from_joints(points, normals, initial, viewpoint, rng, progress or _silent)

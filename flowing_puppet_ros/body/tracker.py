@@ -66,6 +66,7 @@ class BodyTracker:
         self._settings = settings
         self._none = JointTargets.none(fitter.model)
         self.counters: Counter[str] = Counter()
+        self._quick = False
         self.reset()
 
     def reset(self) -> None:
@@ -84,9 +85,10 @@ class BodyTracker:
         """The body in the last cloud, None before the first."""
         return None if self._last is None else self._last.fit
 
-    def fork(self) -> BodyTracker:
-        """A tracker that knows the same person so far and goes its own way from here."""
+    def fork(self, quick: bool) -> BodyTracker:
+        """A tracker that knows the same person so far and goes its own way from here; `quick`: so are its searches."""
         made = copy(self)
+        made._quick = quick
         made.counters = self.counters.copy()
         return made
 
@@ -194,8 +196,9 @@ class BodyTracker:
         normals = None if self._turned else cloud.normals
         # With the model's surface: one of its own would come and go with the searches.
         fit = self._fitter.fit(
-            cloud.points, normals, viewpoint=cloud.viewpoint, seed=seed, progress=progress, quick=True
-        )
+            cloud.points, normals, viewpoint=cloud.viewpoint, seed=seed, progress=progress, own_surface=False,
+            quick=self._quick,
+        )  # fmt: skip
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
             fit = tracked
         else:

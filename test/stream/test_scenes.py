@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -145,6 +146,19 @@ def test_after_a_stall_a_person_is_neither_cut_in_two_nor_taken_for_another(
         assert stage.show((x, 0.0)) == {(x, 0.0): "b1"}, step
 
 
+def test_a_doubtful_body_is_searched_again_after_a_while(
+    person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = BodyFitter.result
+    monkeypatch.setattr(BodyFitter, "result", lambda *known: replace(result(*known), reliable=False))
+    stage = Stage(person, floor)
+    for searches in (1, 2, 3):
+        for _ in range(2):
+            assert stage.show((0, 0)) == {(0, 0): "b1"}
+            assert len(fits) == searches
+        stage.tenths += 50
+
+
 def test_seeds_begin_ids(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
     assert list(Stage(person, floor, seed=2).show((0, 0)).values()) == ["bc1"]
 
@@ -163,6 +177,7 @@ def test_in_the_background_a_search_holds_nobody_up(
 
     def slow(fitter: BodyFitter, *arguments: Any, **keywords: Any) -> BodyFit:
         assert gate.wait(60)
+        assert keywords["quick"] and not keywords["own_surface"], "nobody waits for the best there is"
         return quick(fitter, *arguments, **keywords)
 
     monkeypatch.setattr(BodyFitter, "fit", slow)
