@@ -20,6 +20,8 @@ VIEW_VOTES = 5.0  # the view's evidence saturates here ...
 VIEW_TURNS = 3.0  # ... and must reach this on the other side to turn the puppet round
 SCALE_GAIN = 0.1  # share of the new scale estimate taken at each detection
 ELSEWHERE = 0.06  # m; a joint that is known to be farther off than this is moved at once
+CLOTHES_GAIN = 0.2  # share of the newly seen colours taken at each detection
+LONG_AGO = 1_000  # images; a joint that was not detected for so long goes to where it is
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,8 @@ class Person:
     `mean` (J, 2), isotropic `variance` (J,) px^2, `quality` (J,) of the detections behind each joint, `doubted`
     (J, 2) last detected place that the gate refused (NaN none), `doubts` (J,) how often in a row it stood there,
     `age` (J,) how many images ago a detection was last taken, `detected` (J, 3) this image's detection as x, y and
-    confidence, or None, and `detection` its index among the detections.
+    confidence, or None, and `detection` its index among the detections, `clothes` the colours of the torso (see
+    image/appearance.py) or None, `met` whether somebody else's torso overlapped with it since the last detection.
     """
 
     id: str
@@ -71,6 +74,8 @@ class Person:
     flow_energy: float = 0.0
     detection_energy: float = 0.0
     shape: PuppetShape | None = None
+    clothes: Floats | None = None
+    met: bool = False
 
     @classmethod
     def start(
@@ -136,6 +141,15 @@ class Person:
         self.quality[joint] = confidence
         self.age[joint] = self.doubts[joint] = 0
         self.doubted[joint] = np.nan
+
+    def wear(self, colours: Floats) -> None:
+        """Follow the colours of the torso slowly."""
+        seen = colours if self.clothes is None else (1 - CLOTHES_GAIN) * self.clothes + CLOTHES_GAIN * colours
+        self.clothes = np.asarray(seen)
+
+    def found_again(self) -> None:
+        """Let the next detection, far away, be believed at once."""
+        self.age[:] = LONG_AGO
 
     def fuse(self, joints: Floats, confidence: Floats, settings: TrackerSettings) -> None:
         """Fuse detected joints (J, 2), NaN unknown: precision-weighted means, behind a gate with patience.

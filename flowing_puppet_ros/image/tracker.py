@@ -23,7 +23,8 @@ from flowing_puppet_ros.flow.estimate import (
     working_size,
 )
 from flowing_puppet_ros.flow.puppet_flow import PuppetFlow
-from flowing_puppet_ros.image.association import Detection, associate
+from flowing_puppet_ros.image.appearance import clothes_of, meetings
+from flowing_puppet_ros.image.association import Detection, associate, joint_distance
 from flowing_puppet_ros.image.carry import Carriage, Grid, carry_people, paint_people
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.people import Person, TrackerSettings
@@ -148,7 +149,7 @@ class FlowingPuppetTracker:
                 self.people, pair = [], None
             else:
                 carriage = carry_people(self.model, self.people, pair, grid, self.settings)
-        self._take(detections, warnings)
+        self._take(image, detections, warnings)
         self.people = [person for person in self.people if self._lives(person, size)]
         for person in self.people:
             person.settle(self.model)
@@ -186,23 +187,32 @@ class FlowingPuppetTracker:
         assert self._previous is not None
         return self.optical_flow.between(previous.grey, self._previous.grey)
 
-    def _take(self, detections: Sequence[Keypoints] | None, warnings: list[str]) -> None:
+    def _take(self, image: NDArray[np.uint8], detections: Sequence[Keypoints] | None, warnings: list[str]) -> None:
         """Fuse the detections into the people they belong to and start new people at the rest."""
         for person in self.people:
             person.unseen += 1
             person.detection_energy = 0.0
             person.detected = person.detection = None
+        met = meetings(self.model.joint_names, [person.mean for person in self.people])
+        for person, meets in zip(self.people, met, strict=True):
+            person.met |= meets
         if detections is None:
             return
         found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
-        matched, free = associate(self.people, found, self.settings.match_distance)
+        several = max(len(self.people), len(found)) > 1
+        worn = clothes_of(self.model.joint_names, image, [joints for joints, _ in found]) if several else None
+        matched, free = associate(self.people, found, self.settings.match_distance, worn)
         for index, person in enumerate(self.people):
             person.missed += 1
             if index in matched:
+                if joint_distance(person, found[matched[index]]) > self.settings.match_distance:
+                    person.found_again()
                 person.fuse(*found[matched[index]], self.settings)
                 person.update_scale_and_view(self.model)
                 person.unseen = person.missed = 0
-                person.detection = matched[index]
+                person.detection, person.met = matched[index], False
+                if worn and (clothes := worn[matched[index]]) is not None and clothes.alone:
+                    person.wear(clothes.colours)
         # The surest new person comes first: it gets the lower id, and a place when there is only one left.
         for index in sorted(free, key=lambda k: -found[k][1].sum()):
             self._start(index, found[index], warnings)
