@@ -66,7 +66,8 @@ def decode_image(message: Any) -> NDArray[np.uint8]:
     if size == 2:
         pixels = (pixels >> 8).astype(np.uint8)
     if conversion is None:
-        return np.ascontiguousarray(pixels)
+        # Kernels are compiled for arrays that may be written, as all other conversions return.
+        return np.array(pixels)
     try:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
     except cv2.error as error:  # packed formats need an even width, Bayer patterns two rows
