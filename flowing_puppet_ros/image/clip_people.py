@@ -68,8 +68,20 @@ class ClipPeople:
     _looks: dict[int, list[Place]] = field(default_factory=dict)
 
     def add(self, image: int, places: Sequence[Place]) -> None:
-        """Take the places of image number `image`; numbers grow."""
-        self._looks[image] = list(places)
+        """Take the places of image number `image`; numbers grow.
+
+        A place that costs more than to miss the person there is on no best path, and most of an image's are such.
+        """
+        self._looks[image] = [place for place in places if _gain(place) >= -ABSENT]
+
+    def keep(self, looks: int) -> None:
+        """Forget all but the last looks."""
+        for image in list(self._looks)[:-looks]:
+            del self._looks[image]
+
+    def clear(self) -> None:
+        """Forget all looks."""
+        self._looks.clear()
 
     def paths(self) -> list[PersonPath]:
         """The people, the surest first; the first even where hardly anybody is found."""
