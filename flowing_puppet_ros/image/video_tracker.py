@@ -16,7 +16,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arm_path import PathSettings
 from flowing_puppet_ros.image.arms import ENDS, ArmFilter, Sight
-from flowing_puppet_ros.image.clip_people import ClipPeople, PersonPath
+from flowing_puppet_ros.image.clip_people import FIRST, ClipPeople, PersonPath
 from flowing_puppet_ros.image.detector import DetectorSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
 from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
@@ -27,7 +27,6 @@ from flowing_puppet_ros.settings import Settings, setting
 SURE_LOOKS = 5  # searches that must have found a person before only their place is looked at
 MEMORY = 20  # searches that are remembered live
 LEAST_ODDS = 1e-6
-FIRST = 1 / 3  # of `least_person`: how probable the surest person of an image must be
 
 
 @dataclass(frozen=True)
@@ -164,9 +163,7 @@ class VideoTracker:
         """Search the image, and tell from all searches up to now where people are in it."""
         self._looks.add(number, self.detector.candidates(image))
         self._looks.keep(MEMORY)
-        places = [place for path in self._looks.paths() if (place := path.at(number)) is not None]
-        least = FIRST * self.settings.least_person
-        return places if places and places[0].probability >= least else []
+        return [place for path in self._looks.paths() if (place := path.at(number)) is not None]
 
     def _learn_places(self, result: TrackResult, found: Sequence[PersonDetection]) -> None:
         """Remember how large the people of a search are, and how surely; forget whom it did not find.
