@@ -90,9 +90,11 @@ class ClipPeople:
         found: list[PersonPath] = []
         while len(found) < self.most and (path := _best_path(looks)):
             log_odds = float(np.mean([place.log_odds for place in path.values()]))
-            if 1 / (1 + np.exp(-log_odds)) < (self.least if found else FIRST * self.least):
+            lasting = log_odds + LASTING * np.log2(len(path))
+            probability = 1 / (1 + np.exp(-(log_odds if found else lasting)))
+            if probability < (self.least if found else FIRST * self.least):
                 break
-            steady = zip(path, _steady(list(path.values()), log_odds + LASTING * np.log2(len(path))), strict=True)
+            steady = zip(path, _steady(list(path.values()), lasting), strict=True)
             found.append(PersonPath({images[number]: place for number, place in steady}, self.step))
             for number, place in path.items():
                 looks[number] = [other for other in looks[number] if other.apart(place) >= SAME_PLACE]
