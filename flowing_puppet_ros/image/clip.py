@@ -23,7 +23,7 @@ from flowing_puppet_ros.model.ds import DeformableStructures
 
 type Floats = NDArray[np.float64]
 
-DETECTOR_TRUST = 1 / 16
+DETECTOR_TRUST = 1 / 8
 """Weight of a joint of our detector against one of given keypoints: it errs more, and the flow must hold against it."""
 
 
