@@ -120,6 +120,11 @@ def decode_flow(message: Any) -> NDArray[np.float32]:
     return pixels if sane.all() else np.where(sane.all(axis=2, keepdims=True), pixels, np.float32(np.nan))
 
 
+def is_depth(encoding: str) -> bool:
+    """Whether `decode_depth` reads images of this encoding; mono16 may be a picture as well."""
+    return encoding.lower() in _DEPTH
+
+
 def decode_depth(message: Any) -> NDArray[np.float32]:
     """Return the (H,W) depth of a depth Image in metres along the optical axis (REP-118), NaN where unknown.
 
