@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_path
-from flowing_puppet_ros.image.arms import DISTINCT, KEPT, ArmFilter, ArmHistory, Sight
+from flowing_puppet_ros.image.arms import DISTINCT, KEPT, ArmFilter, ArmHistory, Sight, probability_right
 from flowing_puppet_ros.image.carry import Grid
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector_person import Place
@@ -80,6 +80,12 @@ def sight(guesser: Guesser | None, joints: np.ndarray) -> Sight:
 
 def still() -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((48, 64, 2), np.float32), np.zeros((48, 64, 2), np.float32)
+
+
+def test_the_better_an_arm_and_its_pose_fit_the_surer_they_are() -> None:
+    poor, good, better = (probability_right(*scores) for scores in ((-6.0, 1.0), (-1.0, 1.0), (-1.0, 4.0)))
+    assert ((poor > 0) & (poor < good) & (good < better) & (better < 1)).all()
+    assert np.isnan(probability_right(0.0, sight(None, np.zeros((15, 2))).pose_score)).all()
 
 
 def test_a_guess_that_one_image_lacks_is_carried_into_it() -> None:
@@ -182,6 +188,8 @@ def test_a_clip_joins_the_guesses_that_move_with_the_person() -> None:
     for t, people in enumerate(clip.people()):
         (puppet,) = people
         assert np.linalg.norm(puppet.joints[wrist] - pose(t)[wrist]) < 6, t
+        told = [probability_right(score, Guesser.score)[1] for score in (-4.0, 0.0)]
+        assert told[0] < puppet.confidence[wrist] <= told[1], t
 
 
 def test_between_runs_of_the_detector_people_are_carried() -> None:
