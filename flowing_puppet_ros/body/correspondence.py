@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.geometry import vertex_normals
+from flowing_puppet_ros.evidence.nearest import NearestPoints
 
 TANGENTIAL = 0.05
 MIN_COSINE = 0.2
@@ -31,13 +31,13 @@ class Cloud:
 
     points: np.ndarray
     normals: np.ndarray
-    tree: cKDTree
+    tree: NearestPoints
     viewpoint: np.ndarray | None
 
     @classmethod
     def of(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray | None = None) -> Cloud:
         """Index a cloud."""
-        return cls(points, normals, cKDTree(points), viewpoint)
+        return cls(points, normals, NearestPoints(points), viewpoint)
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Which vertices (V,) face the viewpoint; all of them when there is none."""
@@ -65,8 +65,7 @@ class Matches:
     def __init__(self, cloud: Cloud, most: int | None = None) -> None:
         """Prepare a cloud; of more than `most` points only every second, third ... looks for a vertex of its own."""
         self._cloud = cloud
-        self._placed = _placed(cloud.points, cloud.normals)
-        self._tree = cKDTree(self._placed)
+        self._tree = NearestPoints(cloud.points, cloud.normals, TURN_LENGTH)
         step = 1 if most is None else max(1, -(-len(cloud.points) // most))
         self._looking = np.arange(0, len(cloud.points), step)
 
@@ -85,10 +84,9 @@ class Matches:
         """
         cloud, looking = self._cloud, self._looking
         normals = vertex_normals(vertices, faces)
-        placed = _placed(vertices, normals)
         seen = np.flatnonzero(cloud.sees(vertices, normals))
-        there = self._tree.query(placed[seen])[1]
-        back = cKDTree(placed).query(self._placed[looking])[1]
+        there = self._tree.query(vertices[seen], normals[seen])[1]
+        back = NearestPoints(vertices, normals, TURN_LENGTH).query(cloud.points[looking], cloud.normals[looking])[1]
         matrix, vector = np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3))
         for vertex, point in ((seen, there), (back, looking)):
             _add_pairs(
@@ -103,13 +101,10 @@ class Matches:
         Returns:
             Distances (V,) to the cloud, and for every looking cloud point its nearest vertex and the distance to it.
         """
-        placed = _placed(vertices, vertex_normals(vertices, faces))
-        back, vertex = cKDTree(placed).query(self._placed[self._looking])
-        return self._tree.query(placed)[0], vertex, back
-
-
-def _placed(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    return np.hstack([points, TURN_LENGTH * normals])
+        normals, looking = vertex_normals(vertices, faces), self._looking
+        body = NearestPoints(vertices, normals, TURN_LENGTH)
+        back, vertex = body.query(self._cloud.points[looking], self._cloud.normals[looking])
+        return self._tree.query(vertices, normals)[0], vertex, back
 
 
 @njit(cache=True, nogil=True)
@@ -146,5 +141,5 @@ def two_way_distance(vertices: np.ndarray, faces: np.ndarray, cloud: Cloud) -> f
     face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     seen = cloud.sees(surface, np.concatenate([normals, face_normals]))
     there = cloud.tree.query(surface[seen])[0].mean() if seen.any() else np.inf
-    back = cKDTree(surface).query(cloud.points)[0].mean()
+    back = NearestPoints(surface).query(cloud.points)[0].mean()
     return float((there + back) / 2)

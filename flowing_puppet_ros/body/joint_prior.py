@@ -4,51 +4,42 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from flowing_puppet_ros.model.gaussian import Gaussian
 
-
+@njit(cache=True, nogil=True)
 def inverse_left_jacobian(r: np.ndarray) -> np.ndarray:
     """Derivative (3, 3) of log(exp(x) exp(r)) with respect to x at 0, for a Rodrigues vector r (3,).
 
     The derivative of log(exp(r) exp(x)) is its transpose (Barfoot, State Estimation for Robotics, section 7.1.5).
     """
     cross = np.array([[0.0, -r[2], r[1]], [r[2], 0.0, -r[0]], [-r[1], r[0], 0.0]])
-    angle = float(np.linalg.norm(r))
-    if angle < 1e-4:
-        factor = 1 / 12
-    else:
-        half = angle / 2
-        factor = (1 - half / np.tan(half)) / angle**2
-    return np.eye(3) - 0.5 * cross + factor * cross @ cross
+    angle = np.sqrt(r[0] ** 2 + r[1] ** 2 + r[2] ** 2)
+    half = angle / 2
+    factor = 1 / 12 if angle < 1e-4 else (1 - half / np.tan(half)) / angle**2
+    return np.eye(3) - 0.5 * cross + factor * (cross @ cross)
 
 
-class JointPrior:
-    """The pairwise Gaussian of one edge with a bounded precision, ready for Gauss-Newton."""
+@njit(cache=True, nogil=True)
+def joint_quadratic(
+    relative: np.ndarray, deviation: np.ndarray, precision: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Hessian and gradient of half the squared Mahalanobis distance of an edge to its Gaussian.
 
-    def __init__(self, pairwise: Gaussian, ridge: float = 0.05) -> None:
-        self._mean = pairwise.mean
-        self._precision = np.linalg.inv(pairwise.covariance + ridge**2 * np.eye(len(pairwise.mean)))
+    Args:
+        relative: (3,) Rodrigues vector of the child's rotation in the parent's frame.
+        deviation: (K,) of that vector, the parent's pose and the child's pose from the mean.
+        precision: (K, K), contiguous.
 
-    def quadratic(
-        self, relative: np.ndarray, parent_pose: np.ndarray, child_pose: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Hessian and gradient of half the squared Mahalanobis distance.
-
-        Args:
-            relative: (3,) Rodrigues vector of the child's rotation in the parent's frame.
-            parent_pose: (D,) coefficients.
-            child_pose: (D',) coefficients.
-
-        Returns:
-            Square matrix and vector over [parent's rotation increment, child's rotation increment (both multiplied
-            on the right), parent's pose, child's pose].
-        """
-        inverse = inverse_left_jacobian(relative)
-        deviation = np.concatenate([relative, parent_pose, child_pose]) - self._mean
-        jacobian = np.zeros((len(deviation), len(deviation) + 3))
-        jacobian[:3, :3] = -inverse
-        jacobian[:3, 3:6] = inverse.T
-        jacobian[3:, 6:] = np.eye(len(deviation) - 3)
-        weighted = jacobian.T @ self._precision
-        return weighted @ jacobian, weighted @ deviation
+    Returns:
+        (K + 3, K + 3) and (K + 3,) over [parent's rotation increment, child's rotation increment (both multiplied on
+        the right), parent's pose, child's pose].
+    """
+    inverse, count = inverse_left_jacobian(relative), len(deviation)
+    jacobian = np.zeros((count, count + 3))
+    jacobian[:3, :3] = -inverse
+    jacobian[:3, 3:6] = inverse.T
+    for k in range(3, count):
+        jacobian[k, k + 3] = 1.0
+    weighted = jacobian.T @ precision
+    return weighted @ jacobian, weighted @ deviation

@@ -6,10 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.geometry import vertex_normals
+from flowing_puppet_ros.evidence.nearest import NearestPoints
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 WIDTH = 0.04  # metres: a vertex or point that far from the other surface counts a quarter
@@ -92,7 +92,7 @@ def judged(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> Judgeme
     owner, parts = model.part_of_vertex, len(model.tree)
     count, size = np.bincount(owner[seen], minlength=parts), np.bincount(owner, minlength=parts)
     share = np.bincount(owner[seen], weight[seen], minlength=parts) / np.maximum(count, 1)
-    back = cKDTree(vertices).query(cloud.points)[0]
+    back = NearestPoints(vertices).query(cloud.points)[0]
     centers = np.stack([vertices[owner == part].mean(axis=0) for part in range(parts)])
     apart = [np.linalg.norm(centers[parent] - centers[child]) for parent, child in model.tree.edges]
     return Judgement(

@@ -116,6 +116,6 @@ class LimbSearch:
 
 def _gap(limb: np.ndarray, points: np.ndarray, cloud: Cloud) -> float:
     """Mean distance from a limb's vertices (V, 3) to the cloud and back from the points (M, 3) that it should cover."""
-    there = cloud.tree.query(limb, distance_upper_bound=FAR)[0]
+    there = cloud.tree.query(limb)[0]
     back = cKDTree(limb).query(points, distance_upper_bound=FAR)[0]
     return float(np.minimum(there, FAR).mean() + np.minimum(back, FAR).mean())

@@ -231,7 +231,7 @@ def _found_planes(centres: np.ndarray, clearance: float) -> tuple[Plane | None, 
 
 def _some(points: np.ndarray) -> np.ndarray:
     """Evenly chosen points, as many as are enough to find planes."""
-    return points[:: 1 + len(points) // PLANE_POINTS]
+    return np.ascontiguousarray(points[:: 1 + len(points) // PLANE_POINTS])
 
 
 def _clusters(points: np.ndarray, gap: float) -> np.ndarray:

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.ndimage import label
-from scipy.spatial import cKDTree
 
 TRIALS = (200, 3000)
 TRIALS_TIMES_POINTS = 2_000_000
@@ -122,14 +122,50 @@ def find_wall(points: np.ndarray, thickness: float, rng: np.random.Generator) ->
 def _trials(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Normals (T, 3) and offsets (T,) of planes through three points each."""
     first = points[rng.integers(0, len(points), int(np.clip(TRIALS_TIMES_POINTS // len(points), *TRIALS)))]
-    groups = cKDTree(points).query_ball_point(first, NEIGHBOURHOOD, p=np.inf, return_sorted=True)
-    others = [[near[k] for k in rng.integers(0, len(near), 2)] for near in groups]
-    second, third = points[np.array(others, np.int64).T]
+    ranks = rng.integers(0, _near_count(points, first)[:, None], (len(first), 2))
+    second, third = points[_near_of_ranks(points, first, ranks).T]
     cross = np.cross(second - first, third - first)
     length = np.linalg.norm(cross, axis=1)
     kept = length > 1e-6
     normals = cross[kept] / length[kept, None]
     return normals, (normals * first[kept]).sum(axis=1)
+
+
+@njit(cache=True, nogil=True)
+def _near_count(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """How many (T,) of the points (N, 3) are near each place (T, 3); trials times points is bounded, so no index."""
+    count = np.zeros(len(centres), np.int64)
+    for trial in range(len(centres)):
+        x, y, z = centres[trial]
+        near = 0
+        for row in range(len(points)):
+            near += _apart(points, row, x, y, z) <= NEIGHBOURHOOD
+        count[trial] = near
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _near_of_ranks(points: np.ndarray, centres: np.ndarray, ranks: np.ndarray) -> np.ndarray:
+    """Rows (T, K) of the points that are the ones of the ranks (T, K) among those near each place."""
+    found = np.zeros(ranks.shape, np.int64)
+    for trial in range(len(centres)):
+        x, y, z = centres[trial]
+        near, last = 0, ranks[trial].max()
+        for row in range(len(points)):
+            if _apart(points, row, x, y, z) <= NEIGHBOURHOOD:
+                for k in range(ranks.shape[1]):
+                    if ranks[trial, k] == near:
+                        found[trial, k] = row
+                near += 1
+                if near > last:
+                    break
+    return found
+
+
+@njit(cache=True, inline="always")
+def _apart(points: np.ndarray, row: int, x: float, y: float, z: float) -> float:
+    """The largest of a point's three distances along the axes."""
+    return max(max(abs(points[row, 0] - x), abs(points[row, 1] - y)), abs(points[row, 2] - z))
 
 
 def _best(

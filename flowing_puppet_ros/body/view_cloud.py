@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.correspondence import Cloud, Quadratic
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.nearest import NearestPoints
 from flowing_puppet_ros.evidence.one_sided import OneSidedView
 
 VIEW_POINTS = 4000
@@ -46,11 +47,10 @@ class ViewCloud(Cloud):
                 f"the sensor at {np.round(viewpoint, 2).tolist()} m stands within the cloud and cannot have seen one"
                 " side of it; check the frame or fit it as a whole cloud"
             )
-        tree = cKDTree(points)
-        near = points[tree.query(points, k=min(NOISE_NEIGHBOURS, len(points)))[1]]
+        near = points[cKDTree(points).query(points, k=min(NOISE_NEIGHBOURS, len(points)))[1]]
         noise = float(np.median(np.abs(((near - points[:, None]) * normals[:, None]).sum(axis=2)[:, 1:])))
         view = OneSidedView.build(points, viewpoint)
-        return cls(points, normals, tree, viewpoint, view, max(BEFORE, NOISES * noise))
+        return cls(points, normals, NearestPoints(points), viewpoint, view, max(BEFORE, NOISES * noise))
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Which vertices (V,) face the sensor and are not hidden by what it saw."""

@@ -14,7 +14,8 @@ from typing import Protocol
 
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
+
+from flowing_puppet_ros.evidence.nearest import NearestPoints
 
 MAX_CELLS = 2_000_000
 DISTANCE_OFFSET = 0.001
@@ -41,11 +42,12 @@ class ExactCloud:
 
     points: np.ndarray
     normals: np.ndarray
-    tree: cKDTree
+    tree: NearestPoints
 
     def data_cost(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The same as `CloudGrid.data_cost`."""
-        distance, index = self.tree.query(points)
+        distance, index = self.tree.query(points.reshape(-1, 3))
+        distance, index = distance.reshape(points.shape[:-1]), index.reshape(points.shape[:-1])
         cosine = (normals * self.normals[index]).sum(axis=-1)
         cost = ((distance**2 + DISTANCE_OFFSET) ** DISTANCE_POWER).mean(axis=-1)
         return cost, (cosine < MISMATCH_COSINE).mean(axis=-1)

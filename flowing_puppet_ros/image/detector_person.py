@@ -66,6 +66,11 @@ class Place:
     score: float = 0.0
     least: float = -np.inf
 
+    @property
+    def probability(self) -> float:
+        """Probability that somebody stands there."""
+        return 1 / (1 + float(np.exp(-self.log_odds)))
+
     def apart(self, other: Place) -> float:
         """Distance of the necks in units of the larger S."""
         return float(np.hypot(*(self.neck - other.neck))) / max(self.scale, other.scale)
@@ -97,6 +102,11 @@ class PersonDetection:
     def scale(self) -> float:
         """S: the shoulder width in px, of somebody seen from the side what it would be from the front."""
         return self.pose.scale / self.factor
+
+    @property
+    def score(self) -> float:
+        """Score of the pose in its place, in units of the margin."""
+        return self.pose.score
 
     @property
     def neck(self) -> Doubles:

@@ -103,12 +103,16 @@ class Person:
         unknown: NDArray[np.bool_] = ~(np.sqrt(self.variance) < UNKNOWN_DEVIATION * self.scale)
         return unknown
 
-    def confidence(self, image_size: tuple[int, int]) -> Floats:
-        """(J,) in [0, 1]: falls with the joint's variance, and is a tenth outside the image (width, height)."""
+    @property
+    def confidence(self) -> Floats:
+        """(J,) in [0, 1], of joints that can be seen: falls with the joint's variance."""
         spread = self.variance / (CONFIDENT_DEVIATION * self.scale) ** 2
-        inside = ((self.mean >= -0.5) & (self.mean <= np.array(image_size) - 0.5)).all(axis=1)
-        confidence: Floats = np.clip(self.quality / (1 + spread), 0, 1) * np.where(inside, 1.0, 0.1)
+        confidence: Floats = np.clip(self.quality / (1 + spread), 0, 1)
         return confidence
+
+    def outside(self, image_size: tuple[int, int]) -> NDArray[np.bool_]:
+        """(J,) whether a joint lies outside of the image (width, height)."""
+        return ((self.mean < -0.5) | (self.mean > np.array(image_size) - 0.5)).any(axis=1)
 
     def settle(self, model: DeformableStructures) -> None:
         """Place the unknown joints by the body model and draw the puppet for the joints, scale and view."""
@@ -133,12 +137,13 @@ class Person:
             self.view = "back"
 
     def redirect(self, joint: int, place: Floats, confidence: float, settings: TrackerSettings) -> None:
-        """Move a joint to where it is known to be, (2,) px, unless it is about there already."""
+        """Move a joint to where it is known to be, (2,) px, unless it is about there; NaN: as sure as before."""
+        if np.isfinite(confidence):
+            self.quality[joint] = confidence
         if float(np.hypot(*(place - self.mean[joint]))) <= ELSEWHERE * self.scale:
             return
         self.mean[joint] = place
-        self.variance[joint] = float(detection_variance(np.array(confidence), self.scale, settings))
-        self.quality[joint] = confidence
+        self.variance[joint] = float(detection_variance(self.quality[joint], self.scale, settings))
         self.age[joint] = self.doubts[joint] = 0
         self.doubted[joint] = np.nan
 

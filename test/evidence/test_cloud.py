@@ -3,9 +3,9 @@
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.evidence.cloud import CloudGrid, ExactCloud, look_up
+from flowing_puppet_ros.evidence.nearest import NearestPoints
 
 CENTRE = np.array([1.0, 2.0, -0.5])
 
@@ -85,7 +85,7 @@ def test_the_exact_cloud_takes_the_nearest_of_all_points(sphere: CloudGrid) -> N
     points = rng.uniform(-0.4, 0.4, (3, 40, 3)) + CENTRE
     normals = rng.normal(size=(3, 40, 3))
     normals /= np.linalg.norm(normals, axis=2, keepdims=True)
-    cost, mismatch = ExactCloud(sphere.points, sphere.normals, cKDTree(sphere.points)).data_cost(points, normals)
+    cost, mismatch = ExactCloud(sphere.points, sphere.normals, NearestPoints(sphere.points)).data_cost(points, normals)
     gaps = np.linalg.norm(points[:, :, None] - sphere.points, axis=3)
     np.testing.assert_allclose(cost, ((gaps.min(axis=2) ** 2 + 0.001) ** 0.45).mean(axis=1))
     angle = np.arccos(np.clip((normals * sphere.normals[gaps.argmin(axis=2)]).sum(axis=2), -1, 1))
