@@ -88,6 +88,13 @@ def test_pages_show_the_figures_that_are_drawn() -> None:
     assert drawn == shown == {*figures_2d.FIGURES, *figures_3d.FIGURES}
 
 
+def test_the_tests_that_pages_name_are_there() -> None:
+    text = "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md"))
+    named = set(re.findall(r"test/[\w/]+\.py", text))
+    assert len(named) > 20
+    assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
+
+
 def test_a_figure_is_a_picture_with_something_on_it() -> None:
     picture = figures_2d.labels()
     assert picture.shape[0] == figures_2d.SIZE[1]

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from flowing_puppet_ros.bag.depth_topics import depth_topics, holds_depth
 from flowing_puppet_ros.body.camera import Camera as CameraModel
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings
@@ -96,6 +97,7 @@ class Camera:
 
 def build_graph(
     topics: Mapping[str, str],
+    encoded: Mapping[str, str],
     frames: FrameTree,
     infos: Mapping[str, Any],
     settings: Mapping[str, Mapping[str, Any]],
@@ -104,23 +106,29 @@ def build_graph(
     """Make the components that the topics (name -> type) of a recording can feed.
 
     One tracker a camera; a visual hull of two or more cameras that `frames` connects (`infos`: topic -> its first
-    CameraInfo); a body fitter for their silhouettes and one for every cloud topic. `settings` are those of each kind of
-    component by its name. What the recording holds of their outputs is not used: it is made anew. InputError lists
-    what there is when nothing can be used.
+    CameraInfo); a body fitter for their silhouettes and one for every topic of clouds or depth images (`encoded`: image
+    topic -> encoding). `settings` are those of each kind of component by its name. What the recording holds of their
+    outputs is not used: it is made anew. InputError lists what there is when nothing can be used.
     """
-    cameras = _cameras(topics)
+    cameras = _cameras({name: kind for name, kind in topics.items() if not holds_depth(name, encoded.get(name, ""))})
     clouds = [topic for topic, kind in topics.items() if kind == POINT_CLOUD and not topic.endswith("/body_vertices")]
-    if not cameras and not clouds:
-        raise InputError(_nothing_usable(topics))
+    depths, depth_notes = depth_topics(topics, encoded, clouds)
+    if not cameras and not clouds and not depths:
+        raise InputError("; ".join([_nothing_usable(topics), *depth_notes]))
     graph = Graph([_tracker(camera, topics, settings, factory) for camera in cameras])
-    graph.notes += _detection_notes(graph.instances, topics)
+    graph.notes += [*_detection_notes(graph.instances, topics), *depth_notes]
     if len(cameras) >= LEAST_CAMERAS:
         calibrated, note = _calibrated(cameras, frames, infos)
         graph.notes += [note] if note else []
         if len(calibrated) >= LEAST_CAMERAS:
             graph.instances += _hull_and_fitter(calibrated, settings, factory)
     made = graph.outputs()
-    graph.instances += [_cloud_fitter(cloud, topics, settings, factory) for cloud in clouds if cloud not in made]
+    for topic in (*(cloud for cloud in clouds if cloud not in made), *depths):
+        port = "depth" if topic in depths else "points"
+        fitter = _scene_fitter(port, topic, topics, settings, factory)
+        if fitter.topic("bodies") in graph.outputs():  # of another cloud in the same namespace
+            fitter.namespace = topic
+        graph.instances.append(fitter)
     return graph
 
 
@@ -130,8 +138,8 @@ def _nothing_usable(topics: Mapping[str, str]) -> str:
     old = images[0] if images else "OLD"
     new = f"{old.removesuffix('/compressed').rpartition('/')[0]}/image" if images else "NEW"
     return (
-        f"no topic can be used: wanted are images named {', '.join(IMAGE_NAMES)}, or point clouds; the topics are "
-        f"{listed}; --topic-map {old}:={new} renames one"
+        f"no topic can be used: wanted are images named {', '.join(IMAGE_NAMES)}, depth images with their "
+        f"camera_info, or point clouds; the topics are {listed}; --topic-map {old}:={new} renames one"
     )
 
 
@@ -223,13 +231,20 @@ def _hull_and_fitter(
     return [Instance("visual_hull", hull, "", renamed), Instance("body_fitter", fitter, "", joined)]
 
 
-def _cloud_fitter(
-    cloud: str, topics: Mapping[str, str], settings: Mapping[str, Mapping[str, Any]], factory: MessageFactory
+def _scene_fitter(
+    port: str,
+    topic: str,
+    topics: Mapping[str, str],
+    settings: Mapping[str, Mapping[str, Any]],
+    factory: MessageFactory,
 ) -> Instance:
-    namespace = cloud.rpartition("/")[0]
+    """A body fitter whose `port` (points, or depth with the camera_info beside it) is `topic`."""
+    namespace = topic.rpartition("/")[0]
     fitter = BodyFitterComponent(_settings(BodyFitterComponent, "body_fitter", settings), factory)  # type: ignore[arg-type]
-    renamed = {"points": cloud, "depth": "", "camera_info": "", "silhouettes": ""}
-    instance = Instance(f"{cloud.lstrip('/')}/body_fitter", fitter, namespace, renamed)
+    renamed = {"points": "", "depth": "", "camera_info": "", "silhouettes": "", port: topic}
+    if port == "depth":
+        renamed["camera_info"] = f"{namespace}/camera_info"
+    instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, namespace, renamed)
     fitter.expects("initial", topics.get(instance.topic("initial")) == BODIES)
     return instance
 

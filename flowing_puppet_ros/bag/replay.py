@@ -16,6 +16,7 @@ from typing import Any
 from tqdm import tqdm
 
 from flowing_puppet_ros import __version__
+from flowing_puppet_ros.bag.depth_topics import encodings
 from flowing_puppet_ros.bag.graph import Instance, build_graph, info_topics
 from flowing_puppet_ros.bag.reader import Bag, Record, open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
@@ -87,7 +88,8 @@ class _Replay:
             raise InputError(f"--topic-map gives two topics the name {new}: choose another name")
         self._static = self._static_records(topics)
         infos = self._first_infos(topics)
-        self._graph = build_graph(topics, self._frames(), infos, self._settings(), self._factory)
+        encoded = {self._new_name[name]: encoding for name, encoding in encodings(bag).items()}
+        self._graph = build_graph(topics, encoded, self._frames(), infos, self._settings(), self._factory)
         self.warnings += self._graph.notes
         held = {self._new_name[name]: detail.type for name, detail in bag.details.items() if detail.count}
         self._routes = self._graph.routes(held)

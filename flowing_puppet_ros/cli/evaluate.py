@@ -32,7 +32,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add one sub-command a kind of measurement."""
     kinds = parser.add_subparsers(dest="kind_of_truth", required=True, metavar="|".join(KINDS))
     for name, module in KINDS.items():
-        module.add_arguments(kinds.add_parser(name, description=module.__doc__))
+        summary = (module.__doc__ or "").partition("\n")[0].rstrip(".").replace("%", "%%")
+        module.add_arguments(kinds.add_parser(name, help=summary, description=module.__doc__))
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -24,7 +24,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="|".join(MODULES))
     for name in MODULES:
         module = _module(name)
-        module.add_arguments(kinds.add_parser(name, description=module.__doc__))
+        summary = (module.__doc__ or "").partition("\n")[0].rstrip(".").replace("%", "%%")
+        module.add_arguments(kinds.add_parser(name, help=summary, description=module.__doc__))
 
 
 def run(arguments: argparse.Namespace) -> int:

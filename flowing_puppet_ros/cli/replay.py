@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run the nodes' algorithms over a recording: every message, in log order, with the same result every time.
 
-Each camera (a topic named image, with its camera_info and, if there are any, detections) is tracked; three or more
-calibrated cameras give a visual hull; hulls and point clouds are fitted with bodies. All results go into one bag with
-the stamps of the input, and so do camera_info, detections and /tf_static. Several bags are replayed in parallel, on
-this machine or on a Dask cluster, with the same results as one by one; those that were finished by an earlier call with
-the same flags are skipped.
+Each camera (a topic named image, with its camera_info and, if there are any, detections) is tracked; two or more
+calibrated cameras give silhouettes and a visual hull; silhouettes, point clouds and depth images are fitted with
+bodies. All results go into one bag with the stamps of the input, and so do camera_info, detections and /tf_static.
+Several bags are replayed in parallel, on this machine or on a Dask cluster, with the same results as one by one; those
+that were finished by an earlier call with the same flags are skipped.
 """
 
 from __future__ import annotations

@@ -14,12 +14,15 @@ from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.bag.depth_topics import holds_depth
 from flowing_puppet_ros.bag.reader import Bag
+from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.body.camera import Camera
 from flowing_puppet_ros.body.triangulate import triangulate
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.joints import LIMB_JOINTS, named_points
 from flowing_puppet_ros.image.keypoints import normalise_name
+from flowing_puppet_ros.stream.depth import depth_cloud
 from flowing_puppet_ros.stream.messages import FrameTree, stamp_ns
 
 IMAGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
@@ -59,7 +62,8 @@ class Recording:
     bodies: dict[int, list[Any]] = field(default_factory=dict)
     triangles: np.ndarray = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     body_frame: str = ""
-    cloud_topics: dict[str, str] = field(default_factory=dict)  # "hull", "body_vertices", the input's "points" -> topic
+    cloud_topics: dict[str, str] = field(default_factory=dict)
+    """Topics of "hull", "body_vertices", and the input's "points" or "depth"."""
     counts: dict[str, int] = field(default_factory=dict)  # messages of each topic that replay wrote
 
     @property
@@ -139,17 +143,40 @@ def _take(recording: Recording, frames: FrameTree, topic: str, kind: str, messag
 
 
 def _find_images(recording: Recording, given: Bag) -> None:
-    """Give each camera the image topic of its namespace, or else the one whose first image has its frame."""
+    """Give each camera the image topic of its namespace, or else the one whose first image has its frame.
+
+    Depth images in the frame of the bodies are what these were fitted to.
+    """
     topics = [
         name for name, topic in given.details.items() if topic.type in IMAGE and topic.count and leaf(name) not in MADE
     ]
     by_frame: dict[str, str] = {}
-    for topic in topics:
+    for topic in list(topics):
         with suppress(InputError):
-            by_frame.setdefault(next(given.messages([topic])).message.header.frame_id, topic)
+            image = next(given.messages([topic])).message
+            frame = image.header.frame_id
+            if not holds_depth(topic, getattr(image, "encoding", "")):
+                by_frame.setdefault(frame, topic)
+                continue
+            topics.remove(topic)
+            if recording.bodies and frame == recording.body_frame:
+                recording.cloud_topics.setdefault("depth", topic)
     for camera in recording.cameras.values():
         same = [topic for topic in topics if namespace(topic) == camera.namespace]
         camera.image_topic = min(same) if same else by_frame.get(camera.frame_id, "")
+
+
+def sensed_clouds(recording: Recording) -> list[str]:
+    """The input's topics of what bodies were fitted to: points, or else depth images."""
+    return [recording.cloud_topics[name] for name in ("points", "depth") if name in recording.cloud_topics][:1]
+
+
+def as_cloud(recording: Recording, topic: str, message: Any) -> Any:
+    """The PointCloud2 of a message on one of `sensed_clouds`; InputError when a depth image cannot be used."""
+    if topic != recording.cloud_topics.get("depth"):
+        return message
+    camera = recording.cameras.get(namespace(topic))
+    return depth_cloud(BagMessageFactory(), message, camera and camera.info)
 
 
 def _place_cameras(recording: Recording, frames: FrameTree) -> None:

@@ -23,7 +23,7 @@ from flowing_puppet_ros.model.ds import DeformableStructures
 
 type Floats = NDArray[np.float64]
 
-DETECTOR_TRUST = 1 / 16
+DETECTOR_TRUST = 1 / 8
 """Weight of a joint of our detector against one of given keypoints: it errs more, and the flow must hold against it."""
 
 
@@ -68,52 +68,61 @@ class Clip:
 
     def people(self) -> Iterator[list[TrackedPuppet]]:
         """The people of each image, in the order of the images."""
-        joints = {identity: self._smoothed(identity, track) for identity, track in self._tracks.items()}
+        people = {identity: self._smoothed(identity, track) for identity, track in self._tracks.items()}
         at = dict.fromkeys(self._tracks, 0)
         for image in range(self.images):
             found = []
             for identity, track in self._tracks.items():
                 k = at[identity]
                 if k < len(track) and track[k].image == image:
-                    found.append(self._puppet(track[k], joints[identity][k]))
+                    joints, right = people[identity]
+                    found.append(self._puppet(track[k], joints[k], right[k]))
                     at[identity] = k + 1
             yield found
 
-    def _smoothed(self, identity: str, track: list[_Moment]) -> Floats:
-        """Joints (T, J, 2) of one person, whose images are consecutive."""
+    def _smoothed(self, identity: str, track: list[_Moment]) -> tuple[Floats, Floats]:
+        """Joints (T, J, 2) of one person, whose images are consecutive, and how probably (T, J) each is right.
+
+        NaN where the tracker knows it best.
+        """
         start = np.array([moment.puppet.joints for moment in track])
         scale = float(np.median([moment.puppet.scale for moment in track]))
         unknown = np.full((start.shape[1], 3), np.nan)
         detected = np.array([unknown if m.puppet.detected is None else m.puppet.detected for m in track])
         motion, trust = np.array([m.motion for m in track[1:]]), np.array([m.trust for m in track[1:]])
+        right = np.full(detected.shape[:2], np.nan)
         if identity in self._arms:
-            self._resolve_arms(self._arms[identity], detected, motion, scale)
+            self._resolve_arms(self._arms[identity], detected, motion, right, scale)
             detected[..., 2] *= DETECTOR_TRUST
         confidence = np.where(np.isfinite(detected).all(axis=2), detected[..., 2], 0.0)
         if len(track) < 2 or not (confidence > 0).any():
-            return start
+            return start, right
         places = np.where(confidence[..., None] > 0, detected[..., :2], np.nan)
         joints = smoothed(places, confidence, motion, trust, start, scale, self.settings)
         # The body model has placed what nobody ever saw; along the flow alone it would drift.
         never = ~(confidence > 0).any(axis=0)
         joints[:, never] = start[:, never]
-        return joints
+        return joints, right
 
-    def _resolve_arms(self, arms: ArmHistory, detected: Floats, motion: Floats, scale: float) -> None:
-        """Put the arms of the best path into the detected joints (T, J, 3) and their motion (T-1, J, 2)."""
+    def _resolve_arms(self, arms: ArmHistory, detected: Floats, motion: Floats, right: Floats, scale: float) -> None:
+        """Put the arms of the best path into the detected joints (T, J, 3), their motion (T-1, J, 2) and `right`."""
         for side, arm in arms.resolved(scale * self.model.shoulder_width).items():
             for k, name in enumerate(ENDS):
                 joint = self.model.joint_names.index(f"{side}_{name}")
                 detected[:, joint, :2] = arm.places[:, k]
                 detected[:, joint, 2] = arm.sure
+                right[:, joint] = arm.right[:, k]
                 if len(motion):
                     motion[:, joint] = arm.motion[:-1, k]
 
-    def _puppet(self, moment: _Moment, joints: Floats) -> TrackedPuppet:
+    def _puppet(self, moment: _Moment, joints: Floats, right: Floats) -> TrackedPuppet:
         puppet = moment.puppet
+        confidence = np.where(np.isfinite(right), right * puppet.visible, puppet.confidence)
         shape = self.model.puppet_from_joints(joints, puppet.scale, puppet.view)
         energy = puppet.energy - moment.body_energy + self.model.energy(shape)
-        return replace(puppet, joints=joints, contours=shape.contours, shape=shape, energy=energy)
+        return replace(
+            puppet, joints=joints, confidence=confidence, contours=shape.contours, shape=shape, energy=energy
+        )
 
 
 def _place(puppet: TrackedPuppet) -> Floats:

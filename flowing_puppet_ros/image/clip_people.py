@@ -27,6 +27,7 @@ LOSS = 1.5  # score that a pose may lack where a person is only supposed to be, 
 ABSENT = 0.5  # cost of a look in which a person is missed
 SURE, LEAST_ODDS = 4.0, -3.5  # log-odds above which a place counts no more, and from which it counts
 LASTING = 0.5  # log-odds that a path of twice as many looks has more than its places have on average
+FIRST = 1 / 3  # of the probability that others need: how sure the surest person must be
 SPAN = 15  # looks before and after one over which the scale is averaged
 
 
@@ -59,7 +60,7 @@ class PersonPath:
 class ClipPeople:
     """Collects the places of the images that were looked at, one in `step`, and tells the people.
 
-    Up to `most` of them, each but the first with a probability of `least`.
+    Up to `most` of them with a probability of `least`; of the first a third of it is enough.
     """
 
     least: float
@@ -68,18 +69,32 @@ class ClipPeople:
     _looks: dict[int, list[Place]] = field(default_factory=dict)
 
     def add(self, image: int, places: Sequence[Place]) -> None:
-        """Take the places of image number `image`; numbers grow."""
-        self._looks[image] = list(places)
+        """Take the places of image number `image`; numbers grow.
+
+        A place that costs more than to miss the person there is on no best path, and most of an image's are such.
+        """
+        self._looks[image] = [place for place in places if _gain(place) >= -ABSENT]
+
+    def keep(self, looks: int) -> None:
+        """Forget all but the last looks."""
+        for image in list(self._looks)[:-looks]:
+            del self._looks[image]
+
+    def clear(self) -> None:
+        """Forget all looks."""
+        self._looks.clear()
 
     def paths(self) -> list[PersonPath]:
-        """The people, the surest first; the first even where hardly anybody is found."""
+        """The people, the surest first."""
         images, looks = list(self._looks), [list(places) for places in self._looks.values()]
         found: list[PersonPath] = []
         while len(found) < self.most and (path := _best_path(looks)):
             log_odds = float(np.mean([place.log_odds for place in path.values()]))
-            if found and 1 / (1 + np.exp(-log_odds)) < self.least:
+            lasting = log_odds + LASTING * np.log2(len(path))
+            probability = 1 / (1 + np.exp(-(log_odds if found else lasting)))
+            if probability < (self.least if found else FIRST * self.least):
                 break
-            steady = zip(path, _steady(list(path.values()), log_odds + LASTING * np.log2(len(path))), strict=True)
+            steady = zip(path, _steady(list(path.values()), lasting), strict=True)
             found.append(PersonPath({images[number]: place for number, place in steady}, self.step))
             for number, place in path.items():
                 looks[number] = [other for other in looks[number] if other.apart(place) >= SAME_PLACE]

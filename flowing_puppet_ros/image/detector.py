@@ -140,8 +140,7 @@ class PartDetector:
                 window = window_at(small, (neck[0], neck[1]), (face[0], face[1]), place.scale * factor)
                 pose = self.pose_in(window, np.zeros(0))
                 if pose.score >= place.least:
-                    confidence = 1 / (1 + float(np.exp(-place.log_odds)))
-                    found.append(PersonDetection(self.parts, pose, confidence, factor))
+                    found.append(PersonDetection(self.parts, pose, place.probability, factor))
         return found
 
     def _people(

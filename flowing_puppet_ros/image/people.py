@@ -20,6 +20,8 @@ VIEW_VOTES = 5.0  # the view's evidence saturates here ...
 VIEW_TURNS = 3.0  # ... and must reach this on the other side to turn the puppet round
 SCALE_GAIN = 0.1  # share of the new scale estimate taken at each detection
 ELSEWHERE = 0.06  # m; a joint that is known to be farther off than this is moved at once
+CLOTHES_GAIN = 0.2  # share of the newly seen colours taken at each detection
+LONG_AGO = 1_000  # images; a joint that was not detected for so long goes to where it is
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,8 @@ class Person:
     `mean` (J, 2), isotropic `variance` (J,) px^2, `quality` (J,) of the detections behind each joint, `doubted`
     (J, 2) last detected place that the gate refused (NaN none), `doubts` (J,) how often in a row it stood there,
     `age` (J,) how many images ago a detection was last taken, `detected` (J, 3) this image's detection as x, y and
-    confidence, or None, and `detection` its index among the detections.
+    confidence, or None, and `detection` its index among the detections, `clothes` the colours of the torso (see
+    image/appearance.py) or None, `met` whether somebody else's torso overlapped with it since the last detection.
     """
 
     id: str
@@ -71,6 +74,8 @@ class Person:
     flow_energy: float = 0.0
     detection_energy: float = 0.0
     shape: PuppetShape | None = None
+    clothes: Floats | None = None
+    met: bool = False
 
     @classmethod
     def start(
@@ -98,12 +103,16 @@ class Person:
         unknown: NDArray[np.bool_] = ~(np.sqrt(self.variance) < UNKNOWN_DEVIATION * self.scale)
         return unknown
 
-    def confidence(self, image_size: tuple[int, int]) -> Floats:
-        """(J,) in [0, 1]: falls with the joint's variance, and is a tenth outside the image (width, height)."""
+    @property
+    def confidence(self) -> Floats:
+        """(J,) in [0, 1], of joints that can be seen: falls with the joint's variance."""
         spread = self.variance / (CONFIDENT_DEVIATION * self.scale) ** 2
-        inside = ((self.mean >= -0.5) & (self.mean <= np.array(image_size) - 0.5)).all(axis=1)
-        confidence: Floats = np.clip(self.quality / (1 + spread), 0, 1) * np.where(inside, 1.0, 0.1)
+        confidence: Floats = np.clip(self.quality / (1 + spread), 0, 1)
         return confidence
+
+    def outside(self, image_size: tuple[int, int]) -> NDArray[np.bool_]:
+        """(J,) whether a joint lies outside of the image (width, height)."""
+        return ((self.mean < -0.5) | (self.mean > np.array(image_size) - 0.5)).any(axis=1)
 
     def settle(self, model: DeformableStructures) -> None:
         """Place the unknown joints by the body model and draw the puppet for the joints, scale and view."""
@@ -128,14 +137,24 @@ class Person:
             self.view = "back"
 
     def redirect(self, joint: int, place: Floats, confidence: float, settings: TrackerSettings) -> None:
-        """Move a joint to where it is known to be, (2,) px, unless it is about there already."""
+        """Move a joint to where it is known to be, (2,) px, unless it is about there; NaN: as sure as before."""
+        if np.isfinite(confidence):
+            self.quality[joint] = confidence
         if float(np.hypot(*(place - self.mean[joint]))) <= ELSEWHERE * self.scale:
             return
         self.mean[joint] = place
-        self.variance[joint] = float(detection_variance(np.array(confidence), self.scale, settings))
-        self.quality[joint] = confidence
+        self.variance[joint] = float(detection_variance(self.quality[joint], self.scale, settings))
         self.age[joint] = self.doubts[joint] = 0
         self.doubted[joint] = np.nan
+
+    def wear(self, colours: Floats) -> None:
+        """Follow the colours of the torso slowly."""
+        seen = colours if self.clothes is None else (1 - CLOTHES_GAIN) * self.clothes + CLOTHES_GAIN * colours
+        self.clothes = np.asarray(seen)
+
+    def found_again(self) -> None:
+        """Let the next detection, far away, be believed at once."""
+        self.age[:] = LONG_AGO
 
     def fuse(self, joints: Floats, confidence: Floats, settings: TrackerSettings) -> None:
         """Fuse detected joints (J, 2), NaN unknown: precision-weighted means, behind a gate with patience.

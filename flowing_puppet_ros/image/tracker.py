@@ -23,7 +23,8 @@ from flowing_puppet_ros.flow.estimate import (
     working_size,
 )
 from flowing_puppet_ros.flow.puppet_flow import PuppetFlow
-from flowing_puppet_ros.image.association import Detection, associate
+from flowing_puppet_ros.image.appearance import clothes_of, meetings
+from flowing_puppet_ros.image.association import Detection, associate, joint_distance
 from flowing_puppet_ros.image.carry import Carriage, Grid, carry_people, paint_people
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.people import Person, TrackerSettings
@@ -35,23 +36,25 @@ from flowing_puppet_ros.model.ds_shape import PuppetShape, View
 type Floats = NDArray[np.float64]
 
 LEAST_KNOWN = 3  # a person of whom fewer joints are known is lost
-HIDDEN = 0.3  # share of the confidence that is left of a joint behind somebody nearer
+HIDDEN, OUTSIDE = 0.3, 0.1  # share of the confidence that is left of a joint behind somebody nearer, out of the image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedPuppet:
     """One person in one image, pixels of the image.
 
-    `joints` (J, 2) in the order of the model's joint_names, `confidence` (J,) in [0, 1], `scale` px/m, `view` front or
-    back, `contours` one (K_i, 2) a part, `depth` (P,) paint order of each part, 0 farthest, `energy` the negative log
-    of the body prior, the flow's misfit and the distance of the detection (up to a constant; lower is better),
-    `detected` (J, 3) what this image's detection says, x, y and confidence, or None, and `detection` its index.
+    `joints` (J, 2) in the order of the model's joint_names, `confidence` (J,) in [0, 1], in which the share `visible`
+    (J,) is contained that joints outside of the image or behind somebody keep, `scale` px/m, `view` front or back,
+    `contours` one (K_i, 2) a part, `depth` (P,) paint order of each part, 0 farthest, `energy` the negative log of the
+    body prior, the flow's misfit and the distance of the detection (up to a constant; lower is better), `detected`
+    (J, 3) what this image's detection says, x, y and confidence, or None, and `detection` its index.
     """
 
     id: str
     model: str
     joints: Floats
     confidence: Floats
+    visible: Floats
     scale: float
     view: View
     energy: float
@@ -67,6 +70,7 @@ class TrackResult:
     """What one step found: `puppets` in the order of their ids, `flow` (forward, backward) at working scale, or None.
 
     `flow` leads from the previous image to this one; it is None for the first image and when nobody was tracked.
+    `restarted`: everybody before this image was forgotten, because of a cut, a stamp that went back or another size.
     """
 
     puppets: list[TrackedPuppet]
@@ -75,6 +79,7 @@ class TrackResult:
     _model: DeformableStructures
     grid: Grid
     _carriage: Carriage | None
+    restarted: bool = False
 
     def labels(self, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Part labels (H, W) uint8 of all people, part index + 1, 0 background; `shape` is the image's if not given."""
@@ -137,22 +142,23 @@ class FlowingPuppetTracker:
         image = as_image(image)
         size = (image.shape[1], image.shape[0])
         grid = Grid(size, working_size(image.shape, self.optical_flow.settings.max_side))
+        began = self._previous is not None
         warnings = self._restart_if_broken(stamp_ns, size)
         previous = self._previous
         self._previous = _Previous(stamp_ns, grid, self.optical_flow.prepare(image), colours_of(image))
-        carriage, pair = None, None
+        carriage, pair, restarted = None, None, began and previous is None
         if previous is not None and self.people:
             pair = self._flow(previous, flow, warnings)
             if is_cut(previous.colours, self._previous.colours, pair):
                 warnings.append("the picture changes as at a cut between shots: tracking starts anew")
-                self.people, pair = [], None
+                self.people, pair, restarted = [], None, True
             else:
                 carriage = carry_people(self.model, self.people, pair, grid, self.settings)
-        self._take(detections, warnings)
+        self._take(image, detections, warnings)
         self.people = [person for person in self.people if self._lives(person, size)]
         for person in self.people:
             person.settle(self.model)
-        return TrackResult(self._puppets(grid), pair, warnings, self.model, grid, carriage)
+        return TrackResult(self._puppets(grid), pair, warnings, self.model, grid, carriage, restarted)
 
     def redirected(self, result: TrackResult, places: Mapping[str, Mapping[int, tuple[Floats, float]]]) -> TrackResult:
         """The last result with some joints moved: by id and joint the place (2,) px and how sure it is (0 to 1)."""
@@ -186,23 +192,32 @@ class FlowingPuppetTracker:
         assert self._previous is not None
         return self.optical_flow.between(previous.grey, self._previous.grey)
 
-    def _take(self, detections: Sequence[Keypoints] | None, warnings: list[str]) -> None:
+    def _take(self, image: NDArray[np.uint8], detections: Sequence[Keypoints] | None, warnings: list[str]) -> None:
         """Fuse the detections into the people they belong to and start new people at the rest."""
         for person in self.people:
             person.unseen += 1
             person.detection_energy = 0.0
             person.detected = person.detection = None
+        met = meetings(self.model.joint_names, [person.mean for person in self.people])
+        for person, meets in zip(self.people, met, strict=True):
+            person.met |= meets
         if detections is None:
             return
         found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
-        matched, free = associate(self.people, found, self.settings.match_distance)
+        several = max(len(self.people), len(found)) > 1
+        worn = clothes_of(self.model.joint_names, image, [joints for joints, _ in found]) if several else None
+        matched, free = associate(self.people, found, self.settings.match_distance, worn)
         for index, person in enumerate(self.people):
             person.missed += 1
             if index in matched:
+                if joint_distance(person, found[matched[index]]) > self.settings.match_distance:
+                    person.found_again()
                 person.fuse(*found[matched[index]], self.settings)
                 person.update_scale_and_view(self.model)
                 person.unseen = person.missed = 0
-                person.detection = matched[index]
+                person.detection, person.met = matched[index], False
+                if worn and (clothes := worn[matched[index]]) is not None and clothes.alone:
+                    person.wear(clothes.colours)
         # The surest new person comes first: it gets the lower id, and a place when there is only one left.
         for index in sorted(free, key=lambda k: -found[k][1].sum()):
             self._start(index, found[index], warnings)
@@ -245,11 +260,13 @@ class FlowingPuppetTracker:
         order = depth_order(self.model, person.view)
         depth = tuple(int(rank) for rank in np.argsort(order))
         energy = self.model.energy(shape) + person.flow_energy + person.detection_energy
+        visible = np.where(hidden, HIDDEN, 1.0) * np.where(person.outside(size), OUTSIDE, 1.0)
         return TrackedPuppet(
             person.id,
             self.model.name,
             person.mean.copy(),
-            person.confidence(size) * np.where(hidden, HIDDEN, 1.0),
+            person.confidence * visible,
+            visible,
             person.scale,
             person.view,
             float(energy),

@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections import deque
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +16,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arm_path import PathSettings
 from flowing_puppet_ros.image.arms import ENDS, ArmFilter, Sight
-from flowing_puppet_ros.image.clip_people import ClipPeople, PersonPath
+from flowing_puppet_ros.image.clip_people import FIRST, ClipPeople, PersonPath
 from flowing_puppet_ros.image.detector import DetectorSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
 from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
@@ -25,10 +24,9 @@ from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
 
-SURE_SIZES, SIZES = 3, 9
-"""Searches that must have found a person before only their place is looked at; those whose median tells the size."""
+SURE_LOOKS = 5  # searches that must have found a person before only their place is looked at
+MEMORY = 20  # searches that are remembered live
 LEAST_ODDS = 1e-6
-FIRST = 1 / 3  # of `least_person`: how probable the surest person of an image must be
 
 
 @dataclass(frozen=True)
@@ -73,8 +71,13 @@ class VideoTracker:
     settings: DetectionSettings
     path: PathSettings = field(default_factory=PathSettings)
     images: int = 0
-    _sizes: dict[str, deque[tuple[float, float]]] = field(default_factory=dict)
+    _looks: ClipPeople = field(init=False)
+    _known: dict[str, tuple[float, float, int]] = field(default_factory=dict)
     _arms: dict[str, ArmFilter] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Begin with no search."""
+        self._looks = self._empty(self.settings.search_every)
 
     def step(
         self,
@@ -99,11 +102,21 @@ class VideoTracker:
                 arms.carry(result.flow, result.grid)
             return result, []
         places = self._known_places()
-        search = places is None or number % self.settings.renew_every == 0
-        found = self.detect(image) if search or places is None else self.detector.at(image, places)
-        result = self._with_arms(self._tracked(image, stamp_ns, flow, found), image, found)
-        if search:
-            self._learn_sizes(result, found)
+        searched = places is None or number % self.settings.renew_every == 0
+        if searched or places is None:
+            places = self._searched(image, number)
+        found = self.detector.at(image, places)
+        result = self._tracked(image, stamp_ns, flow, found)
+        if result.restarted:
+            # Nobody stands any more where they stood before a cut.
+            self._looks.clear()
+            searched, found = True, self.detector.at(image, self._searched(image, number))
+            self.tracker.reset()
+            again = self._tracked(image, stamp_ns, None, found)
+            result = replace(again, warnings=result.warnings, restarted=True)
+        result = self._with_arms(result, image, found)
+        if searched:
+            self._learn_places(result, found)
         return result, found
 
     def _tracked(
@@ -125,54 +138,59 @@ class VideoTracker:
         self._arms = {identity: self._arms.get(identity, ArmFilter(self.path)) for identity in sights}
         places: dict[str, dict[int, tuple[NDArray[np.float64], float]]] = {}
         for puppet in result.puppets:
-            sight = sights[puppet.id]
-            arms = self._arms[puppet.id].step(sight, result.flow, result.grid, puppet.scale * model.shoulder_width)
-            person = 1.0 if sight.detection is None else sight.detection.confidence
+            arms = self._arms[puppet.id].step(sights[puppet.id], result.flow, result.grid)
             places[puppet.id] = {
-                model.joint_names.index(f"{side}_{name}"): (ends[k], person * sure)
-                for side, (ends, sure) in arms.items()
+                model.joint_names.index(f"{side}_{name}"): (ends[k], float(right[k]))
+                for side, (ends, right) in arms.items()
                 for k, name in enumerate(ENDS)
             }
         return self.tracker.redirected(result, places)
 
     def _known_places(self) -> list[Place] | None:
-        """Where the tracked people stand; None when nobody, or somebody too new, is tracked."""
+        """Where the known people stand; None when nobody is known, or somebody for too short a time."""
         places = []
         names = self.tracker.model.joint_names
         for person in self.tracker.people:
-            sizes = self._sizes.get(person.id, ())
-            if len(sizes) < SURE_SIZES:
-                return None
-            neck, face = (person.mean[names.index(name)] for name in ("neck", "face"))
-            scale, log_odds = np.median(np.array(sizes), axis=0)
-            places.append(Place(neck, face, float(np.exp(scale)), float(log_odds)))
+            if person.id in self._known:
+                scale, log_odds, looks = self._known[person.id]
+                if looks < SURE_LOOKS:
+                    return None
+                neck, face = (person.mean[names.index(name)] for name in ("neck", "face"))
+                places.append(Place(neck, face, scale, log_odds))
         return places or None
 
-    def _learn_sizes(self, result: TrackResult, found: Sequence[PersonDetection]) -> None:
-        """Remember how large the people of a step were found to be, and how surely; forget those who are gone.
+    def _searched(self, image: NDArray[np.uint8], number: int) -> list[Place]:
+        """Search the image, and tell from all searches up to now where people are in it."""
+        self._looks.add(number, self.detector.candidates(image))
+        self._looks.keep(MEMORY)
+        return [place for path in self._looks.paths() if (place := path.at(number)) is not None]
 
-        Whom a search does not find loses one memory, and with the last of them the look at the place alone.
+    def _learn_places(self, result: TrackResult, found: Sequence[PersonDetection]) -> None:
+        """Remember how large the people of a search are, and how surely; forget whom it did not find.
+
+        They are carried by the flow until another search finds them or the tracker gives them up.
         """
-        kept = {puppet.id: self._sizes.get(puppet.id, deque(maxlen=SIZES)) for puppet in result.puppets}
+        known = {}
         for puppet in result.puppets:
-            sizes = kept[puppet.id]
             if puppet.detection is not None:
                 person = found[puppet.detection]
                 odds = np.clip(person.confidence, LEAST_ODDS, 1 - LEAST_ODDS)
-                sizes.append((float(np.log(person.scale)), float(np.log(odds / (1 - odds)))))
-            elif sizes:
-                sizes.popleft()
-        self._sizes = kept
+                looks = self._known[puppet.id][2] + 1 if puppet.id in self._known else 1
+                known[puppet.id] = person.scale, float(np.log(odds / (1 - odds))), looks
+        self._known = known
 
     def search(self, images: Iterable[NDArray[np.uint8]]) -> list[PersonPath]:
         """Look for the people of a whole clip before it is tracked; images that cannot be used are passed over."""
         every = self.settings.search_every
-        clip = ClipPeople(self.settings.least_person, self.tracker.settings.most_people, every)
+        clip = self._empty(every)
         for number, image in enumerate(images):
             if number % every == 0:
                 with contextlib.suppress(InputError):
                     clip.add(number, self.detector.candidates(image))
         return clip.paths()
+
+    def _empty(self, every: int) -> ClipPeople:
+        return ClipPeople(self.settings.least_person, self.tracker.settings.most_people, every)
 
     def sights(
         self, image: NDArray[np.uint8], result: TrackResult, found: Sequence[PersonDetection]

@@ -32,7 +32,7 @@ _UNUSABLE = (PuppetError, ParameterException, NameValidationException, RuntimeEr
 
 
 class ComponentNode[C: Component](LifecycleNode):
-    """A managed node: configuring loads the models, activating opens the inputs.
+    """A managed node: configuring loads the models and compiles what they need, activating opens the inputs.
 
     With the parameter `autostart` it activates itself when it is made; without, a lifecycle manager does. Parameters
     may be changed in every state: a running component takes them over, or is made anew where it cannot.
@@ -135,7 +135,7 @@ class ComponentNode[C: Component](LifecycleNode):
         """Make the component out of the settings as they are, and put it to work on the topics."""
         kind: Any = COMPONENTS[self._component]
         component: C = kind(self._settings, RosMessageFactory())
-        component.warm()
+        component.warm_up()
         self.session = Session(self, component, self._own.queue, self._diagnostics)
 
     def _activate(self) -> None:

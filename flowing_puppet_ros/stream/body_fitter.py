@@ -83,7 +83,7 @@ class BodyFitterComponent(Component):
         self._outputs = BodyOutputs(settings, factory, self._model)
         self.outputs = (*BodyOutputs.ports, *self._outputs.humans.ports)
 
-    def warm(self) -> None:
+    def warm_up(self) -> None:
         """Do beforehand what the first clouds of a live stream would wait for."""
         self._people.warm()
 

@@ -109,8 +109,8 @@ class Component:
         """Return what was still waiting for a partner when the input ended."""
         return []
 
-    def warm(self) -> None:
-        """Do beforehand what the first messages of a live stream would wait for."""
+    def warm_up(self) -> None:
+        """Load and compile what the first message would wait for; nothing else of the component changes."""
 
     def reset(self) -> None:
         """Forget the past: the next message starts a new recording."""

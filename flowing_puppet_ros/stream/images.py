@@ -66,7 +66,8 @@ def decode_image(message: Any) -> NDArray[np.uint8]:
     if size == 2:
         pixels = (pixels >> 8).astype(np.uint8)
     if conversion is None:
-        return np.ascontiguousarray(pixels)
+        # Kernels are compiled for arrays that may be written, as all other conversions return.
+        return np.array(pixels)
     try:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
     except cv2.error as error:  # packed formats need an even width, Bayer patterns two rows
@@ -118,6 +119,11 @@ def decode_flow(message: Any) -> NDArray[np.float32]:
     pixels = pixels.astype(np.float32, copy=False)
     sane = np.abs(pixels) < FARTHEST_FLOW
     return pixels if sane.all() else np.where(sane.all(axis=2, keepdims=True), pixels, np.float32(np.nan))
+
+
+def is_depth(encoding: str) -> bool:
+    """Whether `decode_depth` reads images of this encoding; mono16 may be a picture as well."""
+    return encoding.lower() in _DEPTH
 
 
 def decode_depth(message: Any) -> NDArray[np.float32]:

@@ -85,6 +85,11 @@ class Lookout:
         """Go on with these settings."""
         self._settings, self._most_people, self._optical_flow = settings, most_people, optical_flow
 
+    def warm_up(self, image: Image) -> None:
+        """Load the detector and have it look at an image of no interest, if it will ever look at any."""
+        if self._settings.detect:
+            self._detect(image, least_person=0.0)
+
     def reset(self) -> None:
         """Forget the images; the next one is looked at."""
         self._now_ns = self._next_ns = 0
@@ -135,14 +140,13 @@ class Lookout:
             found = beside.submit(self._detect, image)
         return _Look(image, stamp_ns, self._now_ns + round(self._settings.detect_delay * NANOSECONDS), found)
 
-    def _detect(self, image: Image) -> list[Keypoints]:
+    def _detect(self, image: Image, least_person: float | None = None) -> list[Keypoints]:
         # Results may depend on the number of threads otherwise.
         cv2.setNumThreads(1)
         if self._detector is None:
             self._detector = PartDetector.load()
-        settings = DetectorSettings(
-            least_confidence=self._settings.least_person, most_people=min(self._most_people, 80)
-        )
+        least = self._settings.least_person if least_person is None else least_person
+        settings = DetectorSettings(least_confidence=least, most_people=min(self._most_people, 80))
         return [person.keypoints for person in self._detector.detect(image, settings)]
 
     def _answer(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.flow.estimate import FlowSettings, OpticalFlow
+from flowing_puppet_ros.stream import warm_up
 from flowing_puppet_ros.stream.component import IMAGE, Component, Output, Port
 from flowing_puppet_ros.stream.images import decode_image, make_image
 from flowing_puppet_ros.stream.messages import MessageFactory, stamp_ns
@@ -34,8 +35,16 @@ class OpticalFlowComponent(Component):
     def __init__(self, settings: FlowSettings, factory: MessageFactory) -> None:
         """Make the flow estimator."""
         super().__init__(settings, factory)
+        self._settings = settings
         self._flow = OpticalFlow(settings)
         self._previous: tuple[Any, int, NDArray[np.uint8]] | None = None
+
+    def warm_up(self) -> None:
+        """Compute the flow of made-up images, and colour it, with a component of its own."""
+        other = type(self)(self._settings, self.factory)
+        other.wants("flow/preview", True)
+        for image in warm_up.images(self.factory):
+            other.handle("image", image)
 
     def reset(self) -> None:
         """Forget the previous image."""

@@ -17,6 +17,7 @@ from flowing_puppet_ros.image.people import TrackerSettings
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.stream import warm_up
 from flowing_puppet_ros.stream.component import IMAGE, PUPPETS, Component, Output, Port
 from flowing_puppet_ros.stream.humans import Humans, HumansSettings, image_humans
 from flowing_puppet_ros.stream.images import decode_flow, decode_image, make_image
@@ -77,6 +78,18 @@ class PuppetTrackerComponent(Component):
         self._header: Any = None
         self._humans = Humans(settings, factory, "skeleton2d", "roi", "cropped")
         self.outputs = (*type(self).outputs, *self._humans.ports)
+
+    def warm_up(self) -> None:
+        """Track somebody made up with a component of its own, and load the detector."""
+        other = type(self)(self._settings, self.factory)
+        other.expects("detections", True)
+        for port in other.outputs:
+            if port.lazy:
+                other.wants(port.name, True)
+        messages = warm_up.tracking(self.factory, self._model)
+        for port_name, message in messages:
+            other.handle(port_name, message)
+        self._lookout.warm_up(decode_image(messages[-1][1]))
 
     def reset(self) -> None:
         """Forget the people and everything that waits."""

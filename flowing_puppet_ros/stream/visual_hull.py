@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from flowing_puppet_ros.body.camera import Camera
@@ -11,6 +11,7 @@ from flowing_puppet_ros.body.hull import MIN_VIEWS
 from flowing_puppet_ros.body.hull_builder import HullBuilder, HullBuilderSettings, PersonSet
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import setting
+from flowing_puppet_ros.stream import warm_up
 from flowing_puppet_ros.stream.clouds import make_cloud
 from flowing_puppet_ros.stream.component import (
     BODIES,
@@ -76,6 +77,13 @@ class VisualHullComponent(Component):
         self._last_stamp: int | None = None
         self._seen = 0
         self._frame = ""
+
+    def warm_up(self) -> None:
+        """Cut out and carve somebody made up with a component of its own."""
+        other = type(self)(replace(self._settings, every=1, frame=""), self.factory)
+        other.wants("silhouettes", True)
+        for port, message in warm_up.cameras(self.factory, self._names):
+            other.handle(port, message)
 
     def reset(self) -> None:
         """Forget backgrounds and what waits; calibrations and frames stay."""

@@ -25,13 +25,15 @@ header{padding-top:28px}h1{font-size:1.7rem;margin:0 0 6px}h2{font-size:1.25rem;
 border-top:1px solid var(--rule)}h3{font-size:1rem;margin:22px 0 6px}
 nav ul{list-style:none;display:flex;flex-wrap:wrap;gap:4px 18px;margin:14px 0 0;padding:0}
 a{color:var(--accent)}p{max-width:74ch}.soft,figcaption,caption{color:var(--soft);font-size:.9rem}
-caption{text-align:left;padding:2px 0 6px}code{font-size:.92em;overflow-wrap:anywhere}
+caption{text-align:left;padding:2px 0 6px}
+caption span{position:sticky;left:0;display:inline-block;max-width:min(74ch,88vw)}
+code{font-size:.92em;overflow-wrap:anywhere}
 .scroll{overflow-x:auto}table{border-collapse:collapse;font-size:.95rem;min-width:50%}
 th,td{padding:5px 14px 5px 0;border-bottom:1px solid var(--rule);text-align:left;vertical-align:top}
 th[scope=row]{font-weight:600;white-space:nowrap}td.n,th.n{text-align:right;font-variant-numeric:tabular-nums;white-space:nowrap}
 figure{margin:10px 0}img{max-width:100%;height:auto;border-radius:4px;vertical-align:middle}
 .row{display:flex;flex-wrap:wrap;gap:12px;align-items:flex-start}.row figure{margin:0 0 6px;flex:0 1 auto}
-.row img{outline:1px solid var(--rule);outline-offset:-1px}.row.three figure{flex:0 1 32%}
+.row img{outline:1px solid var(--rule);outline-offset:-1px}.row.three figure{flex:0 1 calc((100% - 24px)/3)}
 .row.views{flex-wrap:nowrap;overflow-x:auto}.row.views figure{flex:0 1 24%;min-width:150px}
 .frame{display:none}.frame.on{display:block}
 .frame img{height:min(62vh,420px);width:auto;object-fit:contain;object-position:left}
@@ -55,7 +57,8 @@ svg .line{fill:none;stroke-width:1.8;stroke-linejoin:round}
 .key{display:inline-block;width:22px;height:4px;border-radius:2px;margin-right:7px;vertical-align:middle}
 .ramp{width:120px;height:10px;image-rendering:pixelated;vertical-align:middle}
 details{margin:10px 0}summary{cursor:pointer}
-@media(max-width:720px){.panes{flex-direction:column}.pictures{max-width:none}th[scope=row],td.n{white-space:normal;overflow-wrap:normal}table{font-size:.88rem}}
+@media(max-width:720px){.panes{flex-direction:column}.pictures{max-width:none}th[scope=row],td.n{white-space:normal;overflow-wrap:normal}table{font-size:.88rem}
+tr:has(>:nth-child(5))>*{white-space:nowrap}}
 """ + "".join(f".s{k}{{stroke:var(--c{k})}}.d{k}{{fill:var(--c{k})}}.k{k}{{background:var(--c{k})}}" for k in range(8))
 
 # Without scripts every frame is shown, one below the other, and what needs them is not.
@@ -105,7 +108,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], numeric: Sequence
         cells = "".join(f"<td{kind(k)}>{escape(text)}</td>" for k, text in enumerate(row) if k)
         body += f'<tr><th scope="row">{escape(row[0])}</th>{cells}</tr>'
     return (
-        f'<div class="scroll"><table><caption>{escape(caption)}</caption><thead><tr>{head}</tr></thead>'
+        f'<div class="scroll"><table><caption><span>{escape(caption)}</span></caption><thead><tr>{head}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>"
     )
 

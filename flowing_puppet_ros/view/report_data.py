@@ -19,10 +19,12 @@ from flowing_puppet_ros.evaluate.from_bag import (
     CameraRecord,
     Joints,
     Recording,
+    as_cloud,
     body_joints,
     first_bodies,
     frontality,
     read_recording,
+    sensed_clouds,
     track_and_detections,
     triangulated,
 )
@@ -292,8 +294,12 @@ class _Clouds:
 def _clouds(recording: Recording, given: Bag, made: Bag, stamps: list[int]) -> _Clouds:
     topics = recording.cloud_topics
     vertices = fetch(made, {topics.get("body_vertices", ""): stamps})
-    points = fetch(made, {topics.get("hull", ""): stamps}) or fetch(given, {topics.get("points", ""): stamps})
-    return _Clouds({stamp: one for (_, stamp), one in vertices.items()}, {s: one for (_, s), one in points.items()})
+    points = {stamp: one for (_, stamp), one in fetch(made, {topics.get("hull", ""): stamps}).items()}
+    for topic in () if points else sensed_clouds(recording):
+        for (_, stamp), message in each(given, {topic: stamps}):
+            with suppress(InputError):
+                points[stamp] = as_cloud(recording, topic, message)
+    return _Clouds({stamp: one for (_, stamp), one in vertices.items()}, points)
 
 
 def energy_series(data: ReportData) -> list[Series]:

@@ -142,9 +142,9 @@ def people_box(people: Iterable[Sequence[Any]], shape: tuple[int, ...], margin: 
 
 
 def track_shot(image: np.ndarray, people: Sequence[Any], box: Box) -> np.ndarray:
-    """The part `box` of an image with its puppets drawn over it, the first with labels; at most 560 rows."""
+    """The part `box` of an image with its puppets drawn over it, the first with labels; 560 rows."""
     part = box.cut(image)
-    small = shrink(part, STRIP_HEIGHT)
+    small = to_height(part, STRIP_HEIGHT)
     factor = small.shape[0] / part.shape[0]
     drawn = [DrawnPuppet.from_message(person).placed(factor, (box.left, box.top)) for person in people]
     return draw_puppets(draw_puppets(small, drawn[:0:-1], labels=False), drawn[:1])

@@ -82,7 +82,7 @@ def _camera_rows(camera: CameraData, cameras: int) -> list[tuple[str, str, str]]
 def _body_rows(bodies: BodiesData) -> list[tuple[str, str, str]]:
     rows = [
         ("Bodies", f"{len(bodies.seconds)} of {bodies.clouds}", "clouds in which a 3D body was found"),
-        ("Body energy", number(_median(bodies.energy), 2), "median; lower is better"),
+        ("Body energy", _digits(_median(bodies.energy)), "median; lower is better"),
     ]
     if bodies.errors.known.size:
         cm = JointErrors(bodies.errors.names, bodies.errors.distance * 100)
@@ -96,6 +96,11 @@ def _body_rows(bodies: BodiesData) -> list[tuple[str, str, str]]:
         )
         rows.append(("Bodies with left and right swapped", _swaps(bodies.swapped), "bodies, against the detections"))
     return rows
+
+
+def _digits(value: float) -> str:
+    """Two digits of a number however small, a dash when it is not known."""
+    return f"{value:.2g}" if math.isfinite(value) else number(value)
 
 
 def _median(values: np.ndarray) -> float:

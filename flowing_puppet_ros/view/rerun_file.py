@@ -15,7 +15,15 @@ import numpy as np
 
 from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.from_bag import CameraRecord, Recording, body_joints, puppet_joints, read_recording
+from flowing_puppet_ros.evaluate.from_bag import (
+    CameraRecord,
+    Recording,
+    as_cloud,
+    body_joints,
+    puppet_joints,
+    read_recording,
+    sensed_clouds,
+)
 from flowing_puppet_ros.stream.clouds import decode_cloud
 from flowing_puppet_ros.stream.images import decode_image
 from flowing_puppet_ros.stream.messages import stamp_ns
@@ -215,10 +223,10 @@ def _log_bodies(log: _Log, recording: Recording, made: Bag) -> None:
 
 
 def _log_points(log: _Log, recording: Recording, given: Bag, made: Bag) -> None:
-    for bag, name in ((made, "hull"), (given, "points")):
-        topic = recording.cloud_topics.get(name)
-        for record in bag.messages([topic]) if topic else ():
+    hull = recording.cloud_topics.get("hull")
+    for bag, name, topics in ((made, "hull", [hull] if hull else []), (given, "points", sensed_clouds(recording))):
+        for record in bag.messages(topics) if topics else ():
             with suppress(InputError):
-                points = decode_cloud(record.message)[0]
+                points = decode_cloud(as_cloud(recording, record.topic, record.message))[0]
                 log.at(stamp_ns(record.message))
                 log.points(f"{WORLD}/{name}", points)

@@ -158,6 +158,17 @@ def test_without_keypoints_the_detector_looks(frames: Path, tmp_path: Path) -> N
             assert all(0 <= confidence <= 1 for _, _, confidence in puppet["joints"])
 
 
+@pytest.mark.parametrize("flags", [[], ["--live"]])
+def test_where_nobody_is_nobody_is_tracked(flags: list[str], tmp_path: Path) -> None:
+    rng, folder = np.random.default_rng(2), tmp_path / "frames"
+    folder.mkdir()
+    ground = (np.linspace(60, 180, 240)[:, None, None] + rng.normal(0, 12, (240, 320, 3))).astype(np.uint8)
+    for k in range(4):
+        cv2.imwrite(str(folder / f"{k}.png"), np.roll(ground, 2 * k, axis=1))
+    assert main(["track", str(folder), "--out", str(tmp_path / "t.json"), *flags]) == 0
+    assert [frame["puppets"] for frame in json.loads((tmp_path / "t.json").read_text())["frames"]] == [[]] * 4
+
+
 def test_a_bag_brings_its_own_detections(tmp_path: Path) -> None:
     out = tmp_path / "tracks.json"
     assert main(["track", str(GOLDEN), "--out", str(out), "--topic", "/cam2/image/compressed"]) == 0

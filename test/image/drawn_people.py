@@ -6,6 +6,8 @@ The model has the interface of the Deformable Structures model, so that the trac
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +98,13 @@ class CapsuleModel:
             contours.append(capsule(joints[a], joints[b], radius))
         return PuppetShape(joints, tuple(contours), tuple(np.zeros(1) for _ in contours), scale, view)
 
+    def puppets_from_joints(
+        self, joints: Floats, scale: Floats, view: View = "front", edges: Sequence[int] | None = None
+    ) -> tuple[tuple[Floats, ...], Floats]:
+        """The same for P persons (P, J, 2): contours (P, K, 2) of every part; no energy."""
+        shapes = [self.puppet_from_joints(own, size, view) for own, size in zip(joints, scale, strict=True)]
+        return tuple(np.array(part) for part in zip(*(s.contours for s in shapes), strict=True)), np.zeros(len(joints))
+
     def energy(self, shape: PuppetShape) -> float:
         """No prior."""
         return 0.0
@@ -127,10 +136,13 @@ def pose(time: float, offset: tuple[float, float] = (150, 118)) -> Floats:
     return np.asarray(joints)
 
 
-def draw(*people: Floats) -> NDArray[np.uint8]:
-    """A picture in which every capsule carries its own texture along."""
+def draw(*people: Floats, shirts: Sequence[tuple[float, float, float]] = ()) -> NDArray[np.uint8]:
+    """A picture in which every capsule carries its own texture along; later people stand before earlier ones.
+
+    `shirts` are the people's colours, shares of red, green and blue that are left of the texture.
+    """
     image = BACKGROUND.copy()
-    for joints in people:
+    for joints, shirt in zip(people, [*shirts, *[(1.0, 1.0, 1.0)] * (len(people) - len(shirts))], strict=True):
         shape = CapsuleModel().puppet_from_joints(joints, SCALE)
         for part, contour in enumerate(shape.contours):
             a, b = joints[CapsuleModel.bone[part]]
@@ -138,7 +150,8 @@ def draw(*people: Floats) -> NDArray[np.uint8]:
             texture = cv2.resize(NOISE[CapsuleModel.tree.names[part]], None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
             move = np.column_stack([along, [-along[1], along[0]], a - 96 * (along + np.array([-along[1], along[0]]))])
             mask = cv2.fillPoly(np.zeros(SIZE[::-1], np.uint8), [np.round(contour).astype(np.int32)], 1)
-            cv2.copyTo(cv2.warpAffine(texture, move, SIZE), mask, image)
+            drawn = cv2.warpAffine(texture, move, SIZE) * np.asarray(shirt)
+            cv2.copyTo(drawn.astype(np.uint8), mask, image)
     return image
 
 

@@ -3,7 +3,6 @@
 
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_path
-from flowing_puppet_ros.image.arms import CARRIED, ArmFilter, ArmHistory, Sight
+from flowing_puppet_ros.image.arms import DISTINCT, KEPT, ArmFilter, ArmHistory, Sight, probability_right
 from flowing_puppet_ros.image.carry import Grid
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector_person import Place
@@ -59,6 +58,7 @@ class Guesser:
     scores: np.ndarray
     confidence: float = 0.9
     scale: float = 50.0
+    score: float = 3.0
 
     @property
     def keypoints(self) -> Keypoints:
@@ -80,6 +80,12 @@ def sight(guesser: Guesser | None, joints: np.ndarray) -> Sight:
 
 def still() -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((48, 64, 2), np.float32), np.zeros((48, 64, 2), np.float32)
+
+
+def test_the_better_an_arm_and_its_pose_fit_the_surer_they_are() -> None:
+    poor, good, better = (probability_right(*scores) for scores in ((-6.0, 1.0), (-1.0, 1.0), (-1.0, 4.0)))
+    assert ((poor > 0) & (poor < good) & (good < better) & (better < 1)).all()
+    assert np.isnan(probability_right(0.0, sight(None, np.zeros((15, 2))).pose_score)).all()
 
 
 def test_a_guess_that_one_image_lacks_is_carried_into_it() -> None:
@@ -130,9 +136,10 @@ class Finder:
     def __init__(self) -> None:
         self.images = self.searches = 0
 
-    def detect(self, image: np.ndarray, settings: Any) -> list[Guesser]:
+    def candidates(self, image: np.ndarray) -> list[Place]:
         self.searches += 1
-        return self.found()
+        truth = pose(self.images)
+        return [Place(truth[NAMES.index("neck")], truth[NAMES.index("face")], 50.0, 3.0)]
 
     def at(self, image: np.ndarray, places: list[Place]) -> list[Guesser]:
         neck = pose(self.images)[NAMES.index("neck")]
@@ -181,6 +188,8 @@ def test_a_clip_joins_the_guesses_that_move_with_the_person() -> None:
     for t, people in enumerate(clip.people()):
         (puppet,) = people
         assert np.linalg.norm(puppet.joints[wrist] - pose(t)[wrist]) < 6, t
+        told = [probability_right(score, Guesser.score)[1] for score in (-4.0, 0.0)]
+        assert told[0] < puppet.confidence[wrist] <= told[1], t
 
 
 def test_between_runs_of_the_detector_people_are_carried() -> None:
@@ -212,7 +221,19 @@ def test_live_only_the_place_of_a_known_person_is_looked_at_between_searches() -
     for t in range(11):
         video.step(draw(pose(t)), t)
         searches.append(finder.searches)
-    assert searches == [1, 2, 3, 3, 3, 4, 4, 4, 4, 4, 5]
+    assert searches == [1, 2, 3, 4, 5, 6, 6, 6, 6, 6, 7]
+
+
+def test_live_a_cut_makes_it_search_anew_and_nobody_is_left_behind() -> None:
+    finder = Finder()
+    video = VideoTracker(tracker(), finder, NoEvidence(), DetectionSettings())  # type: ignore[arg-type]
+    for t in range(8):
+        before, _ = video.step(draw(pose(t)), t)
+    assert finder.searches == 5
+    after, _ = video.step(255 - draw(pose(8)), 8)
+    assert after.restarted and finder.searches == 6 and any("cut" in warning for warning in after.warnings)
+    assert [puppet.id for puppet in before.puppets] != [puppet.id for puppet in after.puppets]
+    assert len(after.puppets) == 1
 
 
 def test_a_filter_agrees_with_the_best_path_that_ends_now() -> None:
@@ -223,14 +244,20 @@ def test_a_filter_agrees_with_the_best_path_that_ends_now() -> None:
     for t in range(5):
         guesses = rng.uniform(10, 40, (3, 2, 2))
         person = sight(Guesser(joints, {"left": guesses, "right": guesses}, rng.normal(0, 0.3, 3)), joints)
-        found, sure = arms.step(person, still() if t else None, GRID, 40.0)["left"]
+        found, right = arms.step(person, still() if t else None, GRID)["left"]
         if t:
-            before = np.argsort(best_path(history, 40.0, SETTINGS)[-1], kind="stable")[:CARRIED]
-            guesses = np.concatenate([guesses, history[-1].places[before]])
+            before: list[np.ndarray] = []
+            for k in np.argsort(best_path(history, person.width, SETTINGS)[-1], kind="stable"):
+                place = history[-1].places[k]
+                if len(before) < KEPT and all(
+                    np.hypot(*(place - b).T).max() >= DISTINCT * person.width for b in before
+                ):
+                    before.append(place)
+            guesses = np.concatenate([guesses, before])
         history.append(ArmHypotheses(guesses, person.judged("left", guesses, SETTINGS), np.zeros_like(guesses)))
-        cost = best_path(history, 40.0, SETTINGS)[-1]
+        cost = best_path(history, person.width, SETTINGS)[-1]
         np.testing.assert_allclose(found, guesses[cost.argmin()])
-        assert 0.0 < sure <= 1.0
+        assert ((right > 0.0) & (right < 1.0)).all()
 
 
 def test_a_filter_is_carried_through_images_without_a_look() -> None:
@@ -241,7 +268,7 @@ def test_a_filter_is_carried_through_images_without_a_look() -> None:
         guesses = np.array([start + np.array([3.0 * t, 0.0]), start + np.array([0.0, 15.0])])
         scores = np.array([0.0, -0.1]) if t == 0 else np.array([-0.2, 0.0])
         person = sight(Guesser(joints, {"left": guesses, "right": guesses}, scores), joints)
-        found, _ = arms.step(person, (forth, -forth) if t else None, GRID, 40.0)["right"]
+        found, _ = arms.step(person, (forth, -forth) if t else None, GRID)["right"]
         if t == 0:
             arms.carry((forth, -forth), GRID)
     np.testing.assert_allclose(found, start + np.array([6.0, 0.0]), atol=1e-5)

@@ -76,6 +76,8 @@ def test_a_path_does_not_jump() -> None:
     assert len(paths) == 2 and {max(path.places) for path in paths} == {4, 9}
 
 
-@pytest.mark.parametrize("looks", [[], [[]], [[], []], [[place(1, log_odds=-9.0)]]])
+@pytest.mark.parametrize(
+    "looks", [[], [[]], [[], []], [[place(1, log_odds=-9.0)]], [[place(1, log_odds=-3.5 + 1e-3)]] * 2]
+)
 def test_nobody(looks: list[list[Place]]) -> None:
     assert people(looks).paths() == []

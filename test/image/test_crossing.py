@@ -4,7 +4,12 @@
 from __future__ import annotations
 
 import numpy as np
-from drawn_people import detection, draw, pose, tracker  # type: ignore[import-not-found]
+import pytest
+from drawn_people import NAMES, CapsuleModel, detection, draw, pose, tracker  # type: ignore[import-not-found]
+
+from flowing_puppet_ros.image.appearance import clothes_of
+from flowing_puppet_ros.image.association import associate
+from flowing_puppet_ros.image.people import Person, TrackerSettings
 
 Place = tuple[float, float]
 
@@ -43,3 +48,45 @@ def test_who_is_hidden_for_ten_images_keeps_the_id() -> None:
             ids = whose(result, {"still": still, "passing": passing})
     assert whose(result, {"still": still, "passing": passing}) == ids
     assert len(result.puppets) == 2
+
+
+RED, BLUE = (1.0, 0.35, 0.3), (0.3, 0.4, 1.0)
+
+
+@pytest.mark.parametrize("behind", ["left", "right"])
+@pytest.mark.parametrize("meeting", ["cross", "turn back"])
+def test_people_in_different_clothes_keep_their_ids_where_one_hides_the_other(meeting: str, behind: str) -> None:
+    """The detector sees one of two for as long as they overlap; the flow of the nearer one drags the other along."""
+    follower = tracker()
+    shirts = {"left": RED, "right": BLUE}
+    order = [behind, "right" if behind == "left" else "left"]
+    ids: dict[str, str] = {}
+    for time in range(25):
+        way = 8.0 * (time if meeting == "cross" else min(time, 24 - time))
+        places = {"left": (64 + way, 118), "right": (256 - way, 121)}
+        people = {name: pose(0, place) for name, place in places.items()}
+        image = draw(*(people[name] for name in order), shirts=[shirts[name] for name in order])
+        hidden = abs(places["left"][0] - places["right"][0]) < 70
+        seen = [detection(people[name]) for name in (order[1:] if hidden else order)]
+        result = follower.step(image, time, seen)
+        if time == 3:
+            ids = whose(result, people)
+    assert len(set(ids.values())) == 2
+    assert whose(result, people) == ids
+    assert len(result.puppets) == 2
+
+
+def test_of_two_who_stand_as_near_the_clothes_tell_whose_the_detection_is() -> None:
+    """Joints alone would give the detections to the others, by a few millimetres."""
+    image = draw(pose(0, (90, 118)), pose(0, (230, 118)), shirts=[RED, BLUE])
+    red, blue = clothes_of(NAMES, image, [pose(0, (90, 118)), pose(0, (230, 118))])
+    assert red is not None and blue is not None
+    model, joints = CapsuleModel(), pose(0)
+    people = [Person.start(name, model, joints, np.ones(len(joints)), TrackerSettings()) for name in ("red", "blue")]  # type: ignore[arg-type]
+    people[1].mean += 0.5
+    found = [(people[1].mean + 0.2, np.ones(len(joints))), (joints - 0.2, np.ones(len(joints)))]
+    assert associate(people, found, 0.5)[0] == {0: 1, 1: 0}
+    for person, clothes in zip(people, (red, blue), strict=True):
+        person.wear(clothes.colours)
+    assert associate(people, found, 0.5, [red, blue])[0] == {0: 0, 1: 1}
+    assert associate(people, found, 0.5, [blue, red])[0] == {0: 1, 1: 0}

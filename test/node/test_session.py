@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A session's topics: those of people come and go with them, and what is set for one topic is not set for another."""
 
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from typing import Any
 
 import pytest
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from flowing_puppet_ros.node.diagnostics import Diagnostics
@@ -128,3 +130,25 @@ def test_an_override_changes_its_own_topic_only(open_session: Callable[..., tupl
         assert subscribed["/names"] == first and subscribed["/other"] == ReliabilityPolicy.BEST_EFFORT
         assert (published["/all"] == ReliabilityPolicy.BEST_EFFORT) == bool(parameters)
         assert published["/more"] == ReliabilityPolicy.RELIABLE
+
+
+def test_a_publisher_whose_qos_does_not_fit_is_one_warning_with_topic_and_cure(
+    open_session: Callable[..., tuple[Node, Session[Names]]],
+) -> None:
+    node, session = open_session(**{"qos_overrides./names.subscription.reliability": "reliable"})
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    said: list[str] = []
+    session._complain = lambda sentence: said.append(sentence)  # type: ignore[method-assign]
+    other = Node("other")
+    publisher = other.create_publisher(String, "names", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
+    until = time.monotonic() + 60
+    while not said and time.monotonic() < until:
+        publisher.publish(String(data="ann"))
+        executor.spin_once(timeout_sec=0.1)
+    executor.shutdown()
+    other.destroy_node()
+    assert said == [
+        "/names: a publisher offers another reliability, so nothing passes between the two; set "
+        "qos_overrides./names.subscription.reliability of this node, or the reliability of the other, to fit"
+    ]

@@ -28,7 +28,7 @@ class Watched(Lookout):
         super().__init__(LookoutSettings(**settings), 8, OpticalFlow(FlowSettings()))
         self.shown: list[int] = []
 
-    def _detect(self, image: Any) -> list[Keypoints]:
+    def _detect(self, image: Any, least_person: float | None = None) -> list[Keypoints]:
         self.shown.append(int(image[0, 0, 0]))
         y, x = np.unravel_index(image[..., 1].argmax(), image.shape[:2])
         return [Keypoints(("neck",), np.array([[x, y]], float), np.ones(1))]
