@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -75,11 +76,10 @@ class BodyBank:
         self._normals = [part.normals[:size] for part, size in zip(points, sizes, strict=True)]
         spread = [np.linalg.inv(pair.covariance[:3, :3] + JOINT_RIDGE**2 * np.eye(3)) for pair in model.pairwise]
         self._joints = [(pair.mean[:3], precision) for pair, precision in zip(model.pairwise, spread, strict=True)]
-        self._bodies: list[Particles] | None = None
 
     def best(self, coarse: Coarse, count: int) -> list[BodyState]:
         """The bank's bodies that explain a cloud best, each the best of its yaw and moved to the cloud."""
-        bodies = self._placed(self._turned(), coarse)
+        bodies = self._placed(bank_bodies(self._model), coarse)
         cost = self.judge(bodies, coarse, range(len(bodies))).cost.reshape(YAWS, BANK)
         yaws = np.argsort(cost.min(axis=1), kind="stable")[:count]
         rows = [yaw * BANK + int(cost[yaw].argmin()) for yaw in yaws]
@@ -92,7 +92,7 @@ class BodyBank:
         """
         coarse = Coarse.of(cloud, PROMISE_TARGETS)
         rows = np.flatnonzero(np.arange(YAWS * BANK) % BANK < PROMISE_BANK)
-        bodies = self._placed([group.take(rows) for group in self._turned()], coarse)
+        bodies = self._placed([group.take(rows) for group in bank_bodies(self._model)], coarse)
         return float(self.judge(bodies, coarse, range(len(bodies))).cost.min())
 
     def cost(self, body: BodyState, coarse: Coarse) -> float:
@@ -123,15 +123,6 @@ class BodyBank:
                 cost = cost + PRIOR * ((gap @ precision) * gap).sum(axis=1)
         return Covered(cost, distance)
 
-    def _turned(self) -> list[Particles]:
-        """Per part the bodies in every yaw; made once."""
-        if self._bodies is None:
-            rng = np.random.default_rng(0)
-            bank = particles_of(self._model, [self._model.sample(rng, shape_scale=0.0) for _ in range(BANK)])
-            turns = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
-            self._bodies = [Particles.join([_turned(group, turn) for turn in turns]) for group in bank]
-        return self._bodies
-
     def _placed(self, bodies: list[Particles], coarse: Coarse) -> list[Particles]:
         """Move each body so that the mean of its surface, or of what of it faces the sensor, is the cloud's."""
         points, normals = self._points(bodies, range(len(bodies)))
@@ -147,6 +138,15 @@ class BodyBank:
         points = [self._surface[part].world(bodies[part]) for part in parts]
         normals = [self._normals[part] @ bodies[part].rotation.transpose(0, 2, 1) for part in parts]
         return np.concatenate(points, axis=1), np.concatenate(normals, axis=1)
+
+
+@lru_cache(maxsize=3)
+def bank_bodies(model: StitchedPuppet) -> list[Particles]:
+    """Per part the bank's bodies in every yaw; made once for a model."""
+    rng = np.random.default_rng(0)
+    bank = particles_of(model, [model.sample(rng, shape_scale=0.0) for _ in range(BANK)])
+    turns = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
+    return [Particles.join([_turned(group, turn) for turn in turns]) for group in bank]
 
 
 def _first(points: PointSet, count: int) -> PointSet:

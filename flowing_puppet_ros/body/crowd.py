@@ -26,6 +26,8 @@ from flowing_puppet_ros.settings import setting
 
 NEAR = 0.6  # metres by which the middle of a person's cloud may miss where it is expected
 SPEED, FARTHEST = 2.0, 2.5  # metres a second by which that grows while unseen, and metres up to which
+NEWCOMER = 0.6  # metres that a distance counts more for who has no body yet, as what splits off from somebody
+RETRY_NS = 5_000_000_000  # a body that is not reliable is searched again so long after the last search
 OWNED = 0.3  # what a distance counts where the person's body lies in the cloud
 GAIN = 0.5  # share of a new velocity that is taken
 TRUSTED_NS = 1_000_000_000  # a velocity from clouds farther apart than this is none
@@ -41,7 +43,7 @@ class CrowdSettings(BodyTrackerSettings):
 
 @dataclass(slots=True, eq=False)
 class _Member:
-    """A person: where the middle (3,) of their points was and how it moves, m/s; and what tracks them."""
+    """A person: where the middle (3,) of their points was and how it moves, m/s; what tracks them; the last search."""
 
     id: str
     number: int
@@ -50,6 +52,7 @@ class _Member:
     tracker: BodyTracker
     velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
     searches: int = 0
+    searched: int = 0
 
     def expected(self, stamp: int) -> np.ndarray:
         """Where the middle should be at a later time, nanoseconds."""
@@ -147,7 +150,8 @@ class Crowd:
                 continue
             if fit is not None:
                 fits.append((member.id, fit))
-            if not self._pursuit.add(member.number, task) and member.tracker.lost:
+            doubtful = fit is not None and not fit.reliable and stamp - member.searched >= RETRY_NS
+            if not self._pursuit.add(member.number, task) and (member.tracker.lost or doubtful):
                 wanting.append((member, task))
         self.counters["tracked people"] += len(fits)
         self._forget(stamp)
@@ -184,7 +188,7 @@ class Crowd:
         member, task = min(
             wanting, key=lambda pair: (pair[0].tracker.last is not None, pair[0].searches, pair[0].number)
         )
-        member.searches += 1
+        member.searches, member.searched = member.searches + 1, task.stamp
         self.counters["searches"] += 1
         known = member.tracker.last
         self._pursuit.start(member.number, member.tracker.fork(), task, background)
@@ -214,7 +218,9 @@ class Crowd:
             limit = min(NEAR + SPEED * 1e-9 * (stamp - member.stamp), FARTHEST)
             for column, (person, middle) in enumerate(zip(people, middles, strict=True)):
                 apart = float(np.linalg.norm(middle - member.expected(stamp)))
-                cost[row, column] = apart * (OWNED if person.owner == row else 1.0) if apart < limit else np.inf
+                if apart < limit:
+                    extra = 0.0 if member.tracker.last else NEWCOMER
+                    cost[row, column] = extra + apart * (OWNED if person.owner == row else 1.0)
         rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
         matched = {int(column): self._members[row] for row, column in zip(rows, columns, strict=True)
                    if cost[row, column] < np.inf}  # fmt: skip

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.body.bank import BodyBank
+from flowing_puppet_ros.body.bank import BodyBank, Coarse
 from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.initial import sampled_bodies, turned_around
@@ -38,6 +38,8 @@ HYPOTHESIS_STEPS, LIMBS_FINISHED = 12, 3
 LIMB_OFF = 0.6
 # A limb hypothesis must be this much closer than the body that it came from, and none helps a body so many metres off.
 CLOSER, HOPELESS = 0.98, 0.06
+# Shares of the usual particles and of the usual rounds in a quick search, and in one that only loads what it uses.
+QUICK, WARM = 0.5, 0.1
 # Where this share of the cloud is uncovered the whole body is probably wrong: only a leap is worth another round.
 MOSTLY_OFF, LEAP = 0.25, 0.9
 
@@ -93,21 +95,38 @@ class BodyFinder:
         self.bank = BodyBank(model, points)
         self._view_search = ViewSearch(model, self.bank, self._proposer, self.refiner, self._threads)
 
-    def find(self, cloud: Cloud, rng: np.random.Generator, progress: Progress) -> BodyState:
-        """The body of a cloud of which nothing but the upright is known."""
+    def find(self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False) -> BodyState:
+        """The body of a cloud of which nothing but the upright is known.
+
+        `quick` tries a small search first, and is content when its body lies close with no limb in doubt.
+        """
         if isinstance(cloud, ViewCloud):
             return self._view_search.run(cloud, rng, self._settings.refine_iterations, progress)
         grid = CloudGrid.build(cloud.points, cloud.normals)
         none, steps = JointTargets.none(self._model), self._settings.refine_iterations
+        if quick:
+            best = self._two_bodies(cloud, grid, rng, part_of(progress, 0.0, 0.3), QUICK)[0]
+            if self._is_close(best) and not best.judgement.doubtful:
+                return self.finish(best.state, cloud, none, steps)
         tries = 1 + self._settings.restarts
         tried: list[Candidate] = []
         for turn in range(tries):
             for candidate in self._two_bodies(cloud, grid, rng, part_of(progress, turn / tries, (turn + 0.7) / tries)):
                 tried.append(self.mended(candidate, cloud, grid, rng))
                 best = min(tried, key=lambda candidate: candidate.cost)
-                if best.cost < self._settings.restart_distance:
+                if self._is_close(best):
                     return self.finish(best.state, cloud, none, steps)
         return self.finish(best.state, cloud, none, steps)
+
+    def _is_close(self, candidate: Candidate) -> bool:
+        return candidate.cost < self._settings.restart_distance
+
+    def warm(self, cloud: Cloud, view: ViewCloud) -> None:
+        """Use all compiled code once, on any cloud from all sides and any from one side."""
+        grid = CloudGrid.build(cloud.points, cloud.normals)
+        self._two_bodies(cloud, grid, np.random.default_rng(0), lambda _: None, WARM)
+        state = self.bank.best(Coarse.of(view), 1)[0]
+        self.finish(state, view, JointTargets.none(self._model), 1)
 
     def near(
         self, body: BodyState, grid: CloudGrid, targets: JointTargets, rng: np.random.Generator, progress: Progress
@@ -133,14 +152,20 @@ class BodyFinder:
         return Candidate(state, judged(self._model, self._model.vertices(state), cloud))
 
     def _two_bodies(
-        self, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator, progress: Progress
+        self, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator, progress: Progress, share: float = 1.0
     ) -> list[Candidate]:
-        """Search with unknown yaw: the body found and the best one that faces the other way, the closer one first."""
+        """Search with unknown yaw: the body found and the best one that faces the other way, the closer one first.
+
+        `share` is of the usual particles and rounds.
+        """
         none = JointTargets.none(self._model)
-        bodies = sampled_bodies(self._model, cloud.points.mean(axis=0), self._settings.particles, rng)
+        particles, iterations = (
+            max(1, round(share * count)) for count in (self._settings.particles, self._settings.iterations)
+        )
+        bodies = sampled_bodies(self._model, cloud.points.mean(axis=0), particles, rng)
         noise = WalkNoise(center=0.05, rotation=0.1, pose=0.0, shape=0.0)
         start = [self._proposer.walk(group, noise, rng) for group in particles_of(self._model, bodies)]
-        stages, iterations = four_stages(self._model.tree), self._settings.iterations
+        stages = four_stages(self._model.tree)
         found = self.search.run(
             start, grid, none, stages, iterations, rng, part_of(progress, 0.0, 0.8), threads=self._threads
         )

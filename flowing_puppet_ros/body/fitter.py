@@ -18,7 +18,7 @@ from flowing_puppet_ros.body.initial import body_from_joints, joint_targets
 from flowing_puppet_ros.body.judgement import judged
 from flowing_puppet_ros.body.nonrigid import FinishWeights, SurfaceFinish
 from flowing_puppet_ros.body.normals import estimated_normals, thinned
-from flowing_puppet_ros.body.refine import LOOSE
+from flowing_puppet_ros.body.refine import LOOSE, Refiner
 from flowing_puppet_ros.body.view_cloud import VIEW_POINTS, ViewCloud
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud import CloudGrid, ExactCloud
@@ -27,6 +27,9 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 __all__ = ["BodyFit", "BodyFitter", "FitterSettings", "Progress", "checked_cloud"]
 
 MIN_POINTS = 50
+# Models that are warm in this process.
+_WARM: set[str] = set()
+WARM_VIEW = np.array([3.0, 0.0, 0.0])  # metres from the body
 # Points that a cloud needs before it may shape the surface more finely than the model does.
 DENSE_CLOUD = 3000
 PROMISE_POINTS = 1500
@@ -68,6 +71,23 @@ class BodyFitter:
         self._finder = BodyFinder(model, settings)
         self._surface_finish = SurfaceFinish(model.faces, len(model.part_of_vertex), FinishWeights())
 
+    @property
+    def refiner(self) -> Refiner:
+        """The Gauss-Newton over all parts."""
+        return self._finder.refiner
+
+    def warm(self) -> None:
+        """Do beforehand what takes long the first time in a process: load compiled code, make the bank of bodies."""
+        if self.model.name in _WARM:
+            return
+        _WARM.add(self.model.name)
+        with threadpool_limits(limits=1):
+            points = self.model.vertices(self.model.rest_state())
+            cloud = self.cloud(points, None, None)
+            view = ViewCloud.seen_from(cloud.points, cloud.normals, cloud.points.mean(axis=0) + WARM_VIEW)
+            self._finder.warm(cloud, view)
+            self.result(self.model.rest_state(), cloud)
+
     def fit(
         self,
         points: np.ndarray,
@@ -77,6 +97,7 @@ class BodyFitter:
         viewpoint: np.ndarray | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
+        quick: bool = False,
     ) -> BodyFit:
         """Fit the model to a cloud.
 
@@ -88,6 +109,7 @@ class BodyFitter:
             viewpoint: (3,) where the sensor stood when the cloud shows one side only.
             seed: overrides the settings' seed.
             progress: called with the fraction done, 0 to 1.
+            quick: start a track: without initial joints try a small search first, and leave the surface the model's.
 
         Raises:
             InputError: when the cloud cannot be the surface of a person or the initial joints place no body.
@@ -97,11 +119,13 @@ class BodyFitter:
             points, normals = checked_cloud(points, normals)
             if initial is None:
                 cloud = self.cloud(points, normals, viewpoint)
-                state = self._finder.find(cloud, rng, progress or _silent)
+                state = self._finder.find(cloud, rng, progress or _silent, quick)
                 (progress or _silent)(1.0)
                 if not self._follows_surface(cloud):
                     return self.result(state, cloud)
                 state = with_hands(self.model, self._finder.refiner, state, cloud)
+                if quick:
+                    return self.result(state, cloud)
                 return self._with_own_surface(self.result(state, cloud), cloud)
             return self._fit_from_joints(points, normals, initial, viewpoint, rng, progress or _silent)
 
@@ -123,8 +147,9 @@ class BodyFitter:
             )
         limit = self.settings.cloud_points
         points, normals = thinned(points, normals, limit if viewpoint is None else min(limit, VIEW_POINTS))
-        places = len(np.unique(points, axis=0))
-        if places < MIN_POINTS:
+        # Along one axis alone that is quickly told, of nearly every cloud.
+        places = len(np.unique(points[:, 2]))
+        if places < MIN_POINTS and (places := len(np.unique(points, axis=0))) < MIN_POINTS:
             raise InputError(
                 f"the cloud's points lie in {places} places and a fit needs {MIN_POINTS}; give the surface of a person"
             )

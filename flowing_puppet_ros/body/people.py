@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,7 +110,11 @@ def extract_people(
     label[free] = _clusters(_means(drawn_in, voxel)[free], settings.gap)
     strangers = label.max() + 1
     if known and len(free):
-        label[free] = _claimed(centres[free] + origin, label[free], known)
+        whole = {
+            number for number, group in _groups(label[voxel])
+            if person_likeness(local[group], floor) >= settings.likeness
+        }  # fmt: skip
+        label[free] = _claimed(centres[free] + origin, label[free], known, whole)
     people = []
     for number, group in _groups(label[voxel]):
         owner = int(number - strangers) if number >= strangers else None
@@ -123,23 +127,24 @@ def extract_people(
     return people[: settings.people]
 
 
-def _claimed(centres: np.ndarray, label: np.ndarray, known: Sequence[np.ndarray]) -> np.ndarray:
+def _claimed(centres: np.ndarray, label: np.ndarray, known: Sequence[np.ndarray], whole: Set[int]) -> np.ndarray:
     """Labels (M,) with the places (M, 3) of the k-th known body's points under the first free label + k.
 
-    A body takes a cluster of which it explains most. It takes what is near it of a larger one, and clusters that
-    several bodies stand in are divided by the nearest body.
+    A body takes a cluster of which it explains most, and one of those that are a `whole` person even where it lags
+    behind. It takes what is near it of a larger one, and clusters that several bodies stand in are divided by the
+    nearest body.
     """
     trees = [cKDTree(points) for points in known]
     distance = np.stack([tree.query(centres)[0] for tree in trees])
     nearest, closest = distance.argmin(axis=0), distance.min(axis=0)
     claimed, first = label.copy(), int(label.max()) + 1
-    for _, group in _groups(label):
+    for number, group in _groups(label):
         near = group[closest[group] < CLAIM]
         share = np.bincount(nearest[near], minlength=len(known)) / len(group)
         owners = np.flatnonzero(share > LEAST_SHARE)
         if not len(owners):
             continue
-        taken = group if share.sum() > MOST_SHARE else near
+        taken = group if share.sum() > MOST_SHARE or number in whole else near
         claimed[taken] = first + owners[distance[np.ix_(owners, taken)].argmin(axis=0)]
     return claimed
 

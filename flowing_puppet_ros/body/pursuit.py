@@ -12,6 +12,9 @@ import numpy as np
 from flowing_puppet_ros.body.tracker import BodyTracker
 from flowing_puppet_ros.errors import InputError
 
+CHASE_NS, MOST_KEPT, FEW = 300_000_000, 8, 2
+"""Least time between the clouds kept while a fit is made, how many are, and so few that the body is nearly there."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Task:
@@ -35,18 +38,25 @@ class _Run:
         self.number = number
         self.tracker = tracker
         self.first = task
-        self.newest: Task | None = None
+        self.coming: list[Task] = []
+        self.apart = CHASE_NS
         self.lock = threading.Lock()
         self.stopped = False
         self.done = False
         self.problem: Exception | None = None
 
     def add(self, task: Task) -> bool:
-        """Keep the newest cloud for when the fit is made; False when the run is through."""
+        """Keep a few clouds for when the fit is made, and the newest; False when the run is through."""
         with self.lock:
             if self.done:
                 return False
-            self.newest = task
+            before = self.coming[-2] if len(self.coming) > 1 else self.first
+            if self.coming and self.coming[-1].stamp - before.stamp < self.apart:
+                self.coming.pop()
+            self.coming.append(task)
+            if len(self.coming) > MOST_KEPT:
+                # Evenly spread still, so that the longest fit leaves no more to follow.
+                self.coming, self.apart = [*self.coming[1::2], task], 2 * self.apart
             return True
 
     def run(self) -> None:
@@ -58,22 +68,22 @@ class _Run:
                 self.problem, self.done = error, True
 
     def _run(self) -> None:
-        """Fit the first cloud that can be, then follow to the newest, from where whoever takes the body goes on.
+        """Fit the first cloud that can be used, then follow through those that were kept to the newest.
 
-        A stream may be faster than the tracker, so to follow every cloud might never come to an end.
+        A person may have turned or sat down meanwhile, so nothing between is left out. Clouds come while others are
+        followed too; that ends when they are few, or no fewer than before, as where the tracker is the slower one.
         """
-        fitted = self._took(self.first, search=True)
+        fitted, before = self._took(self.first, search=True), MOST_KEPT + 1
         while not self.stopped:
             with self.lock:
-                task, self.newest = self.newest, None
-                self.done = task is None
-            if task is None:
-                return
-            followed = self._took(task, search=not fitted)
-            if fitted:
-                self.done = True
-                return
-            fitted = followed
+                tasks, self.coming, self.apart = self.coming, [], CHASE_NS
+                self.done = not tasks
+            for task in tasks:
+                if not self.stopped:
+                    fitted = self._took(task, search=not fitted) or fitted
+            if not tasks or (fitted and (len(tasks) <= FEW or len(tasks) >= before)):
+                break
+            before = len(tasks)
         self.done = True
 
     def _took(self, task: Task, search: bool) -> bool:

@@ -19,7 +19,7 @@ from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress, checked_cloud
 from flowing_puppet_ros.body.geometry import vertex_normals
 from flowing_puppet_ros.body.normals import estimated_normals, thinned
-from flowing_puppet_ros.body.refine import Refiner, RefineWeights
+from flowing_puppet_ros.body.refine import RefineWeights
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
@@ -28,6 +28,10 @@ NARROW, WIDE = (0.10, 0.03), (0.25, 0.03)  # first and last kernel width of a us
 WIDE_STEPS = 20
 BELIEF = 1e-6  # weight in `RefineWeights.shape` that each frame adds to the shape of the frames before
 MOST_FRAMES = 30  # that are remembered of a shape, or a first mistake would stay
+HIDDEN, HALF_LIFE = (
+    0.4,
+    2.0,
+)  # share of what is usually seen of a person below which somebody stands before them; seconds
 MOST_STRETCH = 2.0  # frames' steps that a motion may go on unseen
 
 
@@ -60,7 +64,6 @@ class BodyTracker:
         """Track with the model of `fitter`, which also makes the full fits."""
         self._fitter = fitter
         self._settings = settings
-        self._refiner = Refiner(fitter.model)
         self._none = JointTargets.none(fitter.model)
         self.counters: Counter[str] = Counter()
         self.reset()
@@ -72,6 +75,8 @@ class BodyTracker:
         self._best = np.inf
         self._frames = 0
         self._turned = False
+        self._usual = 0.0
+        self._hidden = False
         self.lost = True
 
     @property
@@ -144,6 +149,7 @@ class BodyTracker:
             points, normals = thinned(points, normals, self._settings.track_points)
         if self._last is not None and stamp <= self._last.stamp:
             self.reset()
+        self._hidden = viewpoint is not None and self._is_hidden(points, stamp, viewpoint)
         self._turned = normals is None and viewpoint is None and self._last is not None
         if self._turned and self._last is not None:
             vertices = self._fitter.model.vertices(self._predicted(self._last, points.mean(axis=0), stamp))
@@ -151,7 +157,14 @@ class BodyTracker:
         return self._fitter.cloud(points, normals, viewpoint)
 
     def _followed(self, cloud: Cloud, stamp: int) -> BodyFit | None:
-        """The last body after a few steps on the new cloud, and whether it is lost."""
+        """The last body after a few steps on the new cloud, and whether it is lost.
+
+        The little that is seen of a person behind somebody would bend the body: it goes on as it is.
+        """
+        if self._hidden and self._last is not None:
+            self.counters["hidden"] += 1
+            self.lost = False
+            return self._fitter.result(self._carried(self._last, stamp), cloud)
         middle = cloud.points.mean(axis=0)
         fit = None if self._last is None else self._tracked(self._predicted(self._last, middle, stamp), cloud)
         self.lost = fit is None or self._is_lost(fit)
@@ -159,9 +172,9 @@ class BodyTracker:
 
     def _noted(self, fit: BodyFit, cloud: Cloud, stamp: int) -> BodyFit:
         self._before, self._last = self._last, _Seen(fit, stamp, cloud.points.mean(axis=0))
-        if not self.lost:
+        if not self.lost and not self._hidden:
             self._best = min(self._best, fit.two_way_distance)
-        self._frames += 1
+        self._frames += not self._hidden
         return fit
 
     def _tracked(self, start: BodyState, cloud: Cloud) -> BodyFit:
@@ -179,9 +192,10 @@ class BodyTracker:
         self.counters["searched"] += 1
         # Normals that were turned by a body that is lost would mislead the search.
         normals = None if self._turned else cloud.normals
-        found = self._fitter.fit(cloud.points, normals, viewpoint=cloud.viewpoint, seed=seed, progress=progress)
-        # Without the surface of its own that a full fit may have, or it would come and go with the searches.
-        fit = self._fitter.result(found.state, cloud)
+        # With the model's surface: one of its own would come and go with the searches.
+        fit = self._fitter.fit(
+            cloud.points, normals, viewpoint=cloud.viewpoint, seed=seed, progress=progress, quick=True
+        )
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
             fit = tracked
         else:
@@ -199,8 +213,7 @@ class BodyTracker:
             return replace(state, center=state.center + middle - last.middle)
         if self._before is None:
             return state
-        share = min((stamp - last.stamp) / (last.stamp - self._before.stamp), MOST_STRETCH)
-        before = self._before.fit.state
+        share, before = self._stretch(self._before, last, stamp), self._before.fit.state
         turn = rotation.log(np.swapaxes(before.rotation, -1, -2) @ state.rotation)
         return replace(
             state,
@@ -208,13 +221,32 @@ class BodyTracker:
             rotation=state.rotation @ rotation.exp(share * turn),
         )
 
+    def _carried(self, last: _Seen, stamp: int) -> BodyState:
+        """The last body, moved on as its torso moved, in the pose that it has."""
+        state = last.fit.state
+        if self._before is None:
+            return state
+        moved = state.center[0] - self._before.fit.state.center[0]
+        return replace(state, center=state.center + self._stretch(self._before, last, stamp) * moved)
+
+    @staticmethod
+    def _stretch(before: _Seen, last: _Seen, stamp: int) -> float:
+        return min((stamp - last.stamp) / (last.stamp - before.stamp), MOST_STRETCH)
+
+    def _is_hidden(self, points: np.ndarray, stamp: int, viewpoint: np.ndarray) -> bool:
+        """Whether much less of the person is seen from one side than usual; what is usual follows what is seen."""
+        seen = len(points) * float(((points - viewpoint) ** 2).sum(axis=1).mean())
+        passed = 0.0 if self._last is None else 1e-9 * (stamp - self._last.stamp)
+        self._usual = max(seen, self._usual * 0.5 ** (passed / HALF_LIFE))
+        return seen < HIDDEN * self._usual
+
     def _refined(self, start: BodyState, cloud: Cloud, widths: tuple[float, float], steps: int) -> BodyFit:
         weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps)
         learned = BELIEF * min(self._frames, MOST_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
         # What turns to the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
         facing = Cloud(cloud.points, cloud.normals, cloud.tree, cloud.viewpoint)
-        return self._fitter.result(self._refiner.run(start, facing, self._none, weights), cloud)
+        return self._fitter.result(self._fitter.refiner.run(start, facing, self._none, weights), cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
         return fit.two_way_distance > self._settings.track_lost_ratio * self._best + self._settings.track_lost_distance

@@ -80,15 +80,11 @@ class Sight:
     def _evidence(self, window: Window, side: str, places: Floats) -> Floats:
         rows = [self.model.joint_names.index(f"{side}_{name}") for name in ENDS]
         parts = [self.model.tree.names.index(f"{side}_{name}") for name in ("upper_arm", "lower_arm")]
-        contours: list[list[Floats]] = [[], []]
-        for place in places:
-            joints = self.joints.copy()
-            joints[rows] = place
-            shape = self.model.puppet_from_joints(joints, self.scale, self.view)
-            for k, part in enumerate(parts):
-                contours[k].append(shape.contours[part])
+        joints = np.repeat(self.joints[None], len(places), axis=0)
+        joints[:, rows] = places
         scale = np.full(len(places), self.scale)
-        found = [window.log_likelihood(part, np.array(own), scale) for part, own in zip(parts, contours, strict=True)]
+        contours, _ = self.model.puppets_from_joints(joints, scale, self.view, edges=())
+        found = [window.log_likelihood(part, contours[part], scale) for part in parts]
         return np.asarray(found[0] + found[1])
 
 

@@ -161,7 +161,8 @@ class PersonDetection:
     def arms(self, side: str, count: int) -> Doubles:
         """Elbow and wrist (K, 2, 2) px of up to `count` poses of the arm of a side, best first."""
         rows = [PARTS.index(f"{side}_{joint}") for joint in ("elbow", "wrist")]
-        return np.array([self._points(self._refined(mode))[rows] for _, mode in self._arm_modes(side, count)])
+        placements = np.array([placement for _, placement in self._arm_modes(side, count)])
+        return self._points(self._refined(placements)[:, rows])
 
     @cached_property
     def _both_ways(self) -> Beliefs:
@@ -198,21 +199,24 @@ class PersonDetection:
         return modes
 
     def _refined(self, placement: NDArray[np.int64]) -> Doubles:
-        """Grid coordinates (P, 2) of a placement, moved to the top of the parabola through the neighbours' scores."""
-        cells = placement[:, 1:].astype(np.float64)
+        """Grid coordinates (..., P, 2) of placements (..., P, 3), moved to the tops of parabolas through the scores."""
         beliefs = self._both_ways
         assert beliefs.down is not None
         height, width = beliefs.up.shape[1:]
-        for part, (layer, x, y) in enumerate(placement):
-            if 0 < x < width - 1 and 0 < y < height - 1:
-                near = (
-                    beliefs.up[layer, y - 1 : y + 2, x - 1 : x + 2] + beliefs.down[layer, y - 1 : y + 2, x - 1 : x + 2]
-                )
-                cells[part] += _peak(near[1]), _peak(near[:, 1])
-        return cells
+        layer, x, y = np.moveaxis(placement, -1, 0)
+        inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
+        x_in, y_in = np.clip(x, 1, width - 2), np.clip(y, 1, height - 2)
+
+        def near(right: int, down: int) -> Doubles:
+            at = layer, y_in + down, x_in + right
+            return np.asarray(beliefs.up[at] + beliefs.down[at], np.float64)
+
+        middle = near(0, 0)
+        peak = np.stack([_peak(near(-1, 0), middle, near(1, 0)), _peak(near(0, -1), middle, near(0, 1))], axis=-1)
+        return placement[..., 1:] + np.where(inside[..., None], peak, 0.0)
 
     def _points(self, cells: Doubles) -> Doubles:
-        """Grid coordinates (P, 2) in px of the given image."""
+        """Grid coordinates (..., 2) in px of the given image."""
         return (self.pose.window.points_of(cells) + 0.5) / self.factor - 0.5
 
     def _keypoints(self, cells: Doubles) -> Keypoints:
@@ -234,8 +238,8 @@ def _arm_rows(side: str) -> list[int]:
     return [PARTS.index(f"{side}_{part}") for part in ARM]
 
 
-def _peak(values: Floats) -> float:
-    """Top of the parabola through three values, from the middle one, at most half a step away."""
-    low, middle, high = (float(value) for value in values)
+def _peak(low: Doubles, middle: Doubles, high: Doubles) -> Doubles:
+    """Tops of the parabolas through three values, from the middle ones, at most half a step away."""
     bend = low - 2 * middle + high
-    return float(np.clip(0.5 * (low - high) / bend, -0.5, 0.5)) if bend < 0 else 0.0
+    bent = bend < 0
+    return np.where(bent, np.clip(0.5 * (low - high) / np.where(bent, bend, -1.0), -0.5, 0.5), 0.0)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -102,7 +103,7 @@ class StitchedPuppet:
     @classmethod
     def load(cls, name: str = "neutral") -> StitchedPuppet:
         """The shipped model neutral, female or male; InputError for another name."""
-        return cls.from_arrays(name, weights.load("sp", name))
+        return _loaded(name)
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, Array]) -> StitchedPuppet:
@@ -148,13 +149,10 @@ class StitchedPuppet:
 
     def rest_state(self) -> BodyState:
         """The average body in the template pose: pose coefficients that undo the mean pose deformation."""
+        rest = _rest_pose(self)
         parts = len(self.tree)
-        pose = np.zeros((parts, POSE_WIDTH))
-        for i in range(parts):
-            basis = self.pose_basis[i].reshape((-1, self.pose_count(i)))
-            pose[i, : basis.shape[1]] = np.linalg.lstsq(basis, -self.mean_pose[i].ravel(), rcond=None)[0]
         turned = np.broadcast_to(np.eye(3), (parts, 3, 3)).copy()
-        return BodyState(self.rest_center.copy(), turned, pose, np.zeros((parts, self.shape_count)))
+        return BodyState(self.rest_center.copy(), turned, rest.copy(), np.zeros((parts, self.shape_count)))
 
     def local_vertices(self, i: int, d: Array, s: Array) -> Array:
         """Vertices (...,N_i,3) of part i in its own frame (Eqs. 45 and 46); d (...,P_i or zero-padded), s (...,S)."""
@@ -243,3 +241,19 @@ class StitchedPuppet:
             pose[..., i, : len(signs)] *= signs
         turned = MIRROR_POINT[:, None] * state.rotation[..., other, :, :] * MIRROR_POINT
         return BodyState(state.center[..., other, :] * MIRROR_POINT, turned, pose, state.shape[..., other, :])
+
+
+@lru_cache(maxsize=4)
+def _rest_pose(model: StitchedPuppet) -> Array:
+    """Pose coefficients (N, POSE_WIDTH) that undo the mean pose deformation."""
+    pose = np.zeros((len(model.tree), POSE_WIDTH))
+    for i in range(len(pose)):
+        basis = model.pose_basis[i].reshape((-1, model.pose_count(i)))
+        pose[i, : basis.shape[1]] = np.linalg.lstsq(basis, -model.mean_pose[i].ravel(), rcond=None)[0]
+    return pose
+
+
+@lru_cache(maxsize=3)
+def _loaded(name: str) -> StitchedPuppet:
+    """The shipped model; nobody changes it, so all of a process share it."""
+    return StitchedPuppet.from_arrays(name, weights.load("sp", name))

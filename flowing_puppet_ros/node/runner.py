@@ -12,6 +12,8 @@ from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.errors import PuppetError
 
+SWITCH_SECONDS = 0.0005
+
 
 def run(name: str, description: str | None, module: str, arguments: list[str] | None = None) -> int:
     """Spin the node `name` until it is interrupted; return the exit status.
@@ -41,6 +43,8 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
         return 2
     # Workers of their own use the cores; threads of BLAS beside them would only stand in each other's way.
     threadpool_limits(1)
+    # While a search runs beside the messages, every wait for Python's lock would take 5 ms.
+    sys.setswitchinterval(SWITCH_SECONDS)
     _spin(node)
     rclpy.try_shutdown()
     return 0

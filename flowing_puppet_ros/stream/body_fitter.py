@@ -83,6 +83,10 @@ class BodyFitterComponent(Component):
         self._outputs = BodyOutputs(settings, factory, self._model)
         self.outputs = (*BodyOutputs.ports, *self._outputs.humans.ports)
 
+    def warm_up(self) -> None:
+        """Do beforehand what the first clouds of a live stream would wait for."""
+        self._people.warm()
+
     def reset(self) -> None:
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""
         self._silhouettes.reset()

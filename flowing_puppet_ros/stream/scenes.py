@@ -81,6 +81,12 @@ class ScenePeople:
         self._single: bool | None = None
         self._planes = PlaneMemory()
 
+    def warm(self) -> None:
+        """Do beforehand what the first cloud would wait for."""
+        self._fitter.warm()
+        standing = self._fitter.model.vertices(self._fitter.model.rest_state())
+        extract_people(standing, None, self._settings)
+
     def reset(self) -> None:
         """Forget everybody."""
         self._crowd.reset()

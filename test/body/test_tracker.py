@@ -32,6 +32,7 @@ class _KnowingFitter(BodyFitter):
         viewpoint: np.ndarray | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
+        quick: bool = False,
     ) -> BodyFit:
         return self.result(self.truth, self.cloud(points, normals, viewpoint))
 

@@ -98,6 +98,13 @@ class CapsuleModel:
             contours.append(capsule(joints[a], joints[b], radius))
         return PuppetShape(joints, tuple(contours), tuple(np.zeros(1) for _ in contours), scale, view)
 
+    def puppets_from_joints(
+        self, joints: Floats, scale: Floats, view: View = "front", edges: Sequence[int] | None = None
+    ) -> tuple[tuple[Floats, ...], Floats]:
+        """The same for P persons (P, J, 2): contours (P, K, 2) of every part; no energy."""
+        shapes = [self.puppet_from_joints(own, size, view) for own, size in zip(joints, scale, strict=True)]
+        return tuple(np.array(part) for part in zip(*(s.contours for s in shapes), strict=True)), np.zeros(len(joints))
+
     def energy(self, shape: PuppetShape) -> float:
         """No prior."""
         return 0.0

@@ -131,6 +131,20 @@ def test_people_who_touch_stay_two(person: np.ndarray, floor: np.ndarray, fits: 
     assert len(fits) == 2
 
 
+def test_after_a_stall_a_person_is_neither_cut_in_two_nor_taken_for_another(
+    person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
+) -> None:
+    """Seconds without a cloud leave the body behind: it still stands in a part of the person's points."""
+    stage = Stage(person, floor)
+    for step in range(3):
+        stage.show((0.05 * step, 0.0))
+    x = 0.1
+    for step in (0.2, 0.3, 0.4, 0.3, 0.2):
+        stage.tenths += 14
+        x += step
+        assert stage.show((x, 0.0)) == {(x, 0.0): "b1"}, step
+
+
 def test_seeds_begin_ids(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
     assert list(Stage(person, floor, seed=2).show((0, 0)).values()) == ["bc1"]
 
