@@ -200,20 +200,20 @@ class PersonDetection:
 
     def _refined(self, placement: NDArray[np.int64]) -> Doubles:
         """Grid coordinates (..., P, 2) of placements (..., P, 3), moved to the tops of parabolas through the scores."""
-        beliefs = self._both_ways
-        assert beliefs.down is not None
-        height, width = beliefs.up.shape[1:]
+        up, down = self._both_ways.up, self._both_ways.down
+        assert down is not None
+        height, width = up.shape[1:]
         layer, x, y = np.moveaxis(placement, -1, 0)
         inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
         x_in, y_in = np.clip(x, 1, width - 2), np.clip(y, 1, height - 2)
 
-        def near(right: int, down: int) -> Doubles:
-            at = layer, y_in + down, x_in + right
-            return np.asarray(beliefs.up[at] + beliefs.down[at], np.float64)
+        def near(right: int, below: int) -> Doubles:
+            at = layer, y_in + below, x_in + right
+            return np.asarray(up[at] + down[at], np.float64)
 
         middle = near(0, 0)
         peak = np.stack([_peak(near(-1, 0), middle, near(1, 0)), _peak(near(0, -1), middle, near(0, 1))], axis=-1)
-        return placement[..., 1:] + np.where(inside[..., None], peak, 0.0)
+        return np.asarray(placement[..., 1:] + np.where(inside[..., None], peak, 0.0), np.float64)
 
     def _points(self, cells: Doubles) -> Doubles:
         """Grid coordinates (..., 2) in px of the given image."""

@@ -139,10 +139,10 @@ def test_after_a_stall_a_person_is_neither_cut_in_two_nor_taken_for_another(
     for step in range(3):
         stage.show((0.05 * step, 0.0))
     x = 0.1
-    for step in (0.2, 0.3, 0.4, 0.3, 0.2):
+    for stride in (0.2, 0.3, 0.4, 0.3, 0.2):
         stage.tenths += 14
-        x += step
-        assert stage.show((x, 0.0)) == {(x, 0.0): "b1"}, step
+        x += stride
+        assert stage.show((x, 0.0)) == {(x, 0.0): "b1"}, stride
 
 
 def test_seeds_begin_ids(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
