@@ -28,10 +28,8 @@ NARROW, WIDE = (0.10, 0.03), (0.25, 0.03)  # first and last kernel width of a us
 WIDE_STEPS = 20
 BELIEF = 1e-6  # weight in `RefineWeights.shape` that each frame adds to the shape of the frames before
 MOST_FRAMES = 30  # that are remembered of a shape, or a first mistake would stay
-HIDDEN, HALF_LIFE = (
-    0.4,
-    2.0,
-)  # share of what is usually seen of a person below which somebody stands before them; seconds
+HIDDEN = 0.4  # share of what is usually seen of a person below which somebody stands before them
+HALF_LIFE = 2.0  # seconds in which what is usual falls to half, where less is seen
 MOST_STRETCH = 2.0  # frames' steps that a motion may go on unseen
 
 
