@@ -121,7 +121,7 @@ class BodyFinder:
     def _is_close(self, candidate: Candidate) -> bool:
         return candidate.cost < self._settings.restart_distance
 
-    def warm(self, cloud: Cloud, view: ViewCloud) -> None:
+    def warm_up(self, cloud: Cloud, view: ViewCloud) -> None:
         """Use all compiled code once, on any cloud from all sides and any from one side."""
         grid = CloudGrid.build(cloud.points, cloud.normals)
         self._two_bodies(cloud, grid, np.random.default_rng(0), lambda _: None, WARM)

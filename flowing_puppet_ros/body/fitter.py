@@ -76,7 +76,7 @@ class BodyFitter:
         """The Gauss-Newton over all parts."""
         return self._finder.refiner
 
-    def warm(self) -> None:
+    def warm_up(self) -> None:
         """Do beforehand what takes long the first time in a process: load compiled code, make the bank of bodies."""
         if self.model.name in _WARM:
             return
@@ -85,7 +85,7 @@ class BodyFitter:
             points = self.model.vertices(self.model.rest_state())
             cloud = self.cloud(points, None, None)
             view = ViewCloud.seen_from(cloud.points, cloud.normals, cloud.points.mean(axis=0) + WARM_VIEW)
-            self._finder.warm(cloud, view)
+            self._finder.warm_up(cloud, view)
             self.result(self.model.rest_state(), cloud)
 
     def fit(

@@ -71,7 +71,7 @@ class ClipPeople:
     def add(self, image: int, places: Sequence[Place]) -> None:
         """Take the places of image number `image`; numbers grow.
 
-        A place that costs more than to miss the person there is on no best path, and most of an image's are such.
+        A place that costs more than to miss the person there is on no best path, and is not kept.
         """
         self._looks[image] = [place for place in places if _gain(place) >= -ABSENT]
 

@@ -85,7 +85,7 @@ class BodyFitterComponent(Component):
 
     def warm_up(self) -> None:
         """Do beforehand what the first clouds of a live stream would wait for."""
-        self._people.warm()
+        self._people.warm_up()
 
     def reset(self) -> None:
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""

@@ -81,9 +81,9 @@ class ScenePeople:
         self._single: bool | None = None
         self._planes = PlaneMemory()
 
-    def warm(self) -> None:
+    def warm_up(self) -> None:
         """Do beforehand what the first cloud would wait for."""
-        self._fitter.warm()
+        self._fitter.warm_up()
         standing = self._fitter.model.vertices(self._fitter.model.rest_state())
         extract_people(standing, None, self._settings)
 
