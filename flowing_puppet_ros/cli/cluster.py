@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from flowing_puppet_ros.cli.task import Answer, Task, answer
 from flowing_puppet_ros.errors import InputError, PuppetError
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
 REACH_SECONDS = 10.0
 IDLE_SECONDS = 60.0
@@ -29,29 +29,31 @@ def on_cluster(tasks: Sequence[Task], address: str) -> Iterator[tuple[int, Answe
     scheduler goes away or has no worker for a minute; what was yielded until then is finished.
     """
     try:
-        from distributed import as_completed
+        import distributed  # noqa: F401
     except ImportError as error:
         raise InputError("--scheduler needs Dask: pip install 'flowing_puppet_ros[cluster]'") from error
     with _connected(address) as client:
-        futures = {client.submit(answer, task, pure=False): index for index, task in enumerate(tasks)}
+        waiting = {client.submit(answer, task, pure=False): index for index, task in enumerate(tasks)}
         try:
-            done = as_completed(list(futures))
             idle_since = time.monotonic()
-            while not done.is_empty():
-                finished = done.next_batch(block=False)
-                for future in finished:
-                    yield futures[future], _answer(future, tasks[futures[future]], address)
-                if finished or _workers(client, address):
+            while waiting:
+                before = len(waiting)
+                for future, index in list(waiting.items()):
+                    found = _answer(future, tasks[index], address)
+                    if found is not None:
+                        del waiting[future]
+                        yield index, found
+                if len(waiting) < before or _workers(client, address):
                     idle_since = time.monotonic()
                 elif time.monotonic() - idle_since > IDLE_SECONDS:
                     raise PuppetError(
                         f"the scheduler at {address} has no workers; start some (dask worker {address}) and run the"
                         " same command again"
                     )
-                if not finished:
+                if len(waiting) == before:
                     time.sleep(POLL_SECONDS)
         finally:
-            client.cancel([future for future in futures if not future.done()])
+            client.cancel(list(waiting))
 
 
 def _connected(address: str) -> Client:
@@ -72,12 +74,19 @@ def _workers(client: Client, address: str) -> int:
     return len(client.scheduler_info(n_workers=-1)["workers"])
 
 
-def _answer(future: Any, task: Task, address: str) -> Answer:
-    if future.status == "finished":
-        found = future.result()
+def _answer(future: Future, task: Task, address: str) -> Answer | None:
+    """What came back, None when nothing did yet: a result that died with its worker is awaited from another one."""
+    status = future.status
+    if status == "finished":
+        try:
+            found = future.result(timeout=REACH_SECONDS)
+        except TimeoutError:
+            return None
         assert isinstance(found, Answer)
         return found
-    if future.status == "error":
+    if status == "error":
         error = future.exception()
         return Answer({}, f"{task.source} failed on the cluster: {type(error).__name__}: {error}", 1)
-    raise PuppetError(f"the scheduler at {address} is gone; start it and run the same command again")
+    if status == "cancelled":
+        raise PuppetError(f"the scheduler at {address} is gone; start it and run the same command again")
+    return None

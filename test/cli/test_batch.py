@@ -7,17 +7,19 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from batch_work import Plan, work  # type: ignore[import-not-found]
+from distributed import Client
 
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.cli import main
+from flowing_puppet_ros.cli.cluster import on_cluster
 from flowing_puppet_ros.cli.processes import in_processes
 from flowing_puppet_ros.cli.task import Task
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -163,7 +165,10 @@ def test_a_process_that_dies_takes_no_other_input_with_it(tmp_path: Path) -> Non
 @contextmanager
 def started(*words: str | Path) -> Iterator[subprocess.Popen[bytes]]:
     """A program that is killed at the end."""
-    process = subprocess.Popen([sys.executable, "-m", *map(str, words)], stderr=subprocess.DEVNULL)
+    paths = os.pathsep.join([str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    environment = os.environ | {"PYTHONPATH": paths, "NUMBA_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", *map(str, words)]
+    process = subprocess.Popen(command, stderr=subprocess.DEVNULL, env=environment)
     try:
         yield process
     finally:
@@ -178,32 +183,58 @@ def wait(holds: Callable[[], bool], seconds: float = 120.0) -> None:
         time.sleep(0.02)
 
 
+@contextmanager
+def cluster(place: Path) -> Iterator[str]:
+    """The address of a scheduler without workers, which is written down at `place`."""
+    options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", place)
+    with started("dask", "scheduler", *options):
+        wait(lambda: place.exists() and place.read_text().endswith("}"))
+        yield str(json.loads(place.read_text())["address"])
+
+
+def worker(place: Path) -> AbstractContextManager[subprocess.Popen[bytes]]:
+    """A worker of the scheduler that is written down at `place`."""
+    local = ("--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", place)
+    return started("dask", "worker", "--nthreads", "1", "--no-nanny", *local)
+
+
 def test_all_results_arrive_although_a_worker_is_killed(tmp_path: Path) -> None:
     bags = write_bags(tmp_path / "bags", [f"bag{k}" for k in range(BAGS)])
-    place, done = tmp_path / "scheduler.json", tmp_path / "out"
-    local = ("--no-dashboard", "--scheduler-file", place)
-    with ExitStack() as stack:
-        stack.enter_context(started("dask", "scheduler", "--host", "127.0.0.1", "--port", "0", *local))
-        wait(lambda: place.exists() and place.read_text().endswith("}"))
-        address = json.loads(place.read_text())["address"]
-        worker = ("dask", "worker", "--host", "127.0.0.1", "--nthreads", "1", "--no-nanny", *local)
-        workers = [stack.enter_context(started(*worker)) for _ in range(2)]
-        command = ["flowing_puppet_ros", "replay", bags, "--out", done, "--scheduler", address]
-        batch = stack.enter_context(started(*command))
+    done = tmp_path / "out"
+    place = tmp_path / "scheduler.json"
+    with cluster(place) as address, worker(place) as doomed, worker(place), ExitStack() as stack:
+        batch = stack.enter_context(
+            started("flowing_puppet_ros", "replay", bags, "--out", done, "--scheduler", address)
+        )
         wait(lambda: any(done.glob("*.mcap")))
-        workers[0].kill()
+        doomed.kill()
         assert len(list(done.glob("*.mcap"))) < BAGS, "the worker was to be killed in the middle"
         assert batch.wait(120) == 0
     assert main(["replay", str(bags), "--out", str(tmp_path / "serial"), "--jobs", "1"]) == 0
     assert len(contents(done)) == BAGS and contents(done) == contents(tmp_path / "serial")
 
 
+def test_results_that_die_with_their_worker_are_made_again(tmp_path: Path) -> None:
+    names = [f"leaves_a_mark{k}" for k in range(6)]
+    tasks = [Task(work, Path(name), Plan(tmp_path)) for name in names]
+    place = tmp_path / "scheduler.json"
+    with cluster(place) as address, worker(place) as dead:
+        answers = on_cluster(tasks, address)
+        first, found = next(answers)
+        wait(lambda: all((tmp_path / name).exists() for name in names))
+        dead.kill()
+        with Client(address) as client:
+            wait(lambda: not client.scheduler_info()["workers"])
+        time.sleep(0.5)  # until the other client was told of it too
+        with worker(place) as other:
+            rest = dict(answers)
+    assert sorted([first, *rest]) == list(range(len(names))) and found.summary["process"] == dead.pid
+    assert {late.summary["process"] for late in rest.values()} <= {dead.pid, other.pid}
+    assert other.pid in {late.summary["process"] for late in rest.values()}
+
+
 def test_a_cluster_without_workers_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scans = write_scans(tmp_path / "scans", 1)
-    place = tmp_path / "scheduler.json"
     monkeypatch.setattr("flowing_puppet_ros.cli.cluster.IDLE_SECONDS", 0.3)
-    words = ("dask", "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", place)
-    with started(*words):
-        wait(lambda: place.exists() and place.read_text().endswith("}"))
-        address = json.loads(place.read_text())["address"]
+    with cluster(tmp_path / "scheduler.json") as address:
         assert main(["fit", str(scans), "--out", str(tmp_path / "out"), "--scheduler", address, *FAST]) == 1
