@@ -7,7 +7,7 @@ decided at the end of the clip, by `arm_path`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -152,27 +152,33 @@ class ArmFilter:
     settings: PathSettings
     _arms: dict[str, ArmHypotheses] = field(default_factory=dict)
 
-    def step(self, sight: Sight, flow: FlowPair | None, grid: Grid) -> dict[str, tuple[Floats, Floats]]:
-        """Elbow and wrist (2, 2) px of each arm in the next image, and the probabilities (2,) that they are right.
+    def carry(self, flow: FlowPair | None, grid: Grid) -> None:
+        """Go on to the next image, whether anybody looks there or not.
+
+        `flow` (forward, backward) leads there, on the working grid; without one nothing before that image counts.
+        """
+        if flow is None:
+            self._arms.clear()
+        else:
+            self.move(lambda places: places + _motion(flow, grid, places))
+
+    def move(self, moved: Callable[[Floats], Floats]) -> None:
+        """Go on to another image, to which `moved` takes places (K, 2, 2) px of this one."""
+        self._arms = {side: replace(arm, places=moved(arm.places)) for side, arm in self._arms.items()}
+
+    def step(self, sight: Sight) -> dict[str, tuple[Floats, Floats]]:
+        """Elbow and wrist (2, 2) px of each arm in this image, and the probabilities (2,) that they are right.
 
         NaN where nobody was detected.
-        `flow` (forward, backward) leads to this image from the one before, on the working grid.
         """
-        return {side: self._side(side, sight, flow, grid) for side in SIDES}
+        return {side: self._side(side, sight) for side in SIDES}
 
-    def carry(self, flow: FlowPair | None, grid: Grid) -> None:
-        """Go on to an image in which nobody looks; `flow` as in `step`."""
-        if flow is not None:
-            for side, arm in self._arms.items():
-                self._arms[side] = replace(arm, places=arm.places + _motion(flow, grid, arm.places))
-
-    def _side(self, side: str, sight: Sight, flow: FlowPair | None, grid: Grid) -> tuple[Floats, Floats]:
+    def _side(self, side: str, sight: Sight) -> tuple[Floats, Floats]:
         before, places = self._arms.get(side), sight.hypotheses(side, self.settings.modes)
-        if before is not None and flow is not None:
-            before = replace(before, motion=_motion(flow, grid, before.places))
+        if before is not None:
             places = np.concatenate([places, _distinct(before, sight.width)])
         score = own = sight.judged(side, places, self.settings)
-        if before is not None and flow is not None:
+        if before is not None:
             now = ArmHypotheses(places, own, np.zeros_like(places))
             score = own + (before.score[:, None] - step_costs(before, now, sight.width, self.settings)).max(axis=0)
         arm = ArmHypotheses(places, score - score.max(), np.zeros_like(places))
@@ -215,7 +221,7 @@ def _best(arm: ArmHypotheses) -> Floats:
 
 
 def _distinct(arm: ArmHypotheses, width: float) -> Floats:
-    """The best hypotheses (up to KEPT, 2, 2) that differ, where the flow takes them."""
+    """The best hypotheses (up to KEPT, 2, 2) that differ."""
     kept: list[int] = []
     for k in np.argsort(-arm.score, kind="stable").tolist():
         apart = np.linalg.norm(arm.places[kept] - arm.places[k], axis=2).max(axis=1)
@@ -223,7 +229,7 @@ def _distinct(arm: ArmHypotheses, width: float) -> Floats:
             kept.append(k)
         if len(kept) == KEPT:
             break
-    return np.asarray(arm.places[kept] + arm.motion[kept])
+    return arm.places[kept]
 
 
 def _motion(flow: FlowPair, grid: Grid, places: Floats) -> Floats:

@@ -80,10 +80,6 @@ class ClipPeople:
         for image in list(self._looks)[:-looks]:
             del self._looks[image]
 
-    def clear(self) -> None:
-        """Forget all looks."""
-        self._looks.clear()
-
     def paths(self) -> list[PersonPath]:
         """The people, the surest first."""
         images, looks = list(self._looks), [list(places) for places in self._looks.values()]

@@ -21,12 +21,9 @@ from flowing_puppet_ros.image.detector import DetectorSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
 from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
+from flowing_puppet_ros.image.watch import Watch
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
-
-SURE_LOOKS = 5  # searches that must have found a person before only their place is looked at
-MEMORY = 20  # searches that are remembered live
-LEAST_ODDS = 1e-6
 
 
 @dataclass(frozen=True)
@@ -71,13 +68,12 @@ class VideoTracker:
     settings: DetectionSettings
     path: PathSettings = field(default_factory=PathSettings)
     images: int = 0
-    _looks: ClipPeople = field(init=False)
-    _known: dict[str, tuple[float, float, int]] = field(default_factory=dict)
+    _watch: Watch = field(init=False)
     _arms: dict[str, ArmFilter] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Begin with no search."""
-        self._looks = self._empty(self.settings.search_every)
+        """Know nobody yet."""
+        self._forget()
 
     def step(
         self,
@@ -97,26 +93,23 @@ class VideoTracker:
             found = self.detector.at(image, [place for path in paths if (place := path.at(number)) is not None])
             return self._tracked(image, stamp_ns, flow, found), found
         if number % self.settings.detect_every:
-            result = self._tracked(image, stamp_ns, flow, None)
-            for arms in self._arms.values():
-                arms.carry(result.flow, result.grid)
-            return result, []
-        places = self._known_places()
-        searched = places is None or number % self.settings.renew_every == 0
-        if searched or places is None:
-            places = self._searched(image, number)
-        found = self.detector.at(image, places)
+            return self._tracked(image, stamp_ns, flow, None), []
+        people = {person.id: person.mean for person in self.tracker.people}
+        searched = number % self.settings.renew_every == 0 or not self._watch.sure(people)
+        places = [] if searched else list(self._watch.places(self.tracker.model.joint_names, people).values())
+        found = self._searched(image, number) if searched else self.detector.at(image, places)
         result = self._tracked(image, stamp_ns, flow, found)
         if result.restarted:
             # Nobody stands any more where they stood before a cut.
-            self._looks.clear()
-            searched, found = True, self.detector.at(image, self._searched(image, number))
+            self._forget()
+            searched, found = True, self._searched(image, number)
             self.tracker.reset()
             again = self._tracked(image, stamp_ns, None, found)
             result = replace(again, warnings=result.warnings, restarted=True)
         result = self._with_arms(result, image, found)
         if searched:
-            self._learn_places(result, found)
+            seen = {puppet.id: puppet.detection for puppet in result.puppets}
+            self._watch.learn({name: found[index] for name, index in seen.items() if index is not None})
         return result, found
 
     def _tracked(
@@ -127,7 +120,10 @@ class VideoTracker:
         found: Sequence[PersonDetection] | None,
     ) -> TrackResult:
         keypoints = None if found is None else [person.keypoints for person in found]
-        return self.tracker.step(image, stamp_ns, keypoints, flow)
+        result = self.tracker.step(image, stamp_ns, keypoints, flow)
+        for arms in self._arms.values():
+            arms.carry(result.flow, result.grid)
+        return result
 
     def _with_arms(
         self, result: TrackResult, image: NDArray[np.uint8], found: Sequence[PersonDetection]
@@ -138,7 +134,7 @@ class VideoTracker:
         self._arms = {identity: self._arms.get(identity, ArmFilter(self.path)) for identity in sights}
         places: dict[str, dict[int, tuple[NDArray[np.float64], float]]] = {}
         for puppet in result.puppets:
-            arms = self._arms[puppet.id].step(sights[puppet.id], result.flow, result.grid)
+            arms = self._arms[puppet.id].step(sights[puppet.id])
             places[puppet.id] = {
                 model.joint_names.index(f"{side}_{name}"): (ends[k], float(right[k]))
                 for side, (ends, right) in arms.items()
@@ -146,38 +142,13 @@ class VideoTracker:
             }
         return self.tracker.redirected(result, places)
 
-    def _known_places(self) -> list[Place] | None:
-        """Where the known people stand; None when nobody is known, or somebody for too short a time."""
-        places = []
-        names = self.tracker.model.joint_names
-        for person in self.tracker.people:
-            if person.id in self._known:
-                scale, log_odds, looks = self._known[person.id]
-                if looks < SURE_LOOKS:
-                    return None
-                neck, face = (person.mean[names.index(name)] for name in ("neck", "face"))
-                places.append(Place(neck, face, scale, log_odds))
-        return places or None
+    def _searched(self, image: NDArray[np.uint8], number: int) -> list[PersonDetection]:
+        """Search the image for people; where they are is told from all searches up to now."""
+        return self.detector.at(image, self._watch.search(number, self.detector.candidates(image)))
 
-    def _searched(self, image: NDArray[np.uint8], number: int) -> list[Place]:
-        """Search the image, and tell from all searches up to now where people are in it."""
-        self._looks.add(number, self.detector.candidates(image))
-        self._looks.keep(MEMORY)
-        return [place for path in self._looks.paths() if (place := path.at(number)) is not None]
-
-    def _learn_places(self, result: TrackResult, found: Sequence[PersonDetection]) -> None:
-        """Remember how large the people of a search are, and how surely; forget whom it did not find.
-
-        They are carried by the flow until another search finds them or the tracker gives them up.
-        """
-        known = {}
-        for puppet in result.puppets:
-            if puppet.detection is not None:
-                person = found[puppet.detection]
-                odds = np.clip(person.confidence, LEAST_ODDS, 1 - LEAST_ODDS)
-                looks = self._known[puppet.id][2] + 1 if puppet.id in self._known else 1
-                known[puppet.id] = person.scale, float(np.log(odds / (1 - odds))), looks
-        self._known = known
+    def _forget(self) -> None:
+        """Begin with no search."""
+        self._watch = Watch(self._empty(self.settings.search_every))
 
     def search(self, images: Iterable[NDArray[np.uint8]]) -> list[PersonPath]:
         """Look for the people of a whole clip before it is tracked; images that cannot be used are passed over."""
