@@ -24,11 +24,11 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import FlowSettings
 from flowing_puppet_ros.image.arm_path import PathSettings
-from flowing_puppet_ros.image.arms import Sight
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector import PartDetector
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
+from flowing_puppet_ros.image.sight import Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.tracks import puppet_entry, read_keypoints, write_tracks

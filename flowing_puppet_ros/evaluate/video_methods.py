@@ -19,7 +19,6 @@ from flowing_puppet_ros.evidence.hands import HandDetectors
 from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, working_size
 from flowing_puppet_ros.image.arm_path import PathSettings
-from flowing_puppet_ros.image.arms import Sight
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
@@ -28,6 +27,7 @@ from flowing_puppet_ros.image.flowing_clip import FlowingClip, given_sights
 from flowing_puppet_ros.image.flowing_energy import EnergySettings
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
+from flowing_puppet_ros.image.sight import Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.video import Frame

@@ -16,11 +16,8 @@ from numpy.typing import NDArray
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_path, step_costs
 from flowing_puppet_ros.image.carry import Grid
-from flowing_puppet_ros.image.detector_person import PersonDetection
-from flowing_puppet_ros.image.pose_evidence import Window
+from flowing_puppet_ros.image.sight import Sight
 from flowing_puppet_ros.image.smoothing import joint_motion, sampled
-from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.model.ds_shape import View
 
 type Floats = NDArray[np.float64]
 
@@ -34,61 +31,6 @@ DOUBT = 2.0  # nats, cost difference at which a path counts 1/e of the best
 RIGHT = np.array([[-0.07, 0.10, 0.23], [-0.51, 0.23, 0.26]])
 """Log-odds that elbow and wrist lie within 20 px of a 320x240 image's true place: a constant, and by the scores of the
 arm and of the whole pose. Logistic regression over the live and batch tracks of 31 annotated clips."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Sight:
-    """A person in one image.
-
-    `joints` (J, 2) px as tracked, the `detection` (None where it was missed), and the evidence around the person (None
-    outside of the image).
-    """
-
-    model: DeformableStructures
-    joints: Floats
-    scale: float
-    view: View
-    detection: PersonDetection | None
-    window: Window | None
-
-    @property
-    def width(self) -> float:
-        """Shoulder width in px."""
-        return self.scale * self.model.shoulder_width
-
-    def hypotheses(self, side: str, count: int) -> Floats:
-        """Elbow and wrist (K, 2, 2) px of the detector's modes of an arm; without it the tracked ones."""
-        if self.detection is not None:
-            return self.detection.arms(side, count)
-        return self.joints[None, [self.model.joint_names.index(f"{side}_{name}") for name in ENDS]]
-
-    def judged(self, side: str, places: Floats, settings: PathSettings) -> Floats:
-        """Score (K,) in nats of elbow and wrist at places (K, 2, 2) px."""
-        score = np.zeros(len(places))
-        if self.detection is not None:
-            elbow, wrist = (self.detection.joint_score(f"{side}_{name}", places[:, k]) for k, name in enumerate(ENDS))
-            score = settings.detector_weight * np.minimum(elbow, wrist)
-        if self.window is not None and settings.evidence_weight > 0:
-            score = score + settings.evidence_weight * self._evidence(self.window, side, places)
-        return score
-
-    @property
-    def pose_score(self) -> float:
-        """Score of the detected pose; NaN where nobody was detected."""
-        return np.nan if self.detection is None else self.detection.score
-
-    def _evidence(self, window: Window, side: str, places: Floats) -> Floats:
-        rows = [self.model.joint_names.index(f"{side}_{name}") for name in ENDS]
-        parts = [self.model.tree.names.index(f"{side}_{name}") for name in ("upper_arm", "lower_arm")]
-        joints = np.repeat(self.joints[None], len(places), axis=0)
-        joints[:, rows] = places
-        scale = np.full(len(places), self.scale)
-        contours, _ = self.model.puppets_from_joints(joints, scale, self.view, edges=())
-        found = [window.log_likelihood(part, contours[part], scale) for part in parts]
-        return np.asarray(found[0] + found[1])
-
-
-ENDS = ("elbow", "wrist")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.image.arm_path import PathSettings
-from flowing_puppet_ros.image.arms import ENDS, ArmHistory, Sight
+from flowing_puppet_ros.image.arms import ArmHistory
+from flowing_puppet_ros.image.sight import ENDS, Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings, joint_motion, smoothed
 from flowing_puppet_ros.image.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds import DeformableStructures

@@ -23,8 +23,8 @@ from flowing_puppet_ros.image.flowing_energy import EnergySettings, FrameEvidenc
 from flowing_puppet_ros.image.hand_evidence import hand_maps
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.pose_evidence import Found, GivenPerson, Likelihood, Window
+from flowing_puppet_ros.image.sight import window_of
 from flowing_puppet_ros.image.tracker import TrackedPuppet, TrackResult
-from flowing_puppet_ros.image.video_tracker import window_of
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.model.ds_shape import View
 

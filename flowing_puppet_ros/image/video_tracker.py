@@ -10,19 +10,18 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arm_path import PathSettings
-from flowing_puppet_ros.image.arms import ENDS, ArmFilter, Sight
+from flowing_puppet_ros.image.arms import ArmFilter
 from flowing_puppet_ros.image.clip_people import FIRST, ClipPeople, PersonPath
 from flowing_puppet_ros.image.detector import DetectorSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
-from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
-from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
+from flowing_puppet_ros.image.pose_evidence import Likelihood
+from flowing_puppet_ros.image.sight import ENDS, Sight, sight_of
+from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.image.watch import Watch
-from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
 
 
@@ -167,29 +166,12 @@ class VideoTracker:
         self, image: NDArray[np.uint8], result: TrackResult, found: Sequence[PersonDetection]
     ) -> dict[str, Sight]:
         """How each person of a step is seen in its image, by id; only hypotheses need this, tracking does not."""
-        colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
-        # Sums of several BLAS threads would differ in their last bits.
-        with threadpool_limits(1):
-            return {puppet.id: self._sight(puppet, colour, found) for puppet in result.puppets}
+        model, likelihood = self.tracker.model, self.likelihood
+        seen = [(puppet, None if puppet.detection is None else found[puppet.detection]) for puppet in result.puppets]
+        return {puppet.id: sight_of(model, likelihood, image, puppet, detection) for puppet, detection in seen}
 
     def detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
         """The people in an image who are sure enough to be tracked; the surest one may be less sure."""
         people, least = min(self.tracker.settings.most_people, 80), self.settings.least_person
         found = self.detector.detect(image, DetectorSettings(least_confidence=FIRST * least, most_people=people))
         return [person for turn, person in enumerate(found) if turn == 0 or person.confidence >= least]
-
-    def _sight(self, puppet: TrackedPuppet, image: NDArray[np.uint8], found: Sequence[PersonDetection]) -> Sight:
-        window = window_of(self.tracker.model, self.likelihood, image, puppet)
-        detection = None if puppet.detection is None else found[puppet.detection]
-        return Sight(self.tracker.model, puppet.joints, puppet.scale, puppet.view, detection, window)
-
-
-def window_of(
-    model: DeformableStructures, likelihood: Likelihood, image: NDArray[np.uint8], puppet: TrackedPuppet
-) -> Window | None:
-    """The evidence around a puppet in an image (H, W, 3), with the colours of its torso and head; None outside."""
-    window = Window.around(likelihood, image, puppet.joints, puppet.scale)
-    if window is None:
-        return None
-    torso, head = (puppet.contours[model.tree.names.index(name)] for name in ("torso", "head"))
-    return window.with_torso(torso, head)

@@ -10,11 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_path
-from flowing_puppet_ros.image.arms import DISTINCT, KEPT, ArmFilter, ArmHistory, Sight, probability_right
+from flowing_puppet_ros.image.arms import DISTINCT, KEPT, ArmFilter, ArmHistory, probability_right
 from flowing_puppet_ros.image.carry import Grid
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector_person import Place
 from flowing_puppet_ros.image.keypoints import Keypoints
+from flowing_puppet_ros.image.sight import Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.video_tracker import DetectionSettings, VideoTracker
 from test.image.drawn_people import NAMES, CapsuleModel, draw, pose, tracker

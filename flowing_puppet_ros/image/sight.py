@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How one person is seen in one image: what the detector and the evidence say of any place of the arms."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from flowing_puppet_ros.image.arm_path import PathSettings
+from flowing_puppet_ros.image.detector_person import PersonDetection
+from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
+from flowing_puppet_ros.image.tracker import TrackedPuppet
+from flowing_puppet_ros.model.ds import DeformableStructures
+from flowing_puppet_ros.model.ds_shape import View
+
+type Floats = NDArray[np.float64]
+
+ENDS = ("elbow", "wrist")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """A person in one image.
+
+    `joints` (J, 2) px as tracked, the `detection` (None where it was missed), and the evidence around the person (None
+    outside of the image).
+    """
+
+    model: DeformableStructures
+    joints: Floats
+    scale: float
+    view: View
+    detection: PersonDetection | None
+    window: Window | None
+
+    @property
+    def width(self) -> float:
+        """Shoulder width in px."""
+        return self.scale * self.model.shoulder_width
+
+    def hypotheses(self, side: str, count: int) -> Floats:
+        """Elbow and wrist (K, 2, 2) px of the detector's modes of an arm; without it the tracked ones."""
+        if self.detection is not None:
+            return self.detection.arms(side, count)
+        return self.joints[None, [self.model.joint_names.index(f"{side}_{name}") for name in ENDS]]
+
+    def judged(self, side: str, places: Floats, settings: PathSettings) -> Floats:
+        """Score (K,) in nats of elbow and wrist at places (K, 2, 2) px."""
+        score = np.zeros(len(places))
+        if self.detection is not None:
+            elbow, wrist = (self.detection.joint_score(f"{side}_{name}", places[:, k]) for k, name in enumerate(ENDS))
+            score = settings.detector_weight * np.minimum(elbow, wrist)
+        if self.window is not None and settings.evidence_weight > 0:
+            score = score + settings.evidence_weight * self._evidence(self.window, side, places)
+        return score
+
+    @property
+    def pose_score(self) -> float:
+        """Score of the detected pose; NaN where nobody was detected."""
+        return np.nan if self.detection is None else self.detection.score
+
+    def _evidence(self, window: Window, side: str, places: Floats) -> Floats:
+        rows = [self.model.joint_names.index(f"{side}_{name}") for name in ENDS]
+        parts = [self.model.tree.names.index(f"{side}_{name}") for name in ("upper_arm", "lower_arm")]
+        joints = np.repeat(self.joints[None], len(places), axis=0)
+        joints[:, rows] = places
+        scale = np.full(len(places), self.scale)
+        contours, _ = self.model.puppets_from_joints(joints, scale, self.view, edges=())
+        found = [window.log_likelihood(part, contours[part], scale) for part in parts]
+        return np.asarray(found[0] + found[1])
+
+
+def window_of(
+    model: DeformableStructures, likelihood: Likelihood, image: NDArray[np.uint8], puppet: TrackedPuppet
+) -> Window | None:
+    """The evidence around a puppet in an image (H, W, 3), with the colours of its torso and head; None outside."""
+    window = Window.around(likelihood, image, puppet.joints, puppet.scale)
+    if window is None:
+        return None
+    torso, head = (puppet.contours[model.tree.names.index(name)] for name in ("torso", "head"))
+    return window.with_torso(torso, head)
+
+
+def sight_of(
+    model: DeformableStructures,
+    likelihood: Likelihood,
+    image: NDArray[np.uint8],
+    puppet: TrackedPuppet,
+    detection: PersonDetection | None,
+) -> Sight:
+    """How a tracked puppet is seen in an image (H, W, 3) or (H, W), where the detector found it so."""
+    colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+    # Sums of several BLAS threads would differ in their last bits.
+    with threadpool_limits(1):
+        window = window_of(model, likelihood, colour, puppet)
+    return Sight(model, puppet.joints, puppet.scale, puppet.view, detection, window)
