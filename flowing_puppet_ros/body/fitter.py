@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.body.clip import near_limbs
 from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.energy import JointTargets
@@ -81,7 +81,7 @@ class BodyFitter:
         if self.model.name in _WARM:
             return
         _WARM.add(self.model.name)
-        with threadpool_limits(limits=1):
+        with one_blas_thread():
             points = self.model.vertices(self.model.rest_state())
             cloud = self.cloud(points, None, None)
             view = ViewCloud.seen_from(cloud.points, cloud.normals, cloud.points.mean(axis=0) + WARM_VIEW)
@@ -117,7 +117,7 @@ class BodyFitter:
             InputError: when the cloud cannot be the surface of a person or the initial joints place no body.
         """
         rng = np.random.default_rng(self.settings.seed if seed is None else seed)
-        with threadpool_limits(limits=1):
+        with one_blas_thread():
             points, normals = checked_cloud(points, normals)
             if initial is None:
                 cloud = self.cloud(points, normals, viewpoint)

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.body.camera import Camera
 from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.fitter import BodyFit
@@ -92,7 +92,7 @@ class SilhouetteFitter:
         Raises:
             InputError: when fewer than two masks have an outline, or joints and `before` place no body.
         """
-        with threadpool_limits(limits=1):
+        with one_blas_thread():
             outlines = [Outline.of(camera, mask) for camera, mask in views if 0 < np.count_nonzero(mask) < mask.size]
             if len(outlines) < MIN_VIEWS:
                 raise InputError(

@@ -12,8 +12,8 @@ from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.body.correspondence import Cloud
 from flowing_puppet_ros.body.energy import JointTargets
 from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, Progress, checked_cloud
@@ -117,7 +117,7 @@ class BodyTracker:
         Raises:
             InputError: when the cloud cannot be the surface of a person; the track goes on with the next one.
         """
-        with threadpool_limits(limits=1):
+        with one_blas_thread():
             cloud = self._next_cloud(points, normals, stamp, viewpoint)
             fit = self._followed(cloud, stamp)
             if fit is None or self.lost:
@@ -136,7 +136,7 @@ class BodyTracker:
             # Normals take long, and nobody would use them.
             self._fitter.person_points(*checked_cloud(points, normals), viewpoint)
             return None
-        with threadpool_limits(limits=1):
+        with one_blas_thread():
             cloud = self._next_cloud(points, normals, stamp, viewpoint)
             fit = self._followed(cloud, stamp)
         return None if fit is None else self._noted(fit, cloud, stamp)

@@ -6,8 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from threadpoolctl import threadpool_limits
-
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.hands import rank_wrists
 from flowing_puppet_ros.evaluate.likelihood import table
@@ -34,7 +33,7 @@ def run(arguments: argparse.Namespace) -> int:
     model = DeformableStructures.load()
     annotations = Annotations.load(arguments.annotations, arguments.media)
     people = posed_people(annotations, model, arguments.every, True)
-    with threadpool_limits(1):
+    with one_blas_thread():
         ranks = rank_wrists(model, HandDetectors.load(), people, arguments.wrong, arguments.seed)
     if not any(ranks.values()):
         raise InputError(f"{arguments.annotations} shows no wrist that is well enough known to be ranked")

@@ -18,9 +18,9 @@ from typing import Any
 
 import cv2
 import numpy as np
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.tables import text_table, write_csv, write_json
 from flowing_puppet_ros.evaluate.video import (
@@ -131,7 +131,7 @@ class _Task:
         missing = [name for name in plain if self.arguments.again or not self.file(name).is_file()]
         if missing:
             cv2.setNumThreads(1)
-            with threadpool_limits(1):
+            with one_blas_thread():
                 self._track(missing)
         for name in self.methods:
             if name.endswith(MEDIAN):

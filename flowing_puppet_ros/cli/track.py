@@ -21,14 +21,13 @@ from tqdm import tqdm
 
 from flowing_puppet_ros.bag.paths import is_bag
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import FlowSettings
 from flowing_puppet_ros.image.arm_path import PathSettings
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector import PartDetector
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
-from flowing_puppet_ros.image.sight import Sight
+from flowing_puppet_ros.image.sight import Eyes, Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.tracks import puppet_entry, read_keypoints, write_tracks
@@ -96,8 +95,8 @@ def _stepper(arguments: argparse.Namespace, tracker: FlowingPuppetTracker, given
     """What steps the tracker: with the keypoints that are `given`, or with the detector."""
     if given:
         return lambda frame, detections: (tracker.step(frame.image, frame.stamp_ns, detections), None)
-    likelihood, settings = PartLikelihood.load(arguments.parts), DetectionSettings.from_arguments(arguments)
-    video = VideoTracker(tracker, PartDetector.load(), likelihood, settings)
+    settings = DetectionSettings.from_arguments(arguments)
+    video = VideoTracker(tracker, PartDetector.load(), Eyes.load(arguments.model), settings)
     if arguments.live:
         return lambda frame, _: (video.step(frame.image, frame.stamp_ns)[0], None)
     again = _open(arguments, lambda _: None)

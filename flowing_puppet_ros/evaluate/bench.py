@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.body import energy, levenberg
 from flowing_puppet_ros.body.energy import JointTargets, Judged
 from flowing_puppet_ros.body.fitter import BodyFitter, FitterSettings
@@ -211,7 +211,7 @@ def _all_nearest(nearest: np.ndarray, origin: np.ndarray, cell: float, asked: np
 def _seconds(work: Callable[[], object], repeats: int = 3) -> float:
     """Least processor seconds of one call of `work`; short ones are called often enough to be measured."""
     best = np.inf
-    with threadpool_limits(limits=1):
+    with one_blas_thread():
         started = time.process_time()
         work()
         calls = max(1, int(0.02 / max(time.process_time() - started, 1e-6)))

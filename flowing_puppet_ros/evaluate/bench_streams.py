@@ -12,9 +12,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.tables import Row
 from flowing_puppet_ros.flow.estimate import FlowSettings
@@ -45,7 +45,7 @@ def _tracked(size: tuple[int, int], people: int, seed: int) -> Row:
     tracker = FlowingPuppetTracker(model, None, FlowSettings(preset="fast"))
     seconds = []
     cv2.setNumThreads(1)
-    with threadpool_limits(limits=1):
+    with one_blas_thread():
         for number in range(FRAMES):
             moved = [(joints + np.array([STEP * number, 0.0]), scale) for joints, scale in crowd]
             image = _drawn(model, np.asarray(ground), moved)

@@ -27,7 +27,7 @@ from flowing_puppet_ros.image.flowing_clip import FlowingClip, given_sights
 from flowing_puppet_ros.image.flowing_energy import EnergySettings
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.people import TrackerSettings
-from flowing_puppet_ros.image.sight import Sight
+from flowing_puppet_ros.image.sight import Eyes, Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.video import Frame
@@ -116,7 +116,7 @@ class ClipRun:
 
     def video(self) -> VideoTracker:
         """A new tracker with the detector of this run."""
-        return VideoTracker(self.tracker(), self.detector, self.likelihood, self.settings.detection)
+        return VideoTracker(self.tracker(), self.detector, Eyes(self.model, self.likelihood), self.settings.detection)
 
     def tracker(self) -> FlowingPuppetTracker:
         """A new tracker without a detector."""

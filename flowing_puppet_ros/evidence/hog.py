@@ -51,7 +51,7 @@ def _gradient_table() -> tuple[NDArray[np.uint8], Floats]:
     return scores.argmax(axis=0).astype(np.uint8), np.hypot(dx, dy).astype(np.float32)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _histograms(
     pixels: NDArray[np.uint8], cell: int, rows: int, columns: int, orientation: NDArray[np.uint8], magnitude: Floats
 ) -> Any:
@@ -82,7 +82,7 @@ def _histograms(
     return votes[1 : rows + 1, 1 : columns + 1].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _normalise(histogram: Floats) -> Any:
     """Features (rows, columns, 32): 18 signed, 9 unsigned orientations, 4 gradient energies, and 0."""
     rows, columns = histogram.shape[:2]

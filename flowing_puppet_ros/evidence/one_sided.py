@@ -142,7 +142,7 @@ def _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest
     return found, depth, share * dx, share * dy
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _compare(points, viewpoint, axes, directions, seen, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
     beside, behind = np.zeros((len(points), 3)), np.empty(len(points))
     for k in range(len(points)):
@@ -155,7 +155,7 @@ def _compare(points, viewpoint, axes, directions, seen, tolerance, low, cell, ne
     return beside, behind
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
     cost, facing = np.zeros(len(points)), np.zeros(points.shape[:2], dtype=np.bool_)
     for p in range(len(points)):
@@ -178,7 +178,7 @@ def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, 
     return cost, facing
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _distances(targets, points, allowed):  # type: ignore[no-untyped-def]
     result = np.empty((len(points), len(targets)))
     for p in range(len(points)):
@@ -194,7 +194,7 @@ def _distances(targets, points, allowed):  # type: ignore[no-untyped-def]
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _mean_distance(points, targets):  # type: ignore[no-untyped-def]
     result = np.zeros(len(points))
     for p in range(len(points)):

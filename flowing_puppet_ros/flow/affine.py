@@ -71,7 +71,7 @@ def fit_regions(labels: NDArray[np.unsignedinteger], count: int, forward: Flow, 
     return RegionMotions(affine, residual, support, pixels)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def round_trip_weight(x: int, y: int, u: float, v: float, backward: Flow) -> float:
     """Weight in (0, 1] of a flow vector: 1 when the backward flow returns to where it came from."""
     height, width = backward.shape[:2]
@@ -95,7 +95,7 @@ def round_trip_weight(x: int, y: int, u: float, v: float, backward: Flow) -> flo
     return tolerance / (tolerance + error)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _gather(
     labels: NDArray[np.uint16], count: int, forward: Flow, backward: Flow
 ) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
@@ -129,7 +129,7 @@ def _gather(
     return samples, starts, pixels
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fit_all(samples: Floats, starts: NDArray[np.int64], affine: Floats, residual: Floats, support: Floats) -> None:
     """Fit the background, label 0, then discount in the other regions what moves with it and fit those."""
     residual[0], support[0] = _fit(samples[: starts[1]], affine[0])
@@ -144,7 +144,7 @@ def _fit_all(samples: Floats, starts: NDArray[np.int64], affine: Floats, residua
         residual[region], support[region] = _fit(samples[starts[region] : starts[region + 1]], affine[region])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fit(samples: Floats, affine: Floats) -> tuple[float, float]:
     """Write the robust motion of `samples` (M, 6) into `affine`; return residual and support."""
     affine[:] = 0.0
@@ -169,7 +169,7 @@ def _fit(samples: Floats, affine: Floats) -> tuple[float, float]:
     return _agreement(samples, centre_x, centre_y, radius, scale, motion)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _weighted_median(values: Floats, weights: Floats) -> float:
     """The smallest value below which, itself included, lies half of the weight."""
     order = np.argsort(values)
@@ -181,7 +181,7 @@ def _weighted_median(values: Floats, weights: Floats) -> float:
     return float(values[order[-1]])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _reweighted_step(
     samples: Floats, centre_x: float, centre_y: float, radius: float, scale: float, linear: bool, motion: Floats
 ) -> None:
@@ -217,7 +217,7 @@ def _reweighted_step(
     motion[:] = np.linalg.solve(normal, right).T
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _agreement(
     samples: Floats, centre_x: float, centre_y: float, radius: float, scale: float, motion: Floats
 ) -> tuple[float, float]:

@@ -93,7 +93,7 @@ def explained_fraction(labels: NDArray[np.unsignedinteger], field: Flow, flow: F
     return float(np.mean(misfit <= np.maximum(1.0, 0.1 * np.hypot(magnitude[known, 0], magnitude[known, 1]))))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _paint(labels: NDArray[np.uint16], motions: Floats) -> Flow:
     height, width = labels.shape
     field = np.empty((height, width, 2), np.float32)

@@ -104,7 +104,7 @@ class Background:
         return bool(np.count_nonzero(changed & judged) <= _NEW_SCENE_SHARE * np.count_nonzero(judged))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _update(count, mean, variance, image, bare, min_frames, memory):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Welford's update with the count held at `memory`, which turns the mean into an exponential one.
 
@@ -130,7 +130,7 @@ def _update(count, mean, variance, image, bare, min_frames, memory):  # type: ig
                 variance[y, x, c] += (delta * delta * (n - 1) / n - variance[y, x, c]) / n
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _difference(mean, variance, image):  # type: ignore[no-untyped-def]  # pragma: no cover
     height, width, channels = image.shape
     levels = np.zeros((height, width), np.float32)
@@ -145,7 +145,7 @@ def _difference(mean, variance, image):  # type: ignore[no-untyped-def]  # pragm
     return levels, spread
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _shadow(mean, image):  # type: ignore[no-untyped-def]  # pragma: no cover
     height, width, channels = image.shape
     shadow = np.zeros((height, width), np.bool_)

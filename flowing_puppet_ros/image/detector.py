@@ -15,8 +15,8 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.colour import ColourImage, SkinColour
 from flowing_puppet_ros.evidence.region import RegionMap
@@ -108,7 +108,7 @@ class PartDetector:
         if small is None:
             return []
         # Several BLAS threads would sum in another order, and people who run many nodes have no cores to spare.
-        with threadpool_limits(1):
+        with one_blas_thread():
             return self._people(small, _smallest(small, factor, settings), factor, settings)
 
     def candidates(self, image: NDArray[np.uint8], settings: DetectorSettings = DEFAULTS) -> list[Place]:
@@ -116,7 +116,7 @@ class PartDetector:
         small, factor = _shrunk(image, settings)
         if small is None:
             return []
-        with threadpool_limits(1):
+        with one_blas_thread():
             poses = self.look(small, _smallest(small, factor, settings), settings.places)
         scores = self.ranking.scores(poses)
         found = []
@@ -134,7 +134,7 @@ class PartDetector:
         if small is None:
             return []
         found = []
-        with threadpool_limits(1):
+        with one_blas_thread():
             for place in places:
                 neck, face = ((at + 0.5) * factor - 0.5 for at in (place.neck, place.face))
                 window = window_at(small, (neck[0], neck[1]), (face[0], face[1]), place.scale * factor)

@@ -69,7 +69,7 @@ def codes_of(features: Floats, colours: Floats, row: int, column: int) -> Codes:
     return np.clip(both, 0, BINS - 1).astype(np.uint8).ravel()
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _scores(codes: Codes, feature: NDArray[np.int32], threshold: Codes, leaves: Floats) -> Any:
     inner = feature.shape[1]
     out = np.zeros(len(codes), np.float32)

@@ -23,6 +23,7 @@ ARM = ("shoulder", "upper_arm", "elbow", "forearm", "wrist")
 APART = 3.0  # cells between the wrists of two modes of an arm
 CERTAIN_MARGIN = 2.0  # a joint is certain when any other place (beyond NEAR cells) costs more
 NEAR = 3.0
+LEAST_ODDS = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +115,13 @@ class PersonDetection:
         neck: Doubles = self._points(self.pose.placement[:1, 1:].astype(np.float64))[0]
         return neck
 
+    @property
+    def place(self) -> Place:
+        """Where the person stands, and how surely."""
+        neck, face = self._points(self.pose.placement[[0, PARTS.index("face")], 1:].astype(np.float64))
+        odds = np.clip(self.confidence, LEAST_ODDS, 1 - LEAST_ODDS)
+        return Place(neck, face, self.scale, float(np.log(odds / (1 - odds))))
+
     @cached_property
     def keypoints(self) -> Keypoints:
         """The best pose: neck, face, belly, hips, shoulders, elbows, wrists; they may lie outside of the image.
@@ -194,7 +202,8 @@ class PersonDetection:
             if not np.isfinite(score):
                 break
             layers = slice(tree.first[wrist], tree.first[wrist + 1])
-            layer = tree.first[wrist] + int((beliefs.up + beliefs.down)[layers, row, column].argmax())
+            total = beliefs.up[layers, row, column] + beliefs.down[layers, row, column]
+            layer = tree.first[wrist] + int(total.argmax())
             modes.append((score, best_placement(tree, beliefs, (wrist, layer, int(column), int(row)))))
         return modes
 

@@ -110,60 +110,52 @@ def score_of(tree: PartTree, unary: Floats, placement: Integers) -> float:
     return total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def transform(scores: Floats, anchor: Floats, spring: Floats, out: Floats) -> None:
     """Set out[y, x] to the maximum over (v, u) of scores[v, u] - sx (u - x - ax)^2 - sy (v - y - ay)^2.
 
-    `scores` and `out` (H, W); `anchor` a and `spring` s (2,), along x and y.
+    `scores` and `out` (H, W); `anchor` a and `spring` s (2,), along x and y. All shifts are tried, whole images at a
+    time: on grids of some thousand cells this is many times faster than the envelope of parabolas.
     """
     height, width = scores.shape
-    longest = max(height, width)
-    line, result = np.empty(longest, np.float32), np.empty(longest, np.float32)
-    peaks, borders = np.empty(longest, np.int64), np.empty(longest + 1, np.float32)
+    turned, moved = np.empty((width, height), np.float32), np.empty((width, height), np.float32)
     for y in range(height):
-        _transform_line(scores[y], width, anchor[0], spring[0], peaks, borders, out[y])
+        for x in range(width):
+            turned[x, y] = scores[y, x]
+    _transform_rows(turned, anchor[0], spring[0], moved)
+    along_x = np.empty((height, width), np.float32)
     for x in range(width):
         for y in range(height):
-            line[y] = out[y, x]
-        _transform_line(line, height, anchor[1], spring[1], peaks, borders, result)
-        for y in range(height):
-            out[y, x] = result[y]
+            along_x[y, x] = moved[x, y]
+    _transform_rows(along_x, anchor[1], spring[1], out)
 
 
-@njit(cache=True)
-def _transform_line(
-    values: Floats, count: int, anchor: float, spring: float, peaks: Integers, borders: Floats, out: Floats
-) -> None:
-    """Upper envelope of the parabolas values[u] - spring (x - u)^2, read at x + anchor."""
-    top = 0
-    peaks[0] = 0
-    borders[0], borders[1] = np.float32(-np.inf), np.float32(np.inf)
-    inverse = np.float32(0.5) / np.float32(spring)
-    for u in range(1, count):
-        while True:
-            v = peaks[top]
-            at = np.float32(0.5) * (u + v) - (values[u] - values[v]) * inverse / (u - v)
-            if at > borders[top] or top == 0:
-                break
-            top -= 1
-        if at <= borders[top]:
-            at = borders[top]
-            peaks[top] = u
-        else:
-            top += 1
-            peaks[top] = u
-            borders[top] = at
-        borders[top + 1] = np.float32(np.inf)
-    k = 0
-    for x in range(count):
-        place = np.float32(x + anchor)
-        while borders[k + 1] < place:
-            k += 1
-        off = place - np.float32(peaks[k])
-        out[x] = values[peaks[k]] - np.float32(spring) * off * off
+@njit(cache=True, nogil=True)
+def _transform_rows(values: Floats, anchor: float, spring: float, out: Floats) -> None:
+    """Set out[y] to the maximum over v of values[v] - spring (v - y - anchor)^2, for whole rows."""
+    height, width = values.shape
+    flat, target = values.reshape(-1), out.reshape(-1)
+    lowest = highest = flat[0]
+    for value in flat:
+        lowest, highest = min(lowest, value), max(highest, value)
+    target[:] = np.float32(-np.inf)
+    # Rows that look into the grid find something for this much there.
+    enough = highest - lowest + np.float32(0.25) * spring
+    for shift in range(1 - height, height):
+        off = anchor - np.float32(shift)
+        cost = np.float32(spring * off * off)
+        begin, end = max(0, -shift), min(height, height - shift)
+        if cost > enough:
+            if anchor < 0:
+                end = min(end, int(np.ceil(-anchor)))
+            else:
+                begin = max(begin, int(np.floor(height - 1 - anchor)) + 1)
+        if begin < end:
+            first = (begin + shift) * width
+            _keep_larger(target[begin * width : end * width], flat[first : first + (end - begin) * width], -cost)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _upward(
     parents: Integers, first: Integers, anchor: Floats, spring: Floats, bias: Floats, up: Floats, message: Floats
 ) -> None:
@@ -176,19 +168,20 @@ def _upward(
         for layer in range(first[part], first[part + 1]):
             transform(up[layer], anchor[layer], spring[layer], moved)
             for type_ in range(first[parent + 1] - first[parent]):
-                _keep_larger(message[part, type_], moved, bias[layer, type_])
+                _keep_larger(message[part, type_].reshape(-1), moved.reshape(-1), bias[layer, type_])
         for type_ in range(first[parent + 1] - first[parent]):
             up[first[parent] + type_] += message[part, type_]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
 def _keep_larger(target: Floats, values: Floats, add: float) -> None:
-    flat, other, more = target.reshape(-1), values.reshape(-1), np.float32(add)
-    for i in range(flat.size):
-        flat[i] = max(flat[i], other[i] + more)
+    more = np.float32(add)
+    for i in range(target.size):
+        value, kept = values[i] + more, target[i]
+        target[i] = value if value > kept else kept
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _downward(
     parents: Integers,
     first: Integers,
@@ -208,11 +201,11 @@ def _downward(
         for layer in range(first[part], first[part + 1]):
             best[:] = NOWHERE
             for type_ in range(count):
-                _keep_larger(best, rest[type_], bias[layer, type_])
+                _keep_larger(best.reshape(-1), rest[type_].reshape(-1), bias[layer, type_])
             transform(best, -anchor[layer], spring[layer], down[layer])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _trace_up(
     start: int,
     parents: Integers,
@@ -246,7 +239,7 @@ def _trace_up(
         part = parent
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _trace_down(
     parents: Integers, first: Integers, anchor: Floats, spring: Floats, bias: Floats, up: Floats, placement: Integers
 ) -> None:

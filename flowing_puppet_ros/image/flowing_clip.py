@@ -12,8 +12,8 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.evidence.hands import HandDetectors
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.carry import Grid
@@ -67,7 +67,7 @@ def given_sights(
     names, mean = model.joint_names, model.mean_joints()
     width = float(np.linalg.norm(mean[names.index("left_shoulder")] - mean[names.index("right_shoulder")]))
     sights = {}
-    with threadpool_limits(1):
+    with one_blas_thread():
         for puppet in result.puppets:
             known = None if puppet.detection is None or given is None else given[puppet.detection]
             found = None if known is None else GivenPerson(known, width * puppet.scale)
@@ -133,7 +133,7 @@ class FlowingClip:
         view: View = "back" if views.count("back") > len(views) / 2 else "front"
         loop = ThesisLoop(self.model, view, self.loop, self.energy)
         starts = [Start(puppet.joints, puppet.scale) for puppet in piece.puppets]
-        with threadpool_limits(1):
+        with one_blas_thread():
             joints, agreed, energy = loop.run(starts, piece.frames)
         for k, puppet in enumerate(piece.puppets):
             shape = self.model.puppet_from_joints(joints[k], puppet.scale, view)

@@ -13,8 +13,8 @@ from typing import Any, Protocol
 
 import cv2
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.pose_answer import Outcome, PosedPuppet, Seen, completed
@@ -93,7 +93,7 @@ class PoseEstimator:
             image = cv2.resize(image, (int(width), int(height)), interpolation=cv2.INTER_AREA)
         colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
         # Sums of several BLAS threads would differ in their last bits.
-        with threadpool_limits(1):
+        with one_blas_thread():
             found = self._found(colour, keypoints, factor)
             posed = [self._pose(colour, one, index, factor) for index, one in enumerate(found)]
         return [one for one in posed if one is not None]

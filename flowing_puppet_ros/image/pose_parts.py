@@ -177,7 +177,7 @@ def _hung(shape: PartShape, row: int, place: Array, angle: Array, scale: Array, 
     return Particles(place - points_of(shape, at_origin, np.array([row]))[:, 0], angle, scale, coefficients)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _pair_costs(
     expected: Array, own: Array, place: Array, hang: Array, top: Array, above: Array, below: Array, scale: Array
 ) -> Array:

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
+from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.image.arm_path import PathSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection
 from flowing_puppet_ros.image.pose_evidence import Likelihood, Window
@@ -84,16 +86,26 @@ def window_of(
     return window.with_torso(torso, head)
 
 
-def sight_of(
-    model: DeformableStructures,
-    likelihood: Likelihood,
-    image: NDArray[np.uint8],
-    puppet: TrackedPuppet,
-    detection: PersonDetection | None,
-) -> Sight:
-    """How a tracked puppet is seen in an image (H, W, 3) or (H, W), where the detector found it so."""
-    colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
-    # Sums of several BLAS threads would differ in their last bits.
-    with threadpool_limits(1):
-        window = window_of(model, likelihood, colour, puppet)
-    return Sight(model, puppet.joints, puppet.scale, puppet.view, detection, window)
+@dataclass(frozen=True, slots=True, eq=False)
+class Eyes:
+    """What sees the arms of people: evidence, and the model of ten parts for which it was learned.
+
+    A puppet with hands and feet has these parts and joints too, and before its others.
+    """
+
+    model: DeformableStructures
+    likelihood: Likelihood
+
+    @classmethod
+    def load(cls, name: str) -> Self:
+        """Eyes for puppets of a body model, "neutral", "female" or "male"."""
+        return cls(DeformableStructures.load(name), PartLikelihood.load())
+
+    def sight(self, image: NDArray[np.uint8], puppet: TrackedPuppet, detection: PersonDetection | None) -> Sight:
+        """How a tracked puppet is seen in an image (H, W, 3) or (H, W), where the detector found it so."""
+        colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+        # Sums of several BLAS threads would differ in their last bits.
+        with one_blas_thread():
+            window = window_of(self.model, self.likelihood, colour, puppet)
+        joints = puppet.joints[: len(self.model.joint_names)]
+        return Sight(self.model, joints, puppet.scale, puppet.view, detection, window)

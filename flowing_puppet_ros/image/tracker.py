@@ -7,7 +7,7 @@ state of a person is the location of the joints, a scale and a view; the puppet 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -131,10 +131,12 @@ class FlowingPuppetTracker:
         stamp_ns: int,
         detections: Sequence[Keypoints] | None = None,
         flow: FlowPair | None = None,
+        looked_for: Collection[str] | None = None,
     ) -> TrackResult:
         """Take the next `image` (H, W, 3) RGB or (H, W) grey, uint8, and say who is where in it.
 
-        `detections` are the people a detector found in this image; None when none ran, empty when it found nobody.
+        `detections` are the people a detector found in this image; None when none ran, empty when it found nobody. Who
+        is not among them is missed, of those with ids in `looked_for` where only some were looked for.
         `flow` is (forward from the previous image, backward to it), each (h, w, 2) in pixels of its own grid of any
         resolution, NaN unknown; computed here when not given. A stamp before the previous one, an image of another size
         and a cut between shots restart the tracker with a warning. InputError for what is no image.
@@ -154,7 +156,7 @@ class FlowingPuppetTracker:
                 self.people, pair, restarted = [], None, True
             else:
                 carriage = carry_people(self.model, self.people, pair, grid, self.settings)
-        self._take(image, detections, warnings)
+        self._take(image, detections, looked_for, warnings)
         self.people = [person for person in self.people if self._lives(person, size)]
         for person in self.people:
             person.settle(self.model)
@@ -192,7 +194,13 @@ class FlowingPuppetTracker:
         assert self._previous is not None
         return self.optical_flow.between(previous.grey, self._previous.grey)
 
-    def _take(self, image: NDArray[np.uint8], detections: Sequence[Keypoints] | None, warnings: list[str]) -> None:
+    def _take(
+        self,
+        image: NDArray[np.uint8],
+        detections: Sequence[Keypoints] | None,
+        looked_for: Collection[str] | None,
+        warnings: list[str],
+    ) -> None:
         """Fuse the detections into the people they belong to and start new people at the rest."""
         for person in self.people:
             person.unseen += 1
@@ -208,7 +216,7 @@ class FlowingPuppetTracker:
         worn = clothes_of(self.model.joint_names, image, [joints for joints, _ in found]) if several else None
         matched, free = associate(self.people, found, self.settings.match_distance, worn)
         for index, person in enumerate(self.people):
-            person.missed += 1
+            person.missed += looked_for is None or person.id in looked_for
             if index in matched:
                 if joint_distance(person, found[matched[index]]) > self.settings.match_distance:
                     person.found_again()

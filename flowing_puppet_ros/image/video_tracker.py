@@ -18,8 +18,7 @@ from flowing_puppet_ros.image.arms import ArmFilter
 from flowing_puppet_ros.image.clip_people import FIRST, ClipPeople, PersonPath
 from flowing_puppet_ros.image.detector import DetectorSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
-from flowing_puppet_ros.image.pose_evidence import Likelihood
-from flowing_puppet_ros.image.sight import ENDS, Sight, sight_of
+from flowing_puppet_ros.image.sight import ENDS, Eyes, Sight
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.image.watch import Watch
 from flowing_puppet_ros.settings import Settings, setting
@@ -63,7 +62,7 @@ class VideoTracker:
 
     tracker: FlowingPuppetTracker
     detector: Detector
-    likelihood: Likelihood
+    eyes: Eyes
     settings: DetectionSettings
     path: PathSettings = field(default_factory=PathSettings)
     images: int = 0
@@ -108,7 +107,7 @@ class VideoTracker:
         result = self._with_arms(result, image, found)
         if searched:
             seen = {puppet.id: puppet.detection for puppet in result.puppets}
-            self._watch.learn({name: found[index] for name, index in seen.items() if index is not None})
+            self._watch.learn({name: found[index].place for name, index in seen.items() if index is not None})
         return result, found
 
     def _tracked(
@@ -166,9 +165,8 @@ class VideoTracker:
         self, image: NDArray[np.uint8], result: TrackResult, found: Sequence[PersonDetection]
     ) -> dict[str, Sight]:
         """How each person of a step is seen in its image, by id; only hypotheses need this, tracking does not."""
-        model, likelihood = self.tracker.model, self.likelihood
         seen = [(puppet, None if puppet.detection is None else found[puppet.detection]) for puppet in result.puppets]
-        return {puppet.id: sight_of(model, likelihood, image, puppet, detection) for puppet, detection in seen}
+        return {puppet.id: self.eyes.sight(image, puppet, detection) for puppet, detection in seen}
 
     def detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
         """The people in an image who are sure enough to be tracked; the surest one may be less sure."""

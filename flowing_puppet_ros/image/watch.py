@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.image.clip_people import ClipPeople
-from flowing_puppet_ros.image.detector_person import PersonDetection, Place
+from flowing_puppet_ros.image.detector_person import Place
 
 SURE_LOOKS = 5  # searches that must have found a person before only their place is looked at
 MEMORY = 20  # searches that are remembered
-LEAST_ODDS = 1e-6
 
 
 @dataclass(slots=True, eq=False)
@@ -30,17 +29,18 @@ class Watch:
         self.searches.keep(MEMORY)
         return [place for path in self.searches.paths() if (place := path.at(number)) is not None]
 
-    def learn(self, found: Mapping[str, PersonDetection]) -> None:
+    def learn(self, found: Mapping[str, Place]) -> None:
         """Remember how large the people of a search are, by id, and how surely; forget whom it did not find.
 
         They are carried by the flow until another search finds them or the tracker gives them up.
         """
-        known = {}
-        for identity, person in found.items():
-            odds = np.clip(person.confidence, LEAST_ODDS, 1 - LEAST_ODDS)
-            looks = self._known[identity][2] + 1 if identity in self._known else 1
-            known[identity] = person.scale, float(np.log(odds / (1 - odds))), looks
-        self._known = known
+        looks = {identity: self._known[identity][2] + 1 if identity in self._known else 1 for identity in found}
+        self._known = {identity: (place.scale, place.log_odds, looks[identity]) for identity, place in found.items()}
+
+    def meet(self, found: Mapping[str, Place]) -> None:
+        """Remember people who are new here as if a search had found them."""
+        for identity, place in found.items():
+            self._known.setdefault(identity, (place.scale, place.log_odds, 1))
 
     def sure(self, people: Iterable[str]) -> bool:
         """Whether some of these people are known, and each of them from enough searches."""

@@ -12,8 +12,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.learn.annotations import Annotations
 from flowing_puppet_ros.learn.detector import RANKED, LearnDetectorSettings, Learned, learn
 from flowing_puppet_ros.learn.detector_data import examples_of
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
         annotations = annotations.without_sources_of(Annotations.load(arguments.leave_out, arguments.media))
     began = time.process_time()
     # Sums of several BLAS threads depend on how many there are; with one the weights are the same everywhere.
-    with threadpool_limits(1):
+    with one_blas_thread():
         examples = examples_of(annotations.frames(settings.every))
         learned = learn(examples, settings, lambda step: print(step, file=sys.stderr))
     path = arguments.out / f"detector_{arguments.name}.npz"

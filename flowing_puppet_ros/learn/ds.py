@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.learn.anny import GENDERS
 from flowing_puppet_ros.learn.ds_fit import COMPONENTS, fit
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     rng = np.random.default_rng(arguments.seed)
     people = People(arguments.gender, arguments.parts, arguments.mocap)
     # The same weights on every machine: sums of several BLAS threads differ in their last bits.
-    with threadpool_limits(1):
+    with one_blas_thread():
         arrays: dict[str, np.ndarray[Any, Any]]
         if several:
             arrays = fit_views(make_view_sets(people, poses, rng), arguments.components)

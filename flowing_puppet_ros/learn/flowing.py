@@ -14,8 +14,8 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.hands import HandDetectors
 from flowing_puppet_ros.evidence.likelihood import PartLikelihood
@@ -85,7 +85,7 @@ def gather(
         sure = [joint for joint in arms if posed.confidence[joint] >= SURE]
         if posed.before is None or not sure:
             continue
-        with threadpool_limits(1):
+        with one_blas_thread():
             found = _of_person(bodies[posed.puppet.view], posed, likelihood, hands, optical_flow, settings, rng)
         if found is None:
             continue

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.evidence.hands import ACROSS, ALONG, CELL_METRES, HandDetectors
 from flowing_puppet_ros.learn.annotations import Annotations
 from flowing_puppet_ros.learn.hands import Boxes, HandSettings, learn
@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     def say(step: str) -> None:
         print(step, file=sys.stderr)
 
-    with threadpool_limits(1):
+    with one_blas_thread():
         learned, boxes = learn(model, lambda: posed_people(annotations, model, settings.every, True), settings, say)
     path = arguments.out / f"hands_{NAME}.npz"
     np.savez_compressed(path, **learned.to_arrays())  # type: ignore[arg-type]

@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.contour import CELL_METRES, LEVELS
 from flowing_puppet_ros.evidence.likelihood import TERMS_OF
@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not people:
         raise InputError(f"{arguments.annotations} has no person whose joints tell a scale; annotate some first")
     # Sums of several BLAS threads depend on how many there are; with one the weights are the same everywhere.
-    with threadpool_limits(1):
+    with one_blas_thread():
         learned = learn(model, people, settings, lambda step: print(step, file=sys.stderr))
     path = arguments.out / f"likelihood_{PARTS}.npz"
     np.savez_compressed(path, **learned.likelihood.to_arrays())  # type: ignore[arg-type]

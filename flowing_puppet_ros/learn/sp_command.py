@@ -8,8 +8,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
+from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.learn.anny import GENDERS
 from flowing_puppet_ros.learn.sp import Learned, LearnSettings, learn
 from flowing_puppet_ros.learn.sp_pose import TREE
@@ -30,7 +30,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = LearnSettings.from_arguments(arguments)
     make_out_folder(arguments.out)
     # Sums of several BLAS threads depend on how many there are; with one the weights are the same everywhere.
-    with threadpool_limits(1):
+    with one_blas_thread():
         learned = learn(arguments.gender, settings, arguments.mocap, lambda step: print(step, file=sys.stderr))
     path = arguments.out / f"sp_{arguments.gender}.npz"
     np.savez_compressed(path, **learned.arrays)  # type: ignore[arg-type]

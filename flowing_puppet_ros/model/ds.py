@@ -37,7 +37,7 @@ class DeformableStructures:
 
     part_joints: joint indices of every part (proximal, distal, then any others). joint_prior: Gaussian of all joints
     (2J,) around their mid-torso. length_pairs (P,2): joints whose distance tells the scale, log_length (P,2): mean and
-    standard deviation of its logarithm in metres.
+    standard deviation of its logarithm in metres. shoulder_width: distance of the mean puppet's shoulders, in metres.
     """
 
     gender: str
@@ -49,6 +49,7 @@ class DeformableStructures:
     log_length: Array
     joint_names: tuple[str, ...] = field(init=False)
     part_joints: tuple[tuple[int, ...], ...] = field(init=False)
+    shoulder_width: float = field(init=False)
     _shape_from_joints: ShapeFromJoints = field(init=False, repr=False)
     _energy: PairwiseEnergy = field(init=False, repr=False)
 
@@ -58,6 +59,8 @@ class DeformableStructures:
         part_joints = tuple(tuple(names.index(joint) for joint in PART_JOINTS[part]) for part in self.tree.names)
         object.__setattr__(self, "joint_names", names)
         object.__setattr__(self, "part_joints", part_joints)
+        right, left = (self.mean_joints()[names.index(f"{side}_shoulder")] for side in ("right", "left"))
+        object.__setattr__(self, "shoulder_width", float(np.linalg.norm(right - left)))
         inference = ShapeFromJoints(self.tree, self.shapes, self.pairwise, part_joints)
         object.__setattr__(self, "_shape_from_joints", inference)
         object.__setattr__(self, "_energy", PairwiseEnergy(self.tree, self.shapes, self.pairwise, part_joints))
@@ -211,12 +214,6 @@ class DeformableStructures:
             weight = certainty * np.where(short > _HUBER, _HUBER / np.maximum(short, _HUBER), 1.0)
             log_scale = (weight * ratio).sum() / weight.sum()
         return float(np.exp(log_scale))
-
-    @property
-    def shoulder_width(self) -> float:
-        """Distance of the shoulders of the mean puppet, in metres."""
-        right, left = (self.mean_joints()[self.joint_names.index(f"{side}_shoulder")] for side in ("right", "left"))
-        return float(np.linalg.norm(right - left))
 
     def estimate_view(self, joints: Array, confidence: Array) -> View:
         """Which side the camera sees: "front" when the person's left shoulder and hip are on the right of the image."""

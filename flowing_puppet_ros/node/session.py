@@ -275,8 +275,8 @@ def _resolved(node: Node, topic: str) -> str:
 
 @cache
 def _background() -> ThreadPoolExecutor:
-    """One thread for the slow work of all components of this process: the workers need the other cores."""
-    return ThreadPoolExecutor(1, thread_name_prefix="background")
+    """Two threads for the slow work of all components of this process, a long one and a short one."""
+    return ThreadPoolExecutor(2, thread_name_prefix="background")
 
 
 def _same(message: Any) -> Any:

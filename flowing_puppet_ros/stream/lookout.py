@@ -2,23 +2,33 @@
 """When the detector looks at an image of a live stream, and what its answer says of a later image.
 
 A look takes longer than an image may wait, so it runs beside the tracking and its answer is used at a fixed age,
-carried there along the flow. When it is used follows from the stamps alone: a replay, where each look is finished at
-once, gives the same puppets as the live node.
+carried there along the flow. Searches of the whole image are rare; glances at the known people are quick and many. When
+an answer is used follows from the stamps alone: a replay, where each look is finished at once, gives the same puppets
+as the live node.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from flowing_puppet_ros.flow.estimate import Flow, FlowPair, OpticalFlow
-from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
-from flowing_puppet_ros.image.keypoints import Keypoints
+from flowing_puppet_ros.flow.estimate import Flow, FlowPair
+from flowing_puppet_ros.image.arm_path import PathSettings
+from flowing_puppet_ros.image.arms import ArmFilter
+from flowing_puppet_ros.image.clip_people import ClipPeople
+from flowing_puppet_ros.image.detector import PartDetector
+from flowing_puppet_ros.image.detector_person import Place
+from flowing_puppet_ros.image.look import Looker, Seen, owners_of
+from flowing_puppet_ros.image.sight import Eyes
+from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
+from flowing_puppet_ros.image.watch import Watch
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.messages import NANOSECONDS
 
@@ -28,8 +38,10 @@ FRAME_NS = NANOSECONDS // 30
 """What is taken to have passed when a stamp does not go on (drivers that stamp nothing)."""
 LONGEST_NS = 10 * NANOSECONDS
 """What is counted at most between two images."""
-COARSE = 4
-"""Flow is kept at this share of its resolution: a keypoint moves with its surroundings, and little memory is taken."""
+BESIDE = 2.0
+"""How much longer a search may take while people are tracked and glanced at beside it."""
+COARSE = 2
+"""Flow is kept at this share of its resolution: a keypoint moves with its surroundings, and less memory is taken."""
 
 
 @dataclass(frozen=True)
@@ -38,142 +50,264 @@ class LookoutSettings(Settings):
 
     detect: bool = setting(True, "find people by itself when nobody publishes detections")
     detect_interval: float = setting(
-        2.0, "time from one look of the detector to the next while somebody is tracked", unit="s", low=0.05, high=3600.0
+        2.0, "time from one search for people to the next while some are surely known", unit="s", low=0.05, high=3600.0
     )
-    search_interval: float = setting(0.7, "the same while nobody is tracked", unit="s", low=0.05, high=3600.0)
+    search_interval: float = setting(
+        0.7, "the same while nobody is known, or not surely yet", unit="s", low=0.05, high=3600.0
+    )
     detect_delay: float = setting(
-        0.6, "age at which the answer of a look is used, carried by the flow; time for the look", unit="s", low=0.0,
+        0.6, "age at which the answer of a search is used; twice that while people are tracked", unit="s", low=0.0,
         high=10.0,
     )  # fmt: skip
+    glance_interval: float = setting(
+        0.2, "time from one glance at the known people to the next, for each of them", unit="s", low=0.0, high=3600.0
+    )
+    glance_delay: float = setting(
+        0.13, "age at which the answer of a glance is used, for each person in it", unit="s", low=0.0, high=10.0
+    )
     least_person: float = setting(0.3, "probability from which a detected person is tracked", low=0.0, high=1.0)
 
 
 @dataclass(slots=True, eq=False)
 class _Look:
-    """An image that is being looked at, when its answer is due, and the flow since then (None: broken off)."""
+    """An image that is being looked at, when its answer is due, and the flow since then (None: broken off).
+
+    `glanced` are the places of a glance by whom they belong to, and of people who are new; empty for a search.
+    """
 
     image: Image
     stamp_ns: int
     due_ns: int
-    found: Future[list[Keypoints]]
+    seen: Future[list[Seen]]
+    glanced: dict[str, Place] = field(default_factory=dict)
     flows: list[Flow] | None = field(default_factory=list)
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Answer:
-    """The people of a look.
-
-    Either carried to the present image, with the `flow` that leads to it, or, when nobody was tracked meanwhile, as
-    they stand in the image `seen_in` (image, stamp) that was looked at.
-    """
-
-    people: list[Keypoints]
-    flow: FlowPair | None = None
-    seen_in: tuple[Image, int] | None = None
+    def note(self, flow: FlowPair | None) -> None:
+        """Take the flow to the next image."""
+        if flow is None:
+            self.flows = None
+        elif self.flows is not None:
+            self.flows.append(_coarse(flow[0]))
 
 
 class Lookout:
-    """Has the detector look at some of the images and tells whom it saw."""
+    """Has the detector look at some of the images that are tracked, and the tracker told whom it saw."""
 
-    def __init__(self, settings: LookoutSettings, most_people: int, optical_flow: OpticalFlow) -> None:
+    def __init__(self, settings: LookoutSettings, tracker: FlowingPuppetTracker, counters: Counter[str]) -> None:
         """Load nothing yet: whoever publishes detections needs no detector."""
-        self._detector: PartDetector | None = None
-        self.adopt(settings, most_people, optical_flow)
+        self._looker: Looker | None = None
+        self._tracker = tracker
+        self._settings = settings
+        self._counters = counters
         self.reset()
 
-    def adopt(self, settings: LookoutSettings, most_people: int, optical_flow: OpticalFlow) -> None:
+    def adopt(self, settings: LookoutSettings) -> None:
         """Go on with these settings."""
-        self._settings, self._most_people, self._optical_flow = settings, most_people, optical_flow
+        self._settings = settings
 
-    def warm_up(self, image: Image) -> None:
+    def warm_up(self, image: Image, puppet: TrackedPuppet) -> None:
         """Load the detector and have it look at an image of no interest, if it will ever look at any."""
         if self._settings.detect:
-            self._detect(image, least_person=0.0)
+            neck, face = (puppet.joints[self._tracker.model.joint_names.index(name)] for name in ("neck", "face"))
+            place = Place(neck, face, puppet.scale * self._tracker.model.shoulder_width, 0.0)
+            arms = {puppet.id: ArmFilter(PathSettings())}
+            self._search(image, self._new_watch(), 0)
+            for _look in range(2):
+                self._glance(image, [place], [puppet], arms)
 
     def reset(self) -> None:
         """Forget the images; the next one is looked at."""
-        self._now_ns = self._next_ns = 0
+        self._now_ns = 0
+        self._searches = 0
         self._previous: tuple[int, Image] | None = None
-        self._look: _Look | None = None
+        self._forget()
 
-    def ask(
-        self, image: Image, stamp_ns: int, tracked: bool, flow: FlowPair | None, beside: Executor | None
-    ) -> Answer | None:
-        """Take the next `image` (H, W, 3) RGB before it is tracked; return the answer of the look that is due with it.
+    def _forget(self) -> None:
+        """Know nobody, and look for people in the next image."""
+        self._watch = self._new_watch()
+        self._arms: dict[str, ArmFilter] = {}
+        self._new: list[Place] = []
+        self._search_look: _Look | None = None
+        self._glance_look: _Look | None = None
+        self._searched_ns: int | None = None
+        self._glanced_ns: int | None = None
 
-        `tracked` is whether anybody is, `flow` the pair that leads to the image when it is known; a look runs on the
-        executor `beside`, or at once.
+    def _new_watch(self) -> Watch:
+        return Watch(ClipPeople(self._settings.least_person, min(self._tracker.settings.most_people, 80), 1))
+
+    def step(self, image: Image, stamp_ns: int, flow: FlowPair | None, beside: Executor | None) -> TrackResult:
+        """Track the next `image` (H, W, 3) RGB, with what the looks saw whose answers are due.
+
+        `flow` is as `FlowingPuppetTracker.step` takes it; a look runs on the executor `beside`, or at once.
         """
+        self._pass_time(image, stamp_ns)
+        search, glance = self._due(self._search_look), self._due(self._glance_look)
+        if search is not None:
+            self._search_look = None
+            self._counters["searches with people"] += bool(search.seen.result())
+        if search is not None and not self._tracker.people:
+            result = self._begun(search, image, stamp_ns)
+        else:
+            result = self._tracked(glance, image, stamp_ns, flow)
+            if search is not None and not result.restarted:
+                self._learn(search, result)
+        self._previous = stamp_ns, image
+        if self._search_look is None:
+            self._search_look = self._next_search(image, stamp_ns, result, beside)
+        if self._glance_look is None:
+            self._glance_look = self._next_glance(image, stamp_ns, result, beside)
+        return result
+
+    def _pass_time(self, image: Image, stamp_ns: int) -> None:
         previous = self._previous
         if previous is not None and (stamp_ns < previous[0] or image.shape != previous[1].shape):
             self.reset()
-            previous = None
-        if previous is not None:
+        elif previous is not None:
             passed = stamp_ns - previous[0]
             self._now_ns += min(passed, LONGEST_NS) if passed > 0 else FRAME_NS
-        answer = None
-        if self._look is not None and self._now_ns >= self._look.due_ns and previous is not None:
-            answer = self._answer(self._look, previous[1], image, tracked, flow)
-            self._look = None
-        if self._look is None and self._now_ns >= self._next_ns:
-            self._look = self._start(image, stamp_ns, beside)
-            interval = self._settings.detect_interval if tracked else self._settings.search_interval
-            self._next_ns = self._now_ns + round(interval * NANOSECONDS)
-        self._previous = stamp_ns, image
-        return answer
 
-    def tracked(self, stamp_ns: int, flow: FlowPair | None) -> None:
-        """Note that the image of this stamp was tracked with this flow from the image before, None: with none."""
-        look = self._look
-        if look is None or look.stamp_ns == stamp_ns or look.flows is None:
-            return
-        if flow is None:
-            look.flows = None
-        else:
-            look.flows.append(_coarse(flow[0]))
+    def _due(self, look: _Look | None) -> _Look | None:
+        return look if look is not None and self._previous is not None and self._now_ns >= look.due_ns else None
 
-    def _start(self, image: Image, stamp_ns: int, beside: Executor | None) -> _Look:
-        found: Future[list[Keypoints]] = Future()
-        if beside is None:
-            found.set_result(self._detect(image))
-        else:
-            found = beside.submit(self._detect, image)
-        return _Look(image, stamp_ns, self._now_ns + round(self._settings.detect_delay * NANOSECONDS), found)
+    def _begun(self, search: _Look, image: Image, stamp_ns: int) -> TrackResult:
+        """Begin tracks in the image that was searched; one long flow leads from there to this one."""
+        self._glance_look, self._arms, warnings = None, {}, []
+        if found := search.seen.result():
+            self._tracker.reset()
+            begun = self._tracker.step(search.image, search.stamp_ns, [person.keypoints for person in found])
+            warnings = begun.warnings
+            self._watch.learn({p.id: found[p.detection].place for p in begun.puppets if p.detection is not None})
+        result = self._noted(self._tracker.step(image, stamp_ns))
+        return replace(result, warnings=[*warnings, *result.warnings])
 
-    def _detect(self, image: Image, least_person: float | None = None) -> list[Keypoints]:
-        # Results may depend on the number of threads otherwise.
-        cv2.setNumThreads(1)
-        if self._detector is None:
-            self._detector = PartDetector.load()
-        least = self._settings.least_person if least_person is None else least_person
-        settings = DetectorSettings(least_confidence=least, most_people=min(self._most_people, 80))
-        return [person.keypoints for person in self._detector.detect(image, settings)]
-
-    def _answer(
-        self, look: _Look, previous: Image, image: Image, tracked: bool, flow: FlowPair | None
-    ) -> Answer | None:
-        people = look.found.result()
-        if not tracked:
-            return Answer(people, seen_in=(look.image, look.stamp_ns)) if people else None
-        if look.flows is None:
-            return None
-        flow = flow or self._optical_flow.at_working_scale(previous, image)
+    def _tracked(self, glance: _Look | None, image: Image, stamp_ns: int, flow: FlowPair | None) -> TrackResult:
+        """Track an image, with the answer of a glance where one is due."""
+        if glance is None or not self._tracker.people or glance.flows is None:
+            if glance is not None:
+                self._glance_look, self._arms = None, {}
+            return self._noted(self._tracker.step(image, stamp_ns, None, flow))
+        assert self._previous is not None
+        self._glance_look = None
+        self._counters["glances"] += 1
+        flow = flow or self._tracker.optical_flow.at_working_scale(self._previous[1], image)
         size = image.shape[1], image.shape[0]
-        return Answer([carried(person, [*look.flows, _coarse(flow[0])], size) for person in people], flow)
+        move = partial(carried, flows=[*glance.flows, _coarse(flow[0])], size=size)
+        # The arms are the glance's until it has ended.
+        seen = [person.moved(move) for person in glance.seen.result()]
+        for arms in self._arms.values():
+            arms.move(partial(carried, flows=glance.flows, size=size, keep=True))
+        keypoints = [person.keypoints for person in seen]
+        result = self._noted(self._tracker.step(image, stamp_ns, keypoints, flow, glance.glanced))
+        if result.restarted:
+            self._tracker.reset()
+            empty = self._tracker.step(image, stamp_ns)
+            return replace(empty, warnings=result.warnings, restarted=True)
+        owned = {puppet.id: seen[puppet.detection] for puppet in result.puppets if puppet.detection is not None}
+        self._watch.meet({identity: person.place for identity, person in owned.items()})
+        arms_seen = {identity: person.arms for identity, person in owned.items() if person.identity == identity}
+        return self._tracker.redirected(result, arms_seen)
+
+    def _noted(self, result: TrackResult) -> TrackResult:
+        """The same result; what is known of the image before is carried to its image."""
+        if result.restarted:
+            # Nobody stands any more where they stood before a cut.
+            self._forget()
+        if self._search_look is not None:
+            self._search_look.note(result.flow)
+        if self._glance_look is not None:
+            self._glance_look.note(result.flow)
+        else:
+            for arms in self._arms.values():
+                arms.carry(result.flow, result.grid)
+        return result
+
+    def _learn(self, search: _Look, result: TrackResult) -> None:
+        """Take the places of a search: those where nobody is tracked are glanced at next."""
+        self._new = []
+        if search.flows is None or result.flow is None:
+            return
+        search.note(result.flow)
+        places = [
+            person.moved(partial(carried, flows=search.flows, size=result.grid.image)).place
+            for person in search.seen.result()
+        ]
+        owners = owners_of(places, result.puppets, self._tracker.model)
+        self._watch.learn({puppet.id: places[index] for index, puppet in owners.items()})
+        self._new = [
+            place
+            for index, place in enumerate(places)
+            if index not in owners and np.isfinite([*place.neck, *place.face]).all()
+        ]
+
+    def _next_search(self, image: Image, stamp_ns: int, result: TrackResult, beside: Executor | None) -> _Look | None:
+        """Begin to search the image that was just tracked, where it is time for it."""
+        settings, people = self._settings, [puppet.id for puppet in result.puppets]
+        interval = settings.detect_interval if self._watch.sure(people) else settings.search_interval
+        if self._searched_ns is not None and self._now_ns - self._searched_ns < _ns(interval):
+            return None
+        self._searched_ns = self._now_ns
+        self._searches += 1
+        look = partial(self._search, image, self._watch, self._searches)
+        delay = settings.detect_delay * (BESIDE if people else 1.0)
+        return _Look(image, stamp_ns, self._now_ns + _ns(delay), _done(look, beside))
+
+    def _next_glance(self, image: Image, stamp_ns: int, result: TrackResult, beside: Executor | None) -> _Look | None:
+        """Begin to glance at the known people of the image that was just tracked, where it is time for it."""
+        joints = {puppet.id: puppet.joints for puppet in result.puppets}
+        glanced = self._watch.places(self._tracker.model.joint_names, joints)
+        glanced |= {f"new {number}": place for number, place in enumerate(self._new)}
+        since = None if self._glanced_ns is None else self._now_ns - self._glanced_ns
+        if not glanced or (since is not None and since < _ns(self._settings.glance_interval * len(glanced))):
+            return None
+        self._new, self._glanced_ns = [], self._now_ns
+        self._arms = {identity: self._arms.get(identity, ArmFilter(PathSettings())) for identity in joints}
+        look = partial(self._glance, image, list(glanced.values()), result.puppets, self._arms)
+        due_ns = self._now_ns + _ns(self._settings.glance_delay * len(glanced))
+        return _Look(image, stamp_ns, due_ns, _done(look, beside), glanced)
+
+    def _search(self, image: Image, watch: Watch, number: int) -> list[Seen]:
+        return self._load().search(image, watch, number)
+
+    def _glance(
+        self, image: Image, places: Sequence[Place], puppets: Sequence[TrackedPuppet], arms: Mapping[str, ArmFilter]
+    ) -> list[Seen]:
+        return self._load().glance(image, places, puppets, arms)
+
+    def _load(self) -> Looker:
+        if self._looker is None:
+            self._looker = Looker(PartDetector.load(), Eyes.load(self._tracker.model.gender))
+        return self._looker
 
 
-def carried(person: Keypoints, flows: Sequence[Flow], size: tuple[int, int]) -> Keypoints:
-    """Return keypoints that moved along forward flows, one image after the other.
+def _ns(seconds: float) -> int:
+    return round(seconds * NANOSECONDS)
+
+
+def _done(look: Callable[[], list[Seen]], beside: Executor | None) -> Future[list[Seen]]:
+    if beside is not None:
+        return beside.submit(look)
+    seen: Future[list[Seen]] = Future()
+    seen.set_result(look())
+    return seen
+
+
+def carried(
+    places: NDArray[np.float64], flows: Sequence[Flow], size: tuple[int, int], keep: bool = False
+) -> NDArray[np.float64]:
+    """Return places (..., 2) px that moved along forward flows, one image after the other.
 
     `flows` are (h, w, 2), displacements as shares of the image's width and height; `size` is (width, height) of the
-    image that the keypoints are in. Where the flow is unknown so is the keypoint.
+    image that the places are in. Where the flow is unknown so is the place, or it is what it was, to `keep` it.
     """
-    places = (person.xy + 0.5) / size
+    if not places.size:
+        return places
+    shares = (places.reshape(-1, 2) + 0.5) / size
     for flow in flows:
-        at = (places * (flow.shape[1], flow.shape[0]) - 0.5).astype(np.float32)
+        at = (shares * (flow.shape[1], flow.shape[0]) - 0.5).astype(np.float32)
         moved = cv2.remap(flow, at[:, None, :], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        places = places + np.where(np.isfinite(at), moved[:, 0], np.nan)
-    return Keypoints(person.names, places * size - 0.5, person.confidence)
+        step = np.where(np.isfinite(at), moved[:, 0], np.nan)
+        shares = shares + (np.nan_to_num(step) if keep else step)
+    return np.asarray(shares * size - 0.5).reshape(places.shape)
 
 
 def _coarse(flow: Flow) -> Flow:

@@ -72,7 +72,7 @@ class PuppetTrackerComponent(Component):
         self._settings = settings
         self._model = DeformableStructures.load(settings.model, settings.parts)
         self._tracker = FlowingPuppetTracker(self._model, settings, settings)
-        self._lookout = Lookout(settings, settings.most_people, self._tracker.optical_flow)
+        self._lookout = Lookout(settings, self._tracker, self.counters)
         self._line = Line()
         self._shelves = {port.name: Shelf() for port in self.inputs if port.optional}
         self._header: Any = None
@@ -89,7 +89,7 @@ class PuppetTrackerComponent(Component):
         messages = warm_up.tracking(self.factory, self._model)
         for port_name, message in messages:
             other.handle(port_name, message)
-        self._lookout.warm_up(decode_image(messages[-1][1]))
+        self._lookout.warm_up(decode_image(messages[-1][1]), warm_up.puppet(self._model))
 
     def reset(self) -> None:
         """Forget the people and everything that waits."""
@@ -106,7 +106,7 @@ class PuppetTrackerComponent(Component):
         if settings.preset != self._settings.preset:
             self._tracker.optical_flow = OpticalFlow(settings)
         self.settings = self._settings = self._tracker.settings = settings
-        self._lookout.adopt(settings, settings.most_people, self._tracker.optical_flow)
+        self._lookout.adopt(settings)
 
     def flush(self) -> Output:
         """Process the images that still wait."""
@@ -156,11 +156,10 @@ class PuppetTrackerComponent(Component):
         image, flow = decode_image(message), self._flow(stamp)
         people = self._detected(stamp)
         if people is None and "detections" not in self._expected and self._settings.detect:
-            people, flow = self._found(image, stamp, flow)
+            result = self._lookout.step(image, stamp, flow, self.background)
         else:
             self._lookout.reset()
-        result = self._tracker.step(image, stamp, people, flow)
-        self._lookout.tracked(stamp, result.flow)
+            result = self._tracker.step(image, stamp, people, flow)
         for warning in result.warnings:
             self._warn(warning)
         earlier, self._header = self._header, message.header
@@ -178,22 +177,6 @@ class PuppetTrackerComponent(Component):
             return None
         self.counters["paired detections"] += 1
         return keypoints_of(detections)
-
-    def _found(
-        self, image: NDArray[np.uint8], stamp: int, flow: FlowPair | None
-    ) -> tuple[list[Keypoints] | None, FlowPair | None]:
-        """The people that the own detector found, None when it says nothing, and the flow to track with."""
-        answer = self._lookout.ask(image, stamp, bool(self._tracker.people), flow, self.background)
-        if answer is None:
-            return None, flow
-        self.counters["looks with people"] += bool(answer.people)
-        if answer.seen_in is None:
-            return answer.people, answer.flow
-        # Nobody was tracked: the tracks begin in the image that was looked at, and one long flow leads from there here.
-        self._tracker.reset()
-        for warning in self._tracker.step(*answer.seen_in, answer.people).warnings:
-            self._warn(warning)
-        return None, None
 
     def _forget(self, stamp: int) -> None:
         """Drop what was for images up to this one; what no image has used is counted."""

@@ -42,7 +42,7 @@ def tracking(factory: MessageFactory, model: DeformableStructures) -> Messages:
     """What a puppet tracker gets: images, and the detection of somebody in each."""
     found: Messages = []
     for image in images(factory):
-        puppets = make_puppets(factory, image.header, model, [_puppet(model)])
+        puppets = make_puppets(factory, image.header, model, [puppet(model)])
         found += [("detections", puppets), ("image", image)]
     return found
 
@@ -50,7 +50,7 @@ def tracking(factory: MessageFactory, model: DeformableStructures) -> Messages:
 def cameras(factory: MessageFactory, names: tuple[str, ...]) -> Messages:
     """What a visual hull gets of calibrated cameras in a circle around a person: all its inputs, several times."""
     model = DeformableStructures.load()
-    puppet = _puppet(model)
+    person = puppet(model)
     labels = np.zeros(SIZE, np.uint8)
     rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
     labels[(((columns - SIZE[1] / 2) / 20) ** 2 + ((rows - SIZE[0] / 2) / 70) ** 2) < 1] = 1
@@ -63,12 +63,12 @@ def cameras(factory: MessageFactory, names: tuple[str, ...]) -> Messages:
             found += [
                 (f"{name}/image", image),
                 (f"{name}/part_labels", make_image(factory, header, labels, "mono8")),
-                (f"{name}/puppets", make_puppets(factory, header, model, [puppet])),
+                (f"{name}/puppets", make_puppets(factory, header, model, [person])),
             ]
     return found
 
 
-def _puppet(model: DeformableStructures) -> TrackedPuppet:
+def puppet(model: DeformableStructures) -> TrackedPuppet:
     """The mean person in the middle of the image."""
     joints = model.mean_joints() * SCALE
     joints += np.array([SIZE[1] / 2, SIZE[0] / 2]) - (joints.min(axis=0) + joints.max(axis=0)) / 2

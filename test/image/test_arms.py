@@ -15,7 +15,7 @@ from flowing_puppet_ros.image.carry import Grid
 from flowing_puppet_ros.image.clip import Clip
 from flowing_puppet_ros.image.detector_person import Place
 from flowing_puppet_ros.image.keypoints import Keypoints
-from flowing_puppet_ros.image.sight import Sight
+from flowing_puppet_ros.image.sight import Eyes, Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.video_tracker import DetectionSettings, VideoTracker
 from test.image.drawn_people import NAMES, CapsuleModel, draw, pose, tracker
@@ -177,8 +177,11 @@ class NoEvidence:
         return np.ones((1, 1))
 
 
+EYES = Eyes(CapsuleModel(), NoEvidence())  # type: ignore[arg-type]
+
+
 def test_a_clip_joins_the_guesses_that_move_with_the_person() -> None:
-    video = VideoTracker(tracker(), Finder(), NoEvidence(), DetectionSettings())  # type: ignore[arg-type]
+    video = VideoTracker(tracker(), Finder(), EYES, DetectionSettings())  # type: ignore[arg-type]
     path = PathSettings()
     clip = Clip(CapsuleModel(), SmoothingSettings(), path)  # type: ignore[arg-type]
     for t in range(9):
@@ -196,7 +199,7 @@ def test_a_clip_joins_the_guesses_that_move_with_the_person() -> None:
 def test_between_runs_of_the_detector_people_are_carried() -> None:
     finder = Finder()
     settings = DetectionSettings(detect_every=4)
-    video = VideoTracker(tracker(), finder, NoEvidence(), settings)  # type: ignore[arg-type]
+    video = VideoTracker(tracker(), finder, EYES, settings)  # type: ignore[arg-type]
     for t in range(6):
         result, found = video.step(draw(pose(0)), t)
         sights = video.sights(draw(pose(0)), result, found)
@@ -207,7 +210,7 @@ def test_between_runs_of_the_detector_people_are_carried() -> None:
 
 def test_live_arms_follow_the_guesses_that_move_with_the_person() -> None:
     finder = Finder()
-    video = VideoTracker(tracker(), finder, NoEvidence(), DetectionSettings())  # type: ignore[arg-type]
+    video = VideoTracker(tracker(), finder, EYES, DetectionSettings())  # type: ignore[arg-type]
     wrist = NAMES.index("left_wrist")
     for t in range(9):
         result, _ = video.step(draw(pose(t)), t)
@@ -217,7 +220,7 @@ def test_live_arms_follow_the_guesses_that_move_with_the_person() -> None:
 def test_live_only_the_place_of_a_known_person_is_looked_at_between_searches() -> None:
     finder = Finder()
     settings = DetectionSettings(renew_every=5)
-    video = VideoTracker(tracker(), finder, NoEvidence(), settings)  # type: ignore[arg-type]
+    video = VideoTracker(tracker(), finder, EYES, settings)  # type: ignore[arg-type]
     searches = []
     for t in range(11):
         video.step(draw(pose(t)), t)
@@ -227,7 +230,7 @@ def test_live_only_the_place_of_a_known_person_is_looked_at_between_searches() -
 
 def test_live_a_cut_makes_it_search_anew_and_nobody_is_left_behind() -> None:
     finder = Finder()
-    video = VideoTracker(tracker(), finder, NoEvidence(), DetectionSettings())  # type: ignore[arg-type]
+    video = VideoTracker(tracker(), finder, EYES, DetectionSettings())  # type: ignore[arg-type]
     for t in range(8):
         before, _ = video.step(draw(pose(t)), t)
     assert finder.searches == 5
