@@ -219,7 +219,6 @@ def _trace_up(
     placement: Integers,
 ) -> None:
     """Place the ancestors of a placed part, each the best given its placed child."""
-    height, width = up.shape[1:]
     part = start
     while parents[part] >= 0:
         parent = parents[part]
@@ -227,15 +226,12 @@ def _trace_up(
         best = np.float32(-np.inf)
         for type_ in range(first[parent + 1] - first[parent]):
             above = first[parent] + type_
-            for v in range(height):
-                dy = np.float32(y - v) - anchor[layer, 1]
-                for u in range(width):
-                    dx = np.float32(x - u) - anchor[layer, 0]
-                    score = up[above, v, u] + down[above, v, u] - message[part, type_, v, u] + bias[layer, type_]
-                    score -= spring[layer, 0] * dx * dx + spring[layer, 1] * dy * dy
-                    if score > best:
-                        best = score
-                        placement[parent, 0], placement[parent, 1], placement[parent, 2] = above, u, v
+            rest = up[above] + down[above] - message[part, type_]
+            found, v, u = _best_cell(rest, x - anchor[layer, 0], y - anchor[layer, 1], spring[layer])
+            found += bias[layer, type_]
+            if found > best:
+                best = found
+                placement[parent, 0], placement[parent, 1], placement[parent, 2] = above, u, v
         part = parent
 
 
@@ -244,7 +240,6 @@ def _trace_down(
     parents: Integers, first: Integers, anchor: Floats, spring: Floats, bias: Floats, up: Floats, placement: Integers
 ) -> None:
     """Place every part that has no place yet, the best given its parent."""
-    height, width = up.shape[1:]
     for part in range(1, len(parents)):
         if placement[part, 0] >= 0:
             continue
@@ -253,12 +248,30 @@ def _trace_down(
         type_ = above - first[parent]
         best = np.float32(-np.inf)
         for layer in range(first[part], first[part + 1]):
-            for v in range(height):
-                dy = np.float32(v - y) - anchor[layer, 1]
-                for u in range(width):
-                    dx = np.float32(u - x) - anchor[layer, 0]
-                    score = up[layer, v, u] + bias[layer, type_]
-                    score -= spring[layer, 0] * dx * dx + spring[layer, 1] * dy * dy
-                    if score > best:
-                        best = score
-                        placement[part, 0], placement[part, 1], placement[part, 2] = layer, u, v
+            found, v, u = _best_cell(up[layer], x + anchor[layer, 0], y + anchor[layer, 1], spring[layer])
+            found += bias[layer, type_]
+            if found > best:
+                best = found
+                placement[part, 0], placement[part, 1], placement[part, 2] = layer, u, v
+
+
+@njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})
+def _best_cell(scores: Floats, x: float, y: float, spring: Floats) -> tuple[np.float32, int, int]:
+    """The best of scores[v, u] - sx (u - x)^2 - sy (v - y)^2, and its v and u."""
+    height, width = scores.shape
+    line, along = np.empty(width, np.float32), np.empty(width, np.float32)
+    for u in range(width):
+        off = np.float32(u) - np.float32(x)
+        along[u] = spring[0] * off * off
+    best, best_v, best_u = np.float32(-np.inf), 0, 0
+    for v in range(height):
+        off = np.float32(v) - np.float32(y)
+        less = spring[1] * off * off
+        row = scores[v]
+        highest = np.float32(-np.inf)
+        for u in range(width):
+            line[u] = row[u] - along[u] - less
+            highest = line[u] if line[u] > highest else highest
+        if highest > best:
+            best, best_v, best_u = highest, v, int(np.argmax(line))
+    return best, best_v, best_u

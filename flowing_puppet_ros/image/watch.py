@@ -42,6 +42,10 @@ class Watch:
         for identity, place in found.items():
             self._known.setdefault(identity, (place.scale, place.log_odds, 1))
 
+    def known(self, people: Iterable[str]) -> bool:
+        """Whether one of these people is known."""
+        return any(identity in self._known for identity in people)
+
     def sure(self, people: Iterable[str]) -> bool:
         """Whether some of these people are known, and each of them from enough searches."""
         looks = [self._known[identity][2] for identity in people if identity in self._known]

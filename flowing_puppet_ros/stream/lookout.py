@@ -50,10 +50,10 @@ class LookoutSettings(Settings):
 
     detect: bool = setting(True, "find people by itself when nobody publishes detections")
     detect_interval: float = setting(
-        2.0, "time from one search for people to the next while some are surely known", unit="s", low=0.05, high=3600.0
+        2.0, "time from one search for people to the next while some are known", unit="s", low=0.05, high=3600.0
     )
     search_interval: float = setting(
-        0.7, "the same while nobody is known, or not surely yet", unit="s", low=0.05, high=3600.0
+        0.7, "the same while nobody is known", unit="s", low=0.05, high=3600.0
     )
     detect_delay: float = setting(
         0.6, "age at which the answer of a search is used; twice that while people are tracked", unit="s", low=0.0,
@@ -242,7 +242,8 @@ class Lookout:
     def _next_search(self, image: Image, stamp_ns: int, result: TrackResult, beside: Executor | None) -> _Look | None:
         """Begin to search the image that was just tracked, where it is time for it."""
         settings, people = self._settings, [puppet.id for puppet in result.puppets]
-        interval = settings.detect_interval if self._watch.sure(people) else settings.search_interval
+        known = self._watch.known(people)
+        interval = settings.detect_interval if known else settings.search_interval
         if self._searched_ns is not None and self._now_ns - self._searched_ns < _ns(interval):
             return None
         self._searched_ns = self._now_ns

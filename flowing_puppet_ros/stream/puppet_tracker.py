@@ -39,6 +39,7 @@ class PuppetTrackerSettings(TrackerSettings, FlowSettings, LookoutSettings, Huma
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     parts: int = setting(14, "parts of the puppet: 10, or 14 with hands and feet", low=10, high=14)
     wait: int = setting(1, "newer images that may come before an image goes on without its detection", low=0, high=50)
+    max_side: int = setting(400, "longest image side the flow is computed at", unit="px", low=32, high=8192)
     overlay_side: int = setting(960, "longest side of the overlay", unit="px", low=64, high=8192)
 
 

@@ -65,6 +65,11 @@ class Guesser:
     def keypoints(self) -> Keypoints:
         return Keypoints(NAMES, self.joints, np.full(len(self.joints), self.confidence))
 
+    @property
+    def place(self) -> Place:
+        neck, face = (self.joints[NAMES.index(name)] for name in ("neck", "face"))
+        return Place(neck, face, self.scale, 2.0)
+
     def arms(self, side: str, count: int) -> np.ndarray:
         return self.guesses[side][:count]
 

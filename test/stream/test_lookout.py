@@ -107,7 +107,7 @@ def neck_of(result: TrackResult) -> np.ndarray:
 
 
 def test_tracks_begin_in_the_image_that_was_searched_and_glances_follow() -> None:
-    lookout, looker = watching(detect_delay=0.25, glance_interval=0.3, glance_delay=0.15, detect_interval=2.0)
+    lookout, looker = watching(detect_delay=0.25, glance_interval=0.3, glance_delay=0.15, detect_interval=0.7)
     results = [lookout.step(image(number), number * TENTH, None, None) for number in range(12)]
     assert [len(result.puppets) for result in results] == [0] * 3 + [1] * 9
     assert looker.searched == [0, 7] and [number for number, _ in looker.glanced] == [3, 6, 9]
