@@ -6,6 +6,7 @@ A row whose name begins with `init-` starts from given keypoints instead of the 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -26,6 +27,7 @@ from flowing_puppet_ros.image.flowing import LoopSettings
 from flowing_puppet_ros.image.flowing_clip import FlowingClip, given_sights
 from flowing_puppet_ros.image.flowing_energy import EnergySettings
 from flowing_puppet_ros.image.keypoints import Keypoints, joints_from_keypoints
+from flowing_puppet_ros.image.look import Looker
 from flowing_puppet_ros.image.people import TrackerSettings
 from flowing_puppet_ros.image.sight import Eyes, Sight
 from flowing_puppet_ros.image.smoothing import SmoothingSettings
@@ -33,6 +35,7 @@ from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet
 from flowing_puppet_ros.image.video import Frame
 from flowing_puppet_ros.image.video_tracker import DetectionSettings, Detector, VideoTracker
 from flowing_puppet_ros.model.ds import DeformableStructures
+from flowing_puppet_ros.stream.lookout import FRAME_NS, Lookout, LookoutSettings
 
 type Floats = NDArray[np.float64]
 
@@ -166,6 +169,22 @@ def _live(run: ClipRun) -> Track:
     return [_located(result.puppets) for result, _ in _steps(run, whole=False)]
 
 
+def _node(run: ClipRun) -> Track:
+    """What the tracker's node says at 30 Hz of somebody who has been there for some time.
+
+    The clip is shown forth, back and forth again; the last time counts.
+    """
+    if run.given is not None:
+        return _live(run)
+    settings = replace(run.settings.flow, preset="fast")
+    tracker = FlowingPuppetTracker(run.model, run.settings.tracker, settings)
+    looker = Looker(run.detector, Eyes(run.model, run.likelihood), run.settings.path)
+    lookout = Lookout(LookoutSettings(), tracker, Counter(), looker)
+    shown = [*run.frames, *run.frames[::-1], *run.frames]
+    results = [lookout.step(frame.image, number * FRAME_NS, None, None) for number, frame in enumerate(shown)]
+    return [_located(result.puppets) for result in results[-len(run.frames) :]]
+
+
 def _whole(run: ClipRun, still: bool = False) -> Track:
     clip = Clip(run.model, run.settings.smoothing, run.settings.path)
     for result, sights in _steps(run, still):
@@ -206,6 +225,7 @@ def _located(puppets: Sequence[TrackedPuppet]) -> list[Located]:
 
 METHODS: Mapping[str, Callable[[ClipRun], Track]] = {
     "detector": _alone,
+    "node": _node,
     "live": _live,
     "default-still": lambda run: _whole(run, still=True),
     "default-noflow": _unflowed,

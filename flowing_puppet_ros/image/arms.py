@@ -93,6 +93,7 @@ class ArmFilter:
 
     settings: PathSettings
     _arms: dict[str, ArmHypotheses] = field(default_factory=dict)
+    _images: int = 0
 
     def carry(self, flow: FlowPair | None, grid: Grid) -> None:
         """Go on to the next image, whether anybody looks there or not.
@@ -102,10 +103,11 @@ class ArmFilter:
         if flow is None:
             self._arms.clear()
         else:
-            self.move(lambda places: places + _motion(flow, grid, places))
+            self.move(lambda places: places + _motion(flow, grid, places), 1)
 
-    def move(self, moved: Callable[[Floats], Floats]) -> None:
-        """Go on to another image, to which `moved` takes places (K, 2, 2) px of this one."""
+    def move(self, moved: Callable[[Floats], Floats], images: int) -> None:
+        """Go `images` on, where `moved` takes places (K, 2, 2) px of this image."""
+        self._images += images
         self._arms = {side: replace(arm, places=moved(arm.places)) for side, arm in self._arms.items()}
 
     def step(self, sight: Sight) -> dict[str, tuple[Floats, Floats]]:
@@ -113,16 +115,19 @@ class ArmFilter:
 
         NaN where nobody was detected.
         """
-        return {side: self._side(side, sight) for side in SIDES}
+        # What the flow errs adds up from image to image.
+        settings = replace(self.settings, flow_strength=self.settings.flow_strength / max(1, self._images))
+        self._images = 0
+        return {side: self._side(side, sight, settings) for side in SIDES}
 
-    def _side(self, side: str, sight: Sight) -> tuple[Floats, Floats]:
-        before, places = self._arms.get(side), sight.hypotheses(side, self.settings.modes)
+    def _side(self, side: str, sight: Sight, settings: PathSettings) -> tuple[Floats, Floats]:
+        before, places = self._arms.get(side), sight.hypotheses(side, settings.modes)
         if before is not None:
             places = np.concatenate([places, _distinct(before, sight.width)])
-        score = own = sight.judged(side, places, self.settings)
+        score = own = sight.judged(side, places, settings)
         if before is not None:
             now = ArmHypotheses(places, own, np.zeros_like(places))
-            score = own + (before.score[:, None] - step_costs(before, now, sight.width, self.settings)).max(axis=0)
+            score = own + (before.score[:, None] - step_costs(before, now, sight.width, settings)).max(axis=0)
         arm = ArmHypotheses(places, score - score.max(), np.zeros_like(places))
         self._arms[side] = arm
         best = int(score.argmax())

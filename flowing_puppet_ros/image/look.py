@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.image.arm_path import PathSettings
 from flowing_puppet_ros.image.arms import ArmFilter
-from flowing_puppet_ros.image.detector import PartDetector
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.sight import ENDS, Eyes
 from flowing_puppet_ros.image.tracker import TrackedPuppet
+from flowing_puppet_ros.image.video_tracker import Detector
 from flowing_puppet_ros.image.watch import Watch
 from flowing_puppet_ros.model.ds import DeformableStructures
 
@@ -60,7 +60,7 @@ class Seen:
 class Looker:
     """The detector, and what judges the arms of the people that it finds."""
 
-    detector: PartDetector
+    detector: Detector
     eyes: Eyes
     path: PathSettings = field(default_factory=PathSettings)
 

@@ -52,9 +52,7 @@ class LookoutSettings(Settings):
     detect_interval: float = setting(
         2.0, "time from one search for people to the next while some are known", unit="s", low=0.05, high=3600.0
     )
-    search_interval: float = setting(
-        0.7, "the same while nobody is known", unit="s", low=0.05, high=3600.0
-    )
+    search_interval: float = setting(0.7, "the same while nobody is known", unit="s", low=0.05, high=3600.0)
     detect_delay: float = setting(
         0.6, "age at which the answer of a search is used; twice that while people are tracked", unit="s", low=0.0,
         high=10.0,
@@ -93,9 +91,15 @@ class _Look:
 class Lookout:
     """Has the detector look at some of the images that are tracked, and the tracker told whom it saw."""
 
-    def __init__(self, settings: LookoutSettings, tracker: FlowingPuppetTracker, counters: Counter[str]) -> None:
-        """Load nothing yet: whoever publishes detections needs no detector."""
-        self._looker: Looker | None = None
+    def __init__(
+        self,
+        settings: LookoutSettings,
+        tracker: FlowingPuppetTracker,
+        counters: Counter[str],
+        looker: Looker | None = None,
+    ) -> None:
+        """Without a `looker` load none yet: whoever publishes detections needs no detector."""
+        self._looker = looker
         self._tracker = tracker
         self._settings = settings
         self._counters = counters
@@ -195,7 +199,7 @@ class Lookout:
         # The arms are the glance's until it has ended.
         seen = [person.moved(move) for person in glance.seen.result()]
         for arms in self._arms.values():
-            arms.move(partial(carried, flows=glance.flows, size=size, keep=True))
+            arms.move(partial(carried, flows=glance.flows, size=size, keep=True), len(glance.flows))
         keypoints = [person.keypoints for person in seen]
         result = self._noted(self._tracker.step(image, stamp_ns, keypoints, flow, glance.glanced))
         if result.restarted:

@@ -95,10 +95,8 @@ MODEL = DeformableStructures.load()
 
 
 def watching(**settings: Any) -> tuple[Lookout, TrueLooker]:
-    lookout = Lookout(LookoutSettings(**settings), FlowingPuppetTracker(MODEL), Counter())
     looker = TrueLooker()
-    lookout._looker = looker  # type: ignore[assignment]
-    return lookout, looker
+    return Lookout(LookoutSettings(**settings), FlowingPuppetTracker(MODEL), Counter(), looker), looker  # type: ignore[arg-type]
 
 
 def neck_of(result: TrackResult) -> np.ndarray:
