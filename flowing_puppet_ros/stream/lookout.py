@@ -38,7 +38,7 @@ FRAME_NS = NANOSECONDS // 30
 """What is taken to have passed when a stamp does not go on (drivers that stamp nothing)."""
 LONGEST_NS = 10 * NANOSECONDS
 """What is counted at most between two images."""
-BESIDE = 2.0
+BESIDE = 3.0
 """How much longer a search may take while people are tracked and glanced at beside it."""
 COARSE = 2
 """Flow is kept at this share of its resolution: a keypoint moves with its surroundings, and less memory is taken."""
@@ -54,7 +54,7 @@ class LookoutSettings(Settings):
     )
     search_interval: float = setting(0.7, "the same while nobody is known", unit="s", low=0.05, high=3600.0)
     detect_delay: float = setting(
-        0.6, "age at which the answer of a search is used; twice that while people are tracked", unit="s", low=0.0,
+        0.4, "age at which the answer of a search is used; thrice that while people are tracked", unit="s", low=0.0,
         high=10.0,
     )  # fmt: skip
     glance_interval: float = setting(
