@@ -47,6 +47,7 @@ class DetectorSettings(Settings):
     largest_side: int = setting(720, "images are shrunk to this longer side", unit="px", low=64, high=4096)
     places: int = setting(12, "places where a pose is sought", low=1, high=80)
     most_people: int = setting(8, "people to report", low=1, high=80)
+    mirrored: bool = setting(True, "look at the mirror image too: more is found, and it takes twice as long")
     least_confidence: float = setting(0.03, "probability below which nobody is reported", low=0.0, high=1.0)
 
 
@@ -148,6 +149,10 @@ class PartDetector:
     ) -> list[PersonDetection]:
         """The people in an image that is `factor` times as large as the given one."""
         poses = self.look(image, smallest, settings.places)
+        mirror = np.ascontiguousarray(image[:, ::-1]) if settings.mirrored else None
+        if mirror is not None:
+            width = image.shape[1]
+            poses += [pose.mirrored(width) for pose in self.look(mirror, smallest, settings.places)]
         scores = self.ranking.scores(poses)
         people: list[PersonDetection] = []
         for index in best_places(poses, scores):
@@ -155,13 +160,43 @@ class PartDetector:
             if confidence < settings.least_confidence or len(people) == settings.most_people:
                 break
             pose = poses[index]
-            scale = self.ranking.corrected_scale(pose, agreed_scale(poses, scores, index))
+            scale = self._scale(poses, scores, index)
             places = dict(zip(PARTS, pose.points, strict=True))
-            again = self.pose_in(window_at(image, tuple(places["neck"]), tuple(places["face"]), scale), pose.measures)
+            again = self._again(image, mirror, places["neck"], places["face"], scale, pose.measures)
             # At another scale the neck may have moved onto that of a person who is known already.
             if all(apart(again, other.pose) >= SAME_PLACE for other in people):
                 people.append(PersonDetection(self.parts, again, confidence, factor))
         return people
+
+    def _scale(self, poses: Sequence[FoundPose], scores: Doubles, index: int) -> float:
+        """S of the person of a pose: the mean, of logarithms, over the image and its mirror image."""
+        logs = []
+        for turned in {pose.window.mirror for pose in poses}:
+            own = [k for k, pose in enumerate(poses) if pose.window.mirror == turned]
+            near = [n for n, k in enumerate(own) if apart(poses[k], poses[index]) < SAME_PLACE]
+            if near:
+                best = max(near, key=lambda n: scores[own[n]])
+                agreed = agreed_scale([poses[k] for k in own], scores[own], best)
+                logs.append(np.log(self.ranking.corrected_scale(poses[own[best]], agreed)))
+        return float(np.exp(np.mean(logs)))
+
+    def _again(
+        self,
+        image: NDArray[np.uint8],
+        mirror: NDArray[np.uint8] | None,
+        neck: Doubles,
+        face: Doubles,
+        scale: float,
+        measures: Doubles,
+    ) -> FoundPose:
+        """The best pose at a neck and a face (2,) px, in the image or in its mirror image."""
+        pose = self.pose_in(window_at(image, (neck[0], neck[1]), (face[0], face[1]), scale), measures)
+        if mirror is None:
+            return pose
+        width = image.shape[1]
+        window = window_at(mirror, (width - 1 - neck[0], neck[1]), (width - 1 - face[0], face[1]), scale)
+        other = self.pose_in(window, measures).mirrored(width)
+        return other if other.score > pose.score else pose
 
     def look(self, image: NDArray[np.uint8], smallest: float, places: int) -> list[FoundPose]:
         """The best pose in each of the most promising places, in no order of quality."""

@@ -46,11 +46,15 @@ PARENTS = (-1, 0, 0, 2, 2, 0, 5, 6, 7, 8, 0, 10, 11, 12, 13)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Window:
-    """`features` (ROWS, COLUMNS, 36) around a neck; cell (x, y) has its centre at `origin` + `cell` * (x, y) px."""
+    """`features` (ROWS, COLUMNS, 36) around a neck; cell (x, y) has its centre at `origin` + `cell` * (x, y) px.
+
+    `mirror` is the image's width where that place is one of its mirror image.
+    """
 
     features: Floats
     origin: tuple[float, float]
     cell: float
+    mirror: int | None = None
 
     @property
     def outside(self) -> float:
@@ -59,13 +63,19 @@ class Window:
 
     def cells_of(self, points: Doubles) -> Doubles:
         """Grid coordinates (..., 2) of image points (..., 2)."""
-        cells: Doubles = (np.asarray(points, np.float64) - self.origin) / self.cell
+        cells: Doubles = (self._turned(np.asarray(points, np.float64)) - self.origin) / self.cell
         return cells
 
     def points_of(self, cells: Doubles) -> Doubles:
         """Image points (..., 2) of grid coordinates (..., 2)."""
         points: Doubles = np.asarray(cells, np.float64) * self.cell + self.origin
-        return points
+        return self._turned(points)
+
+    def _turned(self, points: Doubles) -> Doubles:
+        """Points (..., 2) of the image in its mirror image, or the other way round, if that was looked at."""
+        if self.mirror is None:
+            return points
+        return np.stack([self.mirror - 1 - points[..., 0], points[..., 1]], axis=-1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

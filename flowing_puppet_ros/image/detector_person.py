@@ -24,6 +24,7 @@ APART = 3.0  # cells between the wrists of two modes of an arm
 CERTAIN_MARGIN = 2.0  # a joint is certain when any other place (beyond NEAR cells) costs more
 NEAR = 3.0
 LEAST_ODDS = 1e-6
+OTHER_SIDE = {"left": "right", "right": "left"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,6 +46,10 @@ class FoundPose:
         """Score of the pose in its window, in units of the margin."""
         layer, x, y = self.placement[0]
         return float(self.beliefs.up[layer, y, x])
+
+    def mirrored(self, width: int) -> FoundPose:
+        """The pose in an image of `width` px in whose mirror image it was found; its parts' sides stay swapped."""
+        return replace(self, window=replace(self.window, mirror=width))
 
     @property
     def points(self) -> Doubles:
@@ -115,6 +120,13 @@ class PersonDetection:
         neck: Doubles = self._points(self.pose.placement[:1, 1:].astype(np.float64))[0]
         return neck
 
+    def _part(self, name: str) -> int:
+        """The part of that name; in a mirror image left and right are swapped."""
+        side, _, rest = name.partition("_")
+        if self.pose.window.mirror is not None and side in OTHER_SIDE:
+            name = f"{OTHER_SIDE[side]}_{rest}"
+        return PARTS.index(name)
+
     @property
     def place(self) -> Place:
         """Where the person stands, and how surely."""
@@ -140,7 +152,7 @@ class PersonDetection:
 
         In units of the margin: one part clearly misplaced costs about 1. Outside of the window the border's score.
         """
-        score = self._maps[PARTS.index(joint)]
+        score = self._maps[self._part(joint)]
         cells = self.pose.window.cells_of((np.asarray(xy, np.float64) + 0.5) * self.factor - 0.5)
         limited = np.clip(np.nan_to_num(cells), 0, np.array(score.shape[::-1]) - 1).astype(np.float32)
         at = np.ascontiguousarray(limited.reshape(-1, 1, 2))
@@ -161,14 +173,14 @@ class PersonDetection:
         for score, i, j in pairs[:count]:
             placement = self.pose.placement.copy()
             for side, mode in (("right", arms[0][i][1]), ("left", arms[1][j][1])):
-                rows = _arm_rows(side)
+                rows = [self._part(f"{side}_{part}") for part in ARM]
                 placement[rows] = mode[rows]
             found.append((self._keypoints(self._refined(placement)), score))
         return found
 
     def arms(self, side: str, count: int) -> Doubles:
         """Elbow and wrist (K, 2, 2) px of up to `count` poses of the arm of a side, best first."""
-        rows = [PARTS.index(f"{side}_{joint}") for joint in ("elbow", "wrist")]
+        rows = [self._part(f"{side}_{joint}") for joint in ("elbow", "wrist")]
         placements = np.array([placement for _, placement in self._arm_modes(side, count)])
         return self._points(self._refined(placements)[:, rows])
 
@@ -190,7 +202,7 @@ class PersonDetection:
         """Peaks of one wrist's map with the best placement (P, 3) for each; the first is that of the best pose."""
         tree, beliefs = self.filters.tree, self._both_ways
         assert beliefs.down is not None
-        wrist = PARTS.index(f"{side}_wrist")
+        wrist = self._part(f"{side}_wrist")
         left = self._maps[wrist].copy()
         y, x = np.indices(left.shape)
         modes = [(0.0, self.pose.placement)]
@@ -230,7 +242,7 @@ class PersonDetection:
 
     def _keypoints(self, cells: Doubles) -> Keypoints:
         points = self._points(cells)
-        chosen = [PARTS.index(name) for name in JOINTS]
+        chosen = [self._part(name) for name in JOINTS]
         confidence = [self.confidence * self._certainty(part, cells[part]) for part in chosen]
         return Keypoints(JOINTS, points[chosen], np.array(confidence))
 
@@ -241,10 +253,6 @@ class PersonDetection:
         far = np.hypot(x - at[0], y - at[1]) > NEAR
         margin = -float(score[far].max())
         return float(np.clip(0.5 + 0.5 * margin / CERTAIN_MARGIN, 0.5, 1.0))
-
-
-def _arm_rows(side: str) -> list[int]:
-    return [PARTS.index(f"{side}_{part}") for part in ARM]
 
 
 def _peak(low: Doubles, middle: Doubles, high: Doubles) -> Doubles:

@@ -171,5 +171,6 @@ class VideoTracker:
     def detect(self, image: NDArray[np.uint8]) -> list[PersonDetection]:
         """The people in an image who are sure enough to be tracked; the surest one may be less sure."""
         people, least = min(self.tracker.settings.most_people, 80), self.settings.least_person
-        found = self.detector.detect(image, DetectorSettings(least_confidence=FIRST * least, most_people=people))
+        settings = DetectorSettings(least_confidence=FIRST * least, most_people=people, mirrored=False)
+        found = self.detector.detect(image, settings)
         return [person for turn, person in enumerate(found) if turn == 0 or person.confidence >= least]
