@@ -93,6 +93,24 @@ def test_same_picture_same_people(detector: PartDetector) -> None:
     assert [p.keypoints.xy.tobytes() for p in one] == [p.keypoints.xy.tobytes() for p in two]
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_in_the_mirror_image_the_same_person_is_found_with_the_sides_swapped(detector: PartDetector, seed: int) -> None:
+    image, _, _ = painted.picture(np.random.default_rng(seed), 40.0)
+    person, mirrored = (detector.detect(np.ascontiguousarray(pixels), ANYBODY)[0] for pixels in (image, image[:, ::-1]))
+    swapped = [name.replace("left", "*").replace("right", "left").replace("*", "right") for name in JOINTS]
+    joints = mirrored.keypoints.xy[[JOINTS.index(name) for name in swapped]]
+    joints[:, 0] = image.shape[1] - 1 - joints[:, 0]
+    np.testing.assert_allclose(joints, person.keypoints.xy, atol=0.5)
+    assert person.pose.window.mirror != mirrored.pose.window.mirror
+    for side, other in (("left", "right"), ("right", "left")):
+        arms, turned = person.arms(side, 3), mirrored.arms(other, 3)
+        turned[..., 0] = image.shape[1] - 1 - turned[..., 0]
+        np.testing.assert_allclose(turned, arms, atol=0.5)
+        wrists = arms[:, 1]
+        score = mirrored.joint_score(f"{other}_wrist", wrists * (-1, 1) + (image.shape[1] - 1, 0))
+        np.testing.assert_allclose(score, person.joint_score(f"{side}_wrist", wrists), atol=0.05)
+
+
 def test_people_are_reported_once_and_surest_first(detector: PartDetector) -> None:
     people = detector.detect(painted.picture(np.random.default_rng(5))[0], ANYBODY)
     assert [p.confidence for p in people] == sorted((p.confidence for p in people), reverse=True)
