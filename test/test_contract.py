@@ -18,7 +18,7 @@ ROOT = PACKAGE.parent
 NAME = PACKAGE.name
 MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
-FOUNDATION = {"errors", "settings"}
+FOUNDATION = {"blas", "errors", "settings"}
 OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "rerun"}
 OPTIONAL = {"learn": "learn", "cli.cluster": "cluster", "view.rerun_file": "rerun"}
 """Where what a requirements file other than runtime.txt lists may be imported."""
