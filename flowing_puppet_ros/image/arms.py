@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arm_path import ArmHypotheses, PathSettings, best_path, step_costs
 from flowing_puppet_ros.image.carry import Grid
-from flowing_puppet_ros.image.sight import Sight
+from flowing_puppet_ros.image.sight import ENDS, Sight
 from flowing_puppet_ros.image.smoothing import joint_motion, sampled
 
 type Floats = NDArray[np.float64]
@@ -119,6 +119,15 @@ class ArmFilter:
         settings = replace(self.settings, flow_strength=self.settings.flow_strength / max(1, self._images))
         self._images = 0
         return {side: self._side(side, sight, settings) for side in SIDES}
+
+    def joints(self, sight: Sight) -> dict[int, tuple[Floats, float]]:
+        """The same by the joints' indices in the model: place (2,) px and probability of each."""
+        names = sight.model.joint_names
+        return {
+            names.index(f"{side}_{name}"): (ends[k], float(right[k]))
+            for side, (ends, right) in self.step(sight).items()
+            for k, name in enumerate(ENDS)
+        }
 
     def _side(self, side: str, sight: Sight, settings: PathSettings) -> tuple[Floats, Floats]:
         before, places = self._arms.get(side), sight.hypotheses(side, settings.modes)

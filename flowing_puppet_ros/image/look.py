@@ -17,7 +17,7 @@ from flowing_puppet_ros.image.arm_path import PathSettings
 from flowing_puppet_ros.image.arms import ArmFilter
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
 from flowing_puppet_ros.image.keypoints import Keypoints
-from flowing_puppet_ros.image.sight import ENDS, Eyes
+from flowing_puppet_ros.image.sight import Eyes
 from flowing_puppet_ros.image.tracker import TrackedPuppet
 from flowing_puppet_ros.image.video_tracker import Detector
 from flowing_puppet_ros.image.watch import Watch
@@ -83,12 +83,7 @@ class Looker:
             if (puppet := owners.get(index)) is None:
                 seen.append(Seen(detection, detection.keypoints))
                 continue
-            sight = self.eyes.sight(image, puppet, detection)
-            ends = {
-                self.eyes.model.joint_names.index(f"{side}_{name}"): (ends[k], float(right[k]))
-                for side, (ends, right) in arms[puppet.id].step(sight).items()
-                for k, name in enumerate(ENDS)
-            }
+            ends = arms[puppet.id].joints(self.eyes.sight(image, puppet, detection))
             seen.append(Seen(detection, detection.keypoints, puppet.id, ends))
         return seen
 

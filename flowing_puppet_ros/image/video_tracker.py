@@ -18,7 +18,7 @@ from flowing_puppet_ros.image.arms import ArmFilter
 from flowing_puppet_ros.image.clip_people import FIRST, ClipPeople, PersonPath
 from flowing_puppet_ros.image.detector import DetectorSettings
 from flowing_puppet_ros.image.detector_person import PersonDetection, Place
-from flowing_puppet_ros.image.sight import ENDS, Eyes, Sight
+from flowing_puppet_ros.image.sight import Eyes, Sight
 from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.image.watch import Watch
 from flowing_puppet_ros.settings import Settings, setting
@@ -127,17 +127,9 @@ class VideoTracker:
         self, result: TrackResult, image: NDArray[np.uint8], found: Sequence[PersonDetection]
     ) -> TrackResult:
         """The result of a live step with the arms where the best paths of their hypotheses lead."""
-        model = self.tracker.model
         sights = self.sights(image, result, found)
         self._arms = {identity: self._arms.get(identity, ArmFilter(self.path)) for identity in sights}
-        places: dict[str, dict[int, tuple[NDArray[np.float64], float]]] = {}
-        for puppet in result.puppets:
-            arms = self._arms[puppet.id].step(sights[puppet.id])
-            places[puppet.id] = {
-                model.joint_names.index(f"{side}_{name}"): (ends[k], float(right[k]))
-                for side, (ends, right) in arms.items()
-                for k, name in enumerate(ENDS)
-            }
+        places = {identity: self._arms[identity].joints(sight) for identity, sight in sights.items()}
         return self.tracker.redirected(result, places)
 
     def _searched(self, image: NDArray[np.uint8], number: int) -> list[PersonDetection]:

@@ -108,6 +108,7 @@ class Lookout:
     def adopt(self, settings: LookoutSettings) -> None:
         """Go on with these settings."""
         self._settings = settings
+        self._watch.searches.least, self._watch.searches.most = self._least_and_most()
 
     def warm_up(self, image: Image, puppet: TrackedPuppet) -> None:
         """Load the detector and have it look at an image of no interest, if it will ever look at any."""
@@ -137,7 +138,10 @@ class Lookout:
         self._glanced_ns: int | None = None
 
     def _new_watch(self) -> Watch:
-        return Watch(ClipPeople(self._settings.least_person, min(self._tracker.settings.most_people, 80), 1))
+        return Watch(ClipPeople(*self._least_and_most(), 1))
+
+    def _least_and_most(self) -> tuple[float, int]:
+        return self._settings.least_person, min(self._tracker.settings.most_people, 80)
 
     def step(self, image: Image, stamp_ns: int, flow: FlowPair | None, beside: Executor | None) -> TrackResult:
         """Track the next `image` (H, W, 3) RGB, with what the looks saw whose answers are due.
@@ -316,7 +320,7 @@ def carried(
 
 
 def _coarse(flow: Flow) -> Flow:
-    """A flow field (h, w, 2) in pixels at a quarter of its resolution, as shares of its width and height."""
+    """A flow field (h, w, 2) in pixels at a share of its resolution, as shares of its width and height."""
     height, width = flow.shape[:2]
     small = max(1, width // COARSE), max(1, height // COARSE)
     shares = np.array([1 / width, 1 / height], np.float32)

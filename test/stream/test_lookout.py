@@ -166,6 +166,12 @@ def test_stamps_that_stand_still_or_go_back_do_not_stop_the_looks(stamps: list[i
     assert 8 <= len(looker.searched) <= 100
 
 
+def test_who_is_sure_enough_can_change_between_searches() -> None:
+    lookout, _ = watching(least_person=0.3)
+    lookout.adopt(LookoutSettings(least_person=0.8))
+    assert lookout._watch.searches.least == 0.8
+
+
 def test_an_image_of_another_size_starts_anew() -> None:
     lookout, looker = watching(detect_delay=0.0)
     lookout.step(image(0), 0, None, None)
