@@ -17,6 +17,7 @@ type Doubles = NDArray[np.float64]
 MEASURES = 8  # of a pose: root filter, trees, relative scale, pose, share outside of the image, and three of skin
 SAME_PLACE = 0.5  # units of S between necks of which only the better is kept
 SAME_HEAD = 0.35  # units of S between necks of poses that tell the scale of one person together
+LENGTHS = np.array([[0.6, 0.2, 0.5], [1.4, 0.7, 2.0]])  # units of S: shoulders, head and trunk of somebody; see lengths
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,12 +68,14 @@ def agreed_scale(poses: Sequence[FoundPose], scores: Doubles, best: int) -> floa
 def lengths(pose: FoundPose, scale: float) -> Doubles:
     """Logarithms of the width of the shoulders, of the head's and of the trunk's length in units of S, and 1: (4,).
 
-    The thesis regresses the scale on head and shoulders of a stickman.
+    The thesis regresses the scale on head and shoulders of a stickman. Lengths beyond LENGTHS count as its ends: where
+    both shoulders are taken for the same one, their distance tells of an error and not of a small person.
     """
     place = dict(zip(PARTS, pose.points, strict=True))
     shoulders, hips = ((place[f"right_{name}"], place[f"left_{name}"]) for name in ("shoulder", "hip"))
     spans = shoulders[0] - shoulders[1], place["neck"] - place["face"], (sum(shoulders) - sum(hips)) / 2
-    return np.array([*(np.log(max(1e-2, float(np.linalg.norm(span)) / scale)) for span in spans), 1.0])
+    measured = np.array([float(np.linalg.norm(span)) / scale for span in spans])
+    return np.append(np.log(np.clip(measured, *LENGTHS)), 1.0)
 
 
 def apart(a: FoundPose, b: FoundPose) -> float:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.region import RegionMap
 from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
-from flowing_puppet_ros.image.detector_parts import COLUMNS, DIMENSIONS, LEFT, OUTSIDE, ROWS, UP, window_at
+from flowing_puppet_ros.image.detector_parts import COLUMNS, DIMENSIONS, LEFT, OUTSIDE, PARTS, ROWS, UP, window_at
 from flowing_puppet_ros.image.detector_person import JOINTS, PersonDetection, Place
 from flowing_puppet_ros.image.detector_root import RootFilters, level, overlap, pyramid, respond, suppress
 from flowing_puppet_ros.image.detector_search import propose
@@ -162,6 +162,17 @@ def test_skin_is_measured_on_face_around_it_and_on_the_chest() -> None:
     measures = skin_measures(RegionMap.of(values), np.array([50.0, 45.0]), np.array([50.0, 20.0]), 25.0)
     assert measures[0] == pytest.approx(2.0) and 1.0 < measures[1] < 2.0 and 0.1 < measures[2] < 0.9
     assert (skin_measures(RegionMap.of(values), np.full(2, 900.0), np.full(2, 900.0), 25.0) == 0.0).all()
+
+
+@pytest.mark.parametrize("lost", [("right_shoulder", "left_shoulder"), ("neck", "face")])
+def test_two_joints_in_one_place_do_not_make_a_person_small(
+    detector: PartDetector, person: PersonDetection, lost: tuple[str, str]
+) -> None:
+    placement = person.pose.placement.copy()
+    placement[PARTS.index(lost[0]), 1:] = placement[PARTS.index(lost[1]), 1:]
+    collapsed = replace(person.pose, placement=placement)
+    whole, changed = (detector.ranking.corrected_scale(pose, 40.0) for pose in (person.pose, collapsed))
+    assert 0.85 * whole < changed < whole
 
 
 def test_ten_people_are_no_more_work_than_asked(detector: PartDetector) -> None:
