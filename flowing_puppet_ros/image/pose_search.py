@@ -2,7 +2,8 @@
 """Particle max-product for the 2D puppet on one person (thesis, "Human Pose Estimation from Single Images").
 
 New particles come from a random walk, from neighbours through the conditional Gaussians of the model, and from the
-image: wrists are drawn where hands are likely, and whole arms laid to them. Selection is that of D-PMP.
+image: wrists are drawn where hands are likely, and whole arms laid to them. Selection is that of D-PMP; at the end
+the best pose alone is refined by plain particle max-product.
 """
 
 from __future__ import annotations
@@ -43,6 +44,10 @@ class Judged:
     particles: Particles
     cost: Array
 
+    def take(self, chosen: Array) -> Judged:
+        """The particles with these indices."""
+        return Judged(self.particles.take(chosen), self.cost[chosen])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Person:
@@ -76,16 +81,13 @@ class PoseSearch:
     def run(self, start: list[Particles], person: Person, rng: np.random.Generator) -> tuple[list[Judged], MaxProduct]:
         """Improve the particles `start` of every part; returns the last ones and max-product over them."""
         judged = [self._judge(k, self._flattened(group), person) for k, group in enumerate(start)]
-        result, edges = self.solve(judged)
-        for _ in range(self._settings.iterations):
-            proposed = self._propose(judged, person, rng)
-            new = [self._judge(k, self._flattened(group), person) for k, group in enumerate(proposed)]
-            judged = [_joined(*pair) for pair in zip(judged, new, strict=True)]
-            result, edges = self.solve(judged)
-            kept = [self._select(k, result, edges) for k in range(len(judged))]
-            judged = [Judged(g.particles.take(i), g.cost[i]) for g, i in zip(judged, kept, strict=True)]
-        result, _ = self.solve(judged)
-        return judged, result
+        settings = self._settings
+        judged = self._improve(judged, person, rng, settings.iterations, settings.diverse)
+        # Particles spread over many poses leave few for the best one: it is refined apart, and no other pose is lost.
+        fine = self._improve(judged, person, rng, settings.refinements, diverse=False)
+        best = self.solve(fine)[0].assignment
+        judged = [_joined(judged[k], fine[k].take(best[k : k + 1])) for k in range(len(judged))]
+        return judged, self.solve(judged)[0]
 
     def best_contours(self, start: list[Particles], person: Person, names: tuple[str, ...]) -> list[Array]:
         """Contours (K,2) px of the parts `names` in the best configuration of some particles."""
@@ -134,16 +136,28 @@ class PoseSearch:
             cost -= weight / len(self._joints[k]) * score
         return Judged(particles, cost)
 
+    def _improve(
+        self, judged: list[Judged], person: Person, rng: np.random.Generator, rounds: int, diverse: bool
+    ) -> list[Judged]:
+        """The particles that are left after so many rounds of proposing and selecting."""
+        for _ in range(rounds):
+            proposed = self._propose(judged, person, rng)
+            new = [self._judge(k, self._flattened(group), person) for k, group in enumerate(proposed)]
+            judged = [_joined(*pair) for pair in zip(judged, new, strict=True)]
+            result, edges = self.solve(judged)
+            judged = [group.take(self._select(k, result, edges, diverse)) for k, group in enumerate(judged)]
+        return judged
+
     def _flattened(self, particles: Particles) -> Particles:
         """The particles as they are, or with the mean shape where shapes may not vary."""
         if self._settings.shape:
             return particles
         return Particles(particles.center, particles.angle, particles.scale, np.zeros_like(particles.shape))
 
-    def _select(self, k: int, result: MaxProduct, edges: list[Array]) -> Array:
+    def _select(self, k: int, result: MaxProduct, edges: list[Array], diverse: bool) -> Array:
         kept = int(result.assignment[k])
         count = min(self._settings.particles, len(result.marginals[k]))
-        if self._settings.diverse:
+        if diverse:
             foundation = message_foundation(self.tree, edges, result, k)
             return select_diverse(foundation, count, kept, self._settings.temperature)
         order = np.argsort(result.marginals[k], kind="stable")

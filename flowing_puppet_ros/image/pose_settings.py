@@ -14,6 +14,7 @@ class PoseSettings(Settings):
 
     particles: int = setting(48, "particles a part that each iteration keeps", low=4, high=1000)
     iterations: int = setting(6, "rounds of proposing and selecting", low=0, high=1000)
+    refinements: int = setting(4, "rounds after these that refine the best pose alone", low=0, high=1000)
     modes: int = setting(16, "poses of the detector from which particles start", low=1, high=200)
     solutions: int = setting(10, "diverse solutions that are given, the best one included", low=1, high=100)
     others: float = setting(0.25, "probability from which people beside the surest one are reported", low=0.0, high=1.0)

@@ -185,6 +185,15 @@ def test_plain_and_diverse_particles_both_find_a_person(joints: np.ndarray) -> N
     assert np.linalg.norm(plain.joints[NAMES.index("neck")] - joints[NAMES.index("neck")]) < 8
 
 
+def test_refining_betters_the_best_pose(joints: np.ndarray) -> None:
+    coarse, fine = (
+        estimator(joints, replace(QUICK, particles=24, refinements=rounds)).estimate(painted(joints))[0]
+        for rounds in (0, 4)
+    )
+    assert fine.solutions[0].energy < coarse.solutions[0].energy
+    assert len(fine.solutions) == len(coarse.solutions)
+
+
 def test_given_keypoints_stand_in_for_the_detector(joints: np.ndarray) -> None:
     alone = PoseEstimator([MODEL], None, None, QUICK)
     (person,) = alone.estimate(np.zeros((320, 320, 3), np.uint8), [keypoints(joints, list(NAMES))])
