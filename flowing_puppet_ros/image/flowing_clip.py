@@ -64,13 +64,11 @@ def given_sights(
     given: Sequence[Keypoints] | None,
 ) -> dict[str, GivenSight]:
     """How the people of a step that took `given` keypoints are seen in its image (H, W, 3), by id."""
-    names, mean = model.joint_names, model.mean_joints()
-    width = float(np.linalg.norm(mean[names.index("left_shoulder")] - mean[names.index("right_shoulder")]))
     sights = {}
     with one_blas_thread():
         for puppet in result.puppets:
             known = None if puppet.detection is None or given is None else given[puppet.detection]
-            found = None if known is None else GivenPerson(known, width * puppet.scale)
+            found = None if known is None else GivenPerson(known, model.shoulder_width * puppet.scale)
             sights[puppet.id] = GivenSight(found, window_of(model, likelihood, image, puppet))
     return sights
 
