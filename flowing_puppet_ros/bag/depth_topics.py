@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from contextlib import suppress
+from typing import Any
 
 from flowing_puppet_ros.bag.reader import Bag
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.component import CAMERA_INFO, IMAGE
+from flowing_puppet_ros.stream.component import CAMERA_INFO, COMPRESSED_DEPTH, COMPRESSED_IMAGE, IMAGE, untransported
+from flowing_puppet_ros.stream.compressed_depth import sent_encoding
 from flowing_puppet_ros.stream.images import is_depth
 
 RECTIFIED_FIRST = ("depth", "image_rect", "image_rect_raw", "image_raw")
@@ -16,16 +18,25 @@ RECTIFIED_FIRST = ("depth", "image_rect", "image_rect_raw", "image_raw")
 
 
 def encodings(bag: Bag) -> dict[str, str]:
-    """Return the encoding of the first readable message of every Image topic that has one."""
+    """Return the encoding of the first readable message of every topic of images that has one; see encoding_of."""
     found: dict[str, str] = {}
     for name, topic in bag.details.items():
-        if topic.type != IMAGE or not topic.count:
+        if topic.type not in (IMAGE, COMPRESSED_IMAGE) or not topic.count:
             continue
         for record in bag.messages([name]):
             with suppress(InputError):
-                found[name] = record.message.encoding
+                encoding = encoding_of(name, record.message)
+                if encoding:
+                    found[name] = encoding
                 break
     return found
+
+
+def encoding_of(topic: str, message: Any) -> str:
+    """Return the encoding of an Image, or of the depth image that a CompressedImage was; empty of other ones."""
+    if not hasattr(message, "format"):
+        return str(message.encoding)
+    return sent_encoding(message.format) if topic.endswith(f"/{COMPRESSED_DEPTH}") else ""
 
 
 def holds_depth(topic: str, encoding: str) -> bool:
@@ -40,21 +51,23 @@ def depth_topics(
 
     `topics` are names and types, `encoded` image topics and their encodings, `clouds` the cloud topics that bodies are
     fitted to already. The encoding alone does not tell depth from heat or confidence, so the name has to say "depth".
-    One topic a namespace, with the camera_info beside it; none where the camera's points were recorded too.
+    One topic a namespace, with the camera_info beside it; none where the camera's points were recorded too. Of what was
+    recorded by the transport `compressedDepth` alone, the name is that of the image itself.
     """
     chosen: dict[str, str] = {}
     notes = []
-    for topic in sorted(encoded, key=_rectified_first):
+    for recorded in sorted(encoded, key=_rectified_first):
+        topic = untransported(recorded)
         namespace = topic.rpartition("/")[0]
         info = f"{namespace}/camera_info"
-        if not holds_depth(topic, encoded[topic]) or namespace in chosen:
+        if not holds_depth(recorded, encoded[recorded]) or namespace in chosen:
             continue
         points = [cloud for cloud in clouds if _of_one_camera(namespace, cloud)]
         if "depth" not in topic.lower():
             if topics.get(info) == CAMERA_INFO:
                 notes.append(
-                    f"{topic} holds {encoded[topic]} images and may be depth: --topic-map {topic}:={namespace}/depth "
-                    "fits bodies to it"
+                    f"{topic} holds {encoded[recorded]} images and may be depth: --topic-map "
+                    f"{topic}:={namespace}/depth fits bodies to it"
                 )
         elif topics.get(info) != CAMERA_INFO:
             notes.append(
@@ -68,7 +81,7 @@ def depth_topics(
 
 
 def _rectified_first(topic: str) -> tuple[int, str]:
-    name = topic.rpartition("/")[2]
+    name = untransported(topic).rpartition("/")[2]
     return RECTIFIED_FIRST.index(name) if name in RECTIFIED_FIRST else len(RECTIFIED_FIRST), topic
 
 

@@ -21,6 +21,7 @@ from flowing_puppet_ros.stream.component import (
     PUPPETS,
     Component,
     Port,
+    untransported,
 )
 from flowing_puppet_ros.stream.messages import FrameTree, MessageFactory
 from flowing_puppet_ros.stream.puppet_tracker import PuppetTrackerComponent
@@ -70,11 +71,11 @@ class Graph:
                 topic = instance.topic(port.name)
                 if not topic:
                     continue
-                kinds = (port.type, COMPRESSED_IMAGE) if port.compressed else (port.type,)
+                kinds = (port.type, COMPRESSED_IMAGE) if port.transport else (port.type,)
                 if recorded.get(topic, port.type) in kinds:
                     found.setdefault(topic, []).append((instance, port.name))
-                if port.compressed and topic not in recorded:
-                    found.setdefault(f"{topic}/compressed", []).append((instance, port.name))
+                if port.transport and topic not in recorded:
+                    found.setdefault(f"{topic}/{port.transport}", []).append((instance, port.name))
         return found
 
     def outputs(self) -> dict[str, Port]:
@@ -136,7 +137,7 @@ def _nothing_usable(topics: Mapping[str, str]) -> str:
     listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
     images = sorted(name for name, kind in topics.items() if kind in (IMAGE, COMPRESSED_IMAGE))
     old = images[0] if images else "OLD"
-    new = f"{old.removesuffix('/compressed').rpartition('/')[0]}/image" if images else "NEW"
+    new = f"{untransported(old).rpartition('/')[0]}/image" if images else "NEW"
     return (
         f"no topic can be used: wanted are images named {', '.join(IMAGE_NAMES)}, depth images with their "
         f"camera_info, or point clouds; the topics are {listed}; --topic-map {old}:={new} renames one"

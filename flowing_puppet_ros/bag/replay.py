@@ -167,8 +167,8 @@ class _Replay:
         for topic, port in self._outputs.items():
             if port.name in _TOO_LARGE or port.per_person:
                 continue
-            if port.compressed:
-                writer.add_topic(f"{topic}/compressed", COMPRESSED_IMAGE, port.qos)
+            if port.transport:
+                writer.add_topic(f"{topic}/{port.transport}", COMPRESSED_IMAGE, port.qos)
             else:
                 writer.add_topic(topic, port.type, port.qos)
 
@@ -213,8 +213,8 @@ class _Replay:
     def _write(self, writer: BagWriter, topic: str, log_time: int, message: Any, port: Port) -> None:
         if port.per_person and not writer.has_topic(topic):
             writer.add_topic(topic, port.type, port.qos)
-        if port.compressed:
-            writer.write(f"{topic}/compressed", log_time, compress(self._factory, message))
+        if port.transport:
+            writer.write(f"{topic}/{port.transport}", log_time, compress(self._factory, message))
         elif port.name not in _TOO_LARGE:
             writer.write(topic, log_time, message)
 

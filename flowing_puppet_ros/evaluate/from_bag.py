@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.bag.depth_topics import holds_depth
+from flowing_puppet_ros.bag.depth_topics import encoding_of, holds_depth
 from flowing_puppet_ros.bag.reader import Bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.body.camera import Camera
@@ -22,6 +22,7 @@ from flowing_puppet_ros.body.triangulate import triangulate
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.joints import LIMB_JOINTS, named_points
 from flowing_puppet_ros.image.keypoints import normalise_name
+from flowing_puppet_ros.stream.component import untransported
 from flowing_puppet_ros.stream.depth import depth_cloud
 from flowing_puppet_ros.stream.messages import FrameTree, stamp_ns
 
@@ -76,8 +77,8 @@ class Recording:
 
 
 def namespace(topic: str) -> str:
-    """The topic without its last word; `/compressed` does not count as a word."""
-    return topic.removesuffix("/compressed").rpartition("/")[0]
+    """The topic without its last word; that of a transport does not count."""
+    return untransported(topic).rpartition("/")[0]
 
 
 def read_recording(given: Bag, made: Bag) -> Recording:
@@ -110,8 +111,8 @@ def read_recording(given: Bag, made: Bag) -> Recording:
 
 
 def leaf(topic: str) -> str:
-    """The last word of a topic; `/compressed` does not count as a word."""
-    return topic.removesuffix("/compressed").rpartition("/")[2]
+    """The last word of a topic; that of a transport does not count."""
+    return untransported(topic).rpartition("/")[2]
 
 
 def _role(topic: str, kind: str) -> str:
@@ -155,7 +156,7 @@ def _find_images(recording: Recording, given: Bag) -> None:
         with suppress(InputError):
             image = next(given.messages([topic])).message
             frame = image.header.frame_id
-            if not holds_depth(topic, getattr(image, "encoding", "")):
+            if not holds_depth(topic, encoding_of(topic, image)):
                 by_frame.setdefault(frame, topic)
                 continue
             topics.remove(topic)

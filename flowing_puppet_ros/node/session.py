@@ -85,7 +85,7 @@ class Session[C: Component]:
         self.active = True
         for port in self.component.inputs:
             self._subscribe(port, message_type(port.type), port.name)
-            if port.compressed:
+            if port.transport:
                 self._subscribe(port, message_type(COMPRESSED_IMAGE), self._compressed(port))
 
     def deactivate(self) -> None:
@@ -154,14 +154,14 @@ class Session[C: Component]:
         """Return the publishers of a port, each with what makes its message out of the component's."""
         made: list[tuple[Publisher, Callable[[Any], Any]]]
         made = [(self._publisher(message_type(port.type), port.name, port.qos, person), _same)]
-        if port.compressed:
+        if port.transport:
             compressed = self._publisher(message_type(COMPRESSED_IMAGE), self._compressed(port), port.qos, person)
             made.append((compressed, partial(compress, self.component.factory)))
         return made
 
     def _compressed(self, port: Port) -> str:
         """Return the topic of a port's compressed images: it follows the port when that is remapped."""
-        return f"{self._node.resolve_topic_name(port.name)}/compressed"
+        return f"{self._node.resolve_topic_name(port.name)}/{port.transport}"
 
     def _publisher(self, kind: Any, topic: str, qos: str, person: bool) -> Publisher:
         name = self._node.resolve_topic_name(topic)

@@ -21,6 +21,7 @@ from flowing_puppet_ros.stream.clouds import decode_cloud
 from flowing_puppet_ros.stream.component import (
     BODIES,
     CAMERA_INFO,
+    COMPRESSED_DEPTH,
     IMAGE,
     POINT_CLOUD,
     SILHOUETTES,
@@ -62,7 +63,7 @@ class BodyFitterComponent(Component):
     settings_type = BodyFitterSettings
     inputs = (
         Port("points", POINT_CLOUD, "sensor"),
-        Port("depth", IMAGE, "sensor"),
+        Port("depth", IMAGE, "sensor", transport=COMPRESSED_DEPTH),
         Port("camera_info", CAMERA_INFO, "sensor"),
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),

@@ -27,6 +27,7 @@ MOST_WARNINGS = 100
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+COMPRESSED, COMPRESSED_DEPTH = "compressed", "compressedDepth"  # transports of images
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
@@ -35,24 +36,32 @@ BODIES = "flowing_puppet_msgs/msg/BodyArray"
 SILHOUETTES = "flowing_puppet_msgs/msg/SilhouetteSet"
 
 
+def untransported(topic: str) -> str:
+    """Return the topic of an image that travels on `topic`: without the word of a transport, where there is one."""
+    for transport in (COMPRESSED, COMPRESSED_DEPTH):
+        topic = topic.removesuffix(f"/{transport}")
+    return topic
+
+
 @dataclass(frozen=True, slots=True)
 class Port:
     """One topic of a component: its name relative to the node's namespace, or global when it starts with a slash.
 
     qos: "sensor" (best effort, what sensors publish), "reliable" or "latched" (transient local).
-    lazy: worth making only when somebody listens. compressed: the same image also travels as CompressedImage on
-    `<name>/compressed`. optional: an input the component works without.
+    lazy: worth making only when somebody listens. transport: the image also travels as CompressedImage on
+    `<name>/<transport>`, COMPRESSED or, an input, COMPRESSED_DEPTH; empty when it does not. optional: an input the
+    component works without.
 
     An output with `{id}` in its name is one topic a person. The component puts `port.of(id)` beside each message; who
     runs the component opens that topic at its first message and closes it at a message that is None, which says that
-    the person is lost. Such a port is neither lazy nor compressed.
+    the person is lost. Such a port is neither lazy nor has it a transport.
     """
 
     name: str
     type: str
     qos: str = "reliable"
     lazy: bool = False
-    compressed: bool = False
+    transport: str = ""
     optional: bool = False
 
     @property

@@ -10,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.messages import MessageFactory
+from flowing_puppet_ros.stream.compressed_depth import LARGEST_PIXELS, is_compressed_depth, unpack_depth
+from flowing_puppet_ros.stream.messages import MessageFactory, message_bytes
 
 JPEG_QUALITY = 85
-
-LARGEST_PIXELS = 100_000_000
-"""Pixels of the largest image that is decoded; sizes beyond are lies or mistakes, and would take the memory."""
 
 FARTHEST_FLOW = 1e5
 """Pixels; no flow leads farther than images are wide."""
@@ -49,11 +47,6 @@ _RAW: dict[str, tuple[int, int, int | None]] = {
 _DEPTH = {"16uc1": ("u2", 0.001), "mono16": ("u2", 0.001), "32fc1": ("f4", 1.0)}
 
 
-def message_bytes(data: Any) -> NDArray[np.uint8]:
-    """View the uint8[] field of any message flavour as an array, without a copy."""
-    return data.view(np.uint8) if isinstance(data, np.ndarray) else np.frombuffer(memoryview(data), np.uint8)
-
-
 def decode_image(message: Any) -> NDArray[np.uint8]:
     """Return the (H,W,3) RGB image of an Image or a CompressedImage; InputError in one sentence when it has none."""
     if hasattr(message, "format"):
@@ -78,7 +71,7 @@ def decode_image(message: Any) -> NDArray[np.uint8]:
 
 def _decode_compressed(message: Any) -> NDArray[np.uint8]:
     data = message_bytes(message.data)
-    if "compresseddepth" in message.format.lower().replace(" ", ""):
+    if is_compressed_depth(message.format):
         raise InputError(f"the compressed image format {message.format!r} is a depth image, not a picture")
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
     try:
@@ -129,13 +122,18 @@ def is_depth(encoding: str) -> bool:
 def decode_depth(message: Any) -> NDArray[np.float32]:
     """Return the (H,W) depth of a depth Image in metres along the optical axis (REP-118), NaN where unknown.
 
-    16UC1 is in millimetres and 0 is unknown, 32FC1 is in metres; what is not positive or not finite is unknown.
+    16UC1 is in millimetres and 0 is unknown, 32FC1 is in metres; what is not positive or not finite is unknown. Takes
+    the CompressedImage of the transport `compressedDepth` too.
     """
-    encoding = message.encoding.lower()
-    if encoding not in _DEPTH:
-        raise InputError(f"depth comes as 16UC1 (mm) or 32FC1 (m), not as {message.encoding!r}")
-    form, unit = _DEPTH[encoding]
-    raw = _rows(message, 1, np.dtype((">" if message.is_bigendian else "<") + form))
+    if hasattr(message, "format"):
+        raw: NDArray[Any] = unpack_depth(message)
+        unit = 0.001 if raw.dtype == np.uint16 else 1.0
+    else:
+        encoding = message.encoding.lower()
+        if encoding not in _DEPTH:
+            raise InputError(f"depth comes as 16UC1 (mm) or 32FC1 (m), not as {message.encoding!r}")
+        form, unit = _DEPTH[encoding]
+        raw = _rows(message, 1, np.dtype((">" if message.is_bigendian else "<") + form))
     depth = raw.astype(np.float32) * np.float32(unit)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
 

@@ -27,6 +27,11 @@ class MessageFactory(Protocol):
         ...
 
 
+def message_bytes(data: Any) -> NDArray[np.uint8]:
+    """View the uint8[] field of any message flavour as an array, without a copy."""
+    return data.view(np.uint8) if isinstance(data, np.ndarray) else np.frombuffer(memoryview(data), np.uint8)
+
+
 def header_ns(header: Any) -> int:
     """Return the stamp of a header in nanoseconds."""
     return int(header.stamp.sec) * NANOSECONDS + int(header.stamp.nanosec)

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.flow.estimate import FlowSettings, OpticalFlow
 from flowing_puppet_ros.stream import warm_up
-from flowing_puppet_ros.stream.component import IMAGE, Component, Output, Port
+from flowing_puppet_ros.stream.component import (
+    COMPRESSED,
+    IMAGE,
+    Component,
+    Output,
+    Port,
+)
 from flowing_puppet_ros.stream.images import decode_image, make_image
 from flowing_puppet_ros.stream.messages import MessageFactory, stamp_ns
 from flowing_puppet_ros.view.flow_colour import flow_scale, flow_to_rgb
@@ -25,11 +31,11 @@ class OpticalFlowComponent(Component):
     """
 
     settings_type = FlowSettings
-    inputs = (Port("image", IMAGE, "sensor", compressed=True),)
+    inputs = (Port("image", IMAGE, "sensor", transport=COMPRESSED),)
     outputs = (
         Port("flow/forward", IMAGE),
         Port("flow/backward", IMAGE),
-        Port("flow/preview", IMAGE, lazy=True, compressed=True),
+        Port("flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
     )
 
     def __init__(self, settings: FlowSettings, factory: MessageFactory) -> None:

@@ -18,7 +18,14 @@ from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.model.ds import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream import warm_up
-from flowing_puppet_ros.stream.component import IMAGE, PUPPETS, Component, Output, Port
+from flowing_puppet_ros.stream.component import (
+    COMPRESSED,
+    IMAGE,
+    PUPPETS,
+    Component,
+    Output,
+    Port,
+)
 from flowing_puppet_ros.stream.humans import Humans, HumansSettings, image_humans
 from flowing_puppet_ros.stream.images import decode_flow, decode_image, make_image
 from flowing_puppet_ros.stream.lookout import Lookout, LookoutSettings
@@ -54,7 +61,7 @@ class PuppetTrackerComponent(Component):
     settings_type = PuppetTrackerSettings
     adoptable = frozenset(info.name for info in PuppetTrackerSettings.describe()) - _OF_A_NEW_TRACKER
     inputs = (
-        Port("image", IMAGE, "sensor", compressed=True),
+        Port("image", IMAGE, "sensor", transport=COMPRESSED),
         Port("flow/forward", IMAGE, optional=True),
         Port("flow/backward", IMAGE, optional=True),
         Port("detections", PUPPETS, "sensor", optional=True),
@@ -62,9 +69,9 @@ class PuppetTrackerComponent(Component):
     outputs: tuple[Port, ...] = (
         Port("puppets", PUPPETS),
         Port("part_labels", IMAGE, lazy=True),
-        Port("overlay", IMAGE, lazy=True, compressed=True),
-        Port("flow/preview", IMAGE, lazy=True, compressed=True),
-        Port("puppet_flow/preview", IMAGE, lazy=True, compressed=True),
+        Port("overlay", IMAGE, lazy=True, transport=COMPRESSED),
+        Port("flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
+        Port("puppet_flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
     )
 
     def __init__(self, settings: PuppetTrackerSettings, factory: MessageFactory) -> None:

@@ -16,6 +16,7 @@ from flowing_puppet_ros.stream.clouds import make_cloud
 from flowing_puppet_ros.stream.component import (
     BODIES,
     CAMERA_INFO,
+    COMPRESSED,
     IMAGE,
     POINT_CLOUD,
     PUPPETS,
@@ -217,7 +218,7 @@ class VisualHullComponent(Component):
 
 def _ports_of(camera: str) -> tuple[Port, ...]:
     return (
-        Port(f"{camera}/image", IMAGE, "sensor", compressed=True),
+        Port(f"{camera}/image", IMAGE, "sensor", transport=COMPRESSED),
         Port(f"{camera}/part_labels", IMAGE),
         Port(f"{camera}/puppets", PUPPETS),
         Port(f"{camera}/camera_info", CAMERA_INFO, "sensor"),

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -15,7 +16,7 @@ from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.clouds import make_cloud
-from flowing_puppet_ros.stream.component import BODIES, CAMERA_INFO, IMAGE, POINT_CLOUD
+from flowing_puppet_ros.stream.component import BODIES, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 from flowing_puppet_ros.stream.images import make_image
 from flowing_puppet_ros.stream.messages import make_header
 from flowing_puppet_ros.view.report_data import gather
@@ -84,7 +85,17 @@ def recorded(path: Path, messages: list[tuple[str, str, Any]]) -> Path:
     return path
 
 
-@pytest.mark.parametrize(("encoding", "name"), [("16UC1", "image_rect_raw"), ("32FC1", "depth_registered")])
+def compressed(message: Any) -> Any:
+    """Return a 16UC1 image as the transport `compressedDepth` sends it."""
+    pixels = message.data.view("<u2").reshape(message.height, message.width)
+    data = np.concatenate([np.zeros(12, np.uint8), cv2.imencode(".png", pixels)[1].reshape(-1)])
+    return FACTORY.make(COMPRESSED_IMAGE, header=message.header, format="16UC1; compressedDepth png", data=data)
+
+
+@pytest.mark.parametrize(
+    ("encoding", "name"),
+    [("16UC1", "image_rect_raw"), ("32FC1", "depth_registered"), ("16UC1", "image_rect_raw/compressedDepth")],
+)
 def test_a_recorded_depth_camera_gives_the_bodies_that_it_gives_live(encoding: str, name: str, tmp_path: Path) -> None:
     surface, _ = cloud_of(joints_of(), 60_000)
     truth = [in_camera(np.stack(list(joints_of().values())), 0.02 * k) for k in range(2)]
@@ -93,7 +104,7 @@ def test_a_recorded_depth_camera_gives_the_bodies_that_it_gives_live(encoding: s
         seen = image(k * TENTH, depth_of(in_camera(surface, 0.02 * k)), encoding)
         three = [
             ("/rig/depth/camera_info", CAMERA_INFO, info(k * TENTH)),
-            (f"/rig/depth/{name}", IMAGE, seen),
+            (f"/rig/depth/{name}", *((COMPRESSED_IMAGE, compressed(seen)) if "/" in name else (IMAGE, seen))),
             ("/rig/depth/initial", BODIES, believed(k * TENTH, truth[k])),
         ]
         stream += three if k else three[::-1]

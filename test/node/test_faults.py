@@ -314,6 +314,18 @@ def test_depth_without_a_calibration(world: World) -> None:
     assert "uncalibrated (k and p are all zero)" in world.logs["body_fitter"].read_text()
 
 
+def test_compressed_depth_of_garbage(world: World) -> None:
+    info = CameraInfo(width=64, height=48, k=np.array([50.0, 0, 32, 0, 50, 24, 0, 0, 1]))
+    for data in (b"", bytes(12) + b"\x89PNG no more", bytes(10_000)):
+        with world.fault("body_fitter"):
+            garbage = CompressedImage(format="16UC1; compressedDepth png", data=array.array("B", data))
+            for _ in range(3):
+                garbage.header = info.header = world.header()
+                world.send("camera_info", info)
+                world.send("depth/compressedDepth", garbage)
+    assert "a compressed depth image of" in world.logs["body_fitter"].read_text()
+
+
 def test_a_publisher_that_dies_and_returns(world: World) -> None:
     world.works("puppets", "image", image(world.header()))
     for topic in ("image", "detections", "image/compressed"):
