@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections import deque
@@ -41,12 +42,16 @@ class ReplayOptions:
 
     rate: 0 is as fast as it goes, 1 the speed of the recording. topic_map: old name -> new name. settings: component
     (puppet_tracker, visual_hull, body_fitter) -> setting -> value. seed: of every component that takes one.
+    start_offset: seconds that are left out, by the times of recording, from the first message that could be used on;
+    playback_duration: seconds from there on.
     """
 
     rate: float = 0.0
     topic_map: Mapping[str, str] = field(default_factory=dict)
     settings: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     seed: int = 0
+    start_offset: float = 0.0
+    playback_duration: float = math.inf
     salvage: bool = False
     progress: bool = True
 
@@ -148,12 +153,29 @@ class _Replay:
         for record in self._static:
             self._take(writer, record, log_time)
         with bar:
-            for record in paced(self._bag.messages(used), self._options.rate):
+            for record in paced(self._asked_for(self._bag.messages(used)), self._options.rate):
                 log_time = record.log_time
                 self._take(writer, record, log_time)
                 bar.update()
             for instance in self._graph.instances:
                 self._emit(writer, log_time, instance, self._timed(instance, instance.component.flush))
+
+    def _asked_for(self, records: Iterator[Record]) -> Iterator[Record]:
+        """The records of the time that was asked for; InputError when there is none."""
+        first, last, found = None, 0, False
+        begin, length = self._options.start_offset * 1e9, self._options.playback_duration * 1e9
+        for record in records:
+            first, last = record.log_time if first is None else first, record.log_time
+            if record.log_time - first > begin + length:
+                break
+            if record.log_time - first >= begin:
+                found = True
+                yield record
+        if first is not None and not found:
+            raise InputError(
+                f"nothing is left of {self._bag.path} from second {self._options.start_offset:g} on: "
+                f"it lasts {(last - first) * 1e-9:.1f} s"
+            )
 
     def _needed(self, topic: str) -> bool:
         return topic != STATIC and topic not in self._outputs and (topic in self._routes or topic in self._carried)
@@ -224,6 +246,8 @@ class _Replay:
         return {
             "version": __version__,
             "seed": self._options.seed,
+            "start_offset": self._options.start_offset,
+            "playback_duration": None if math.isinf(length := self._options.playback_duration) else length,
             "topic_map": dict(self._options.topic_map),
             "settings": {instance.name: _values(instance) for instance in instances},
             "counters": {instance.name: dict(sorted(instance.component.counters.items())) for instance in instances},

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -50,6 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="output bag: a .mcap file, or a folder with metadata; of several inputs the folder of their .mcap files",
     )
     parser.add_argument("--rate", type=float, default=0.0, help="times the recording's speed; 0 is full speed [0]")
+    parser.add_argument("--start-offset", type=float, default=0.0, metavar="S", help="leave out the first seconds [0]")
+    parser.add_argument(
+        "--playback-duration", type=float, default=math.inf, metavar="S", help="seconds to replay [all]"
+    )
     parser.add_argument(
         "--topic-map", action="append", default=[], metavar="OLD:=NEW", help="rename a topic of the input (repeatable)"
     )
@@ -70,6 +75,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Replay, report, and say where the results are."""
     if not arguments.rate >= 0:
         raise InputError(f"--rate is {arguments.rate:g}: give 0 for full speed or a positive factor")
+    if not 0 <= arguments.start_offset < math.inf:
+        raise InputError(f"--start-offset is {arguments.start_offset:g}: give seconds from the start, 0 or more")
+    if not arguments.playback_duration > 0:
+        raise InputError(f"--playback-duration is {arguments.playback_duration:g}: give seconds, more than 0")
     if arguments.seed < 0:
         raise InputError(f"--seed is {arguments.seed}: give 0 or a positive number")
     options = ReplayOptions(
@@ -77,6 +86,8 @@ def run(arguments: argparse.Namespace) -> int:
         topic_map=parse_topic_map(arguments.topic_map),
         settings=read_params(arguments.params) if arguments.params else {},
         seed=arguments.seed,
+        start_offset=arguments.start_offset,
+        playback_duration=arguments.playback_duration,
         salvage=arguments.salvage,
     )
     if arguments.rerun is not None:

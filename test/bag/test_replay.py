@@ -2,6 +2,7 @@
 """What a replay finds in a bag, is told, and refuses; and the command line around it."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,24 @@ def test_empty_clouds_are_warned_of_and_answered_with_no_body(tmp_path: Path) ->
     assert summary["messages"]["/lidar/bodies"] == 2
 
 
+def test_a_part_of_a_recording_is_replayed_by_the_times_of_recording(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "in.mcap") as writer:
+        writer.add_topic("/lidar/points", "sensor_msgs/msg/PointCloud2", "sensor")
+        for k in range(6):
+            cloud = make_cloud(FACTORY, make_header(FACTORY, 10**9 * k, "lidar"), np.zeros((0, 3)))
+            writer.write("/lidar/points", 10**12 + 10**9 * k, cloud)
+    for start, length, expected in ((0.0, 2.0, [0, 1, 2]), (3.5, math.inf, [4, 5]), (1.0, 2.9, [1, 2, 3])):
+        options = ReplayOptions(start_offset=start, playback_duration=length, progress=False)
+        replay(tmp_path / "in.mcap", tmp_path / "out.mcap", options)
+        with open_bag(tmp_path / "out.mcap") as out:
+            stamps = [record.message.header.stamp.sec for record in out.messages(["/lidar/bodies"])]
+        assert stamps == expected
+        (tmp_path / "out.mcap").unlink()
+    with pytest.raises(InputError, match=r"from second 7 on: it lasts 5\.0 s"):
+        replay(tmp_path / "in.mcap", tmp_path / "out.mcap", ReplayOptions(start_offset=7.0, progress=False))
+    assert not (tmp_path / "out.mcap").exists()
+
+
 def test_a_bag_without_usable_topics_says_what_it_has(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "in.mcap") as writer:
         writer.add_topic("/imu", "sensor_msgs/msg/Imu")
@@ -152,6 +171,10 @@ def test_command_line_prints_one_json_object(golden: Any, tmp_path: Path, capsys
     [
         (["missing.mcap", "--out", "x.mcap"], "there is no bag missing.mcap"),
         (["missing.mcap", "--out", "x.mcap", "--rate", "-1"], "--rate is -1"),
+        (["missing.mcap", "--out", "x.mcap", "--start-offset", "-2"], "--start-offset is -2"),
+        (["missing.mcap", "--out", "x.mcap", "--start-offset", "inf"], "--start-offset is inf"),
+        (["missing.mcap", "--out", "x.mcap", "--playback-duration", "0"], "--playback-duration is 0"),
+        (["missing.mcap", "--out", "x.mcap", "--playback-duration", "nan"], "--playback-duration is nan"),
         (["missing.mcap", "--out", "x.mcap", "--topic-map", "a=b"], "--topic-map is 'a=b': give /old:=/new"),
         (["missing.mcap", "--out", "x.mcap", "--params", "none.yaml"], "none.yaml cannot be read as YAML"),
     ],
