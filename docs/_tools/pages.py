@@ -89,8 +89,8 @@ def port_row(port: Port, humans: bool = False) -> list[str]:
     """Return one line of a table of topics; `humans` are those that are published only on request."""
     package, _, message = port.type.split("/")
     notes = []
-    if port.compressed:
-        notes.append(f"also `{port.name}/compressed`")
+    if port.transport:
+        notes.append(f"also `{port.name}/{port.transport}`")
     if port.optional:
         notes.append("optional")
     if port.lazy:
