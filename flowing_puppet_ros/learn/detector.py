@@ -13,12 +13,11 @@ import numpy as np
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.likelihood import PartLikelihood
 from flowing_puppet_ros.image.detector import PartDetector
-from flowing_puppet_ros.image.detector_rank import MEASURES, SCALE_INPUTS, Ranking
+from flowing_puppet_ros.image.detector_rank import MEASURES, Ranking
 from flowing_puppet_ros.learn.detector_data import Example
-from flowing_puppet_ros.learn.detector_far import far_away
 from flowing_puppet_ros.learn.detector_forest import learn_forest
 from flowing_puppet_ros.learn.detector_parts import learn_parts
-from flowing_puppet_ros.learn.detector_ranking import Looked, Outline, learn_ranking
+from flowing_puppet_ros.learn.detector_ranking import learn_ranking
 from flowing_puppet_ros.learn.detector_root import learn_root
 from flowing_puppet_ros.settings import Settings, setting
 
@@ -63,20 +62,15 @@ def learn(examples: Sequence[Example], settings: LearnDetectorSettings, report: 
     forest = learn_forest(kept, root, settings.trees, settings.seed + 1, report)
     parts = learn_parts(kept, settings.steps, settings.seed + 2, report)
     skin = PartLikelihood.load().skin
-    detector = PartDetector(root, forest, parts, skin, Ranking(np.zeros(MEASURES), np.zeros(SCALE_INPUTS), np.zeros(2)))
-    ranking, found = rank(detector, others, settings.seed)
+    detector = PartDetector(root, forest, parts, skin, Ranking(np.zeros(MEASURES), np.zeros(4), np.zeros(2)))
+    ranking, found = rank(detector, others)
     return Learned(replace(detector, ranking=ranking), len(kept), len(others), found)
 
 
-def rank(detector: PartDetector, examples: Sequence[Example], seed: int) -> tuple[Ranking, float]:
+def rank(detector: PartDetector, examples: Sequence[Example]) -> tuple[Ranking, float]:
     """Learn the ranking on about RANKED of the examples; also the share of them whom the best poses find."""
-    rng = np.random.default_rng(seed)
-    some = examples[:: math.ceil(len(examples) / RANKED)]
-    far = [one for example in some if (one := far_away(example, examples, rng)) is not None]
-    return learn_ranking(*([_look(detector, example) for example in those] for those in (some, far)))
-
-
-def _look(detector: PartDetector, example: Example) -> Looked:
-    smallest = max(8.0, max(example.image.shape[:2]) / 20)
-    poses = detector.look(example.image, smallest, PLACES)
-    return Looked(example.joint("neck"), example.scale, [Outline.of(pose) for pose in poses])
+    poses = []
+    for example in examples[:: math.ceil(len(examples) / RANKED)]:
+        smallest = max(8.0, max(example.image.shape[:2]) / 20)
+        poses.append((example, detector.look(example.image, smallest, PLACES)))
+    return learn_ranking(poses)

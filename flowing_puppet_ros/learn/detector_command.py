@@ -85,8 +85,8 @@ regression for the confidence. No neural network.
   `{command}`
 - Only statistics of the images are in the file, no image.
 - Calibrated on people of other videos than the filters were learned on ({held_out}, of whom about {ranked} are looked
-  at, for the scale also when they are made far away): there the surest pose has the right place (half a shoulder width)
-  and scale (25 %) in {found:.0f} % of the images.
+  at): there the surest pose has the right place (half a shoulder width) and scale (25 %) in {found:.0f} % of the
+  images.
 - Limits: upright people, seen from the front or half from the side, shoulders at least a twentieth of the image's
   longer side wide; no knees and ankles; arms in front of the face, and people seen from the side, are often missed.
 - Licence: Apache-2.0, as the package.
