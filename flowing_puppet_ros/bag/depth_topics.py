@@ -9,7 +9,7 @@ from typing import Any
 
 from flowing_puppet_ros.bag.reader import Bag
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.component import CAMERA_INFO, COMPRESSED_DEPTH, COMPRESSED_IMAGE, IMAGE, untransported
+from flowing_puppet_ros.stream.component import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, sends_depth, untransported
 from flowing_puppet_ros.stream.compressed_depth import sent_encoding
 from flowing_puppet_ros.stream.images import is_depth
 
@@ -18,16 +18,14 @@ RECTIFIED_FIRST = ("depth", "image_rect", "image_rect_raw", "image_raw")
 
 
 def encodings(bag: Bag) -> dict[str, str]:
-    """Return the encoding of the first readable message of every topic of images that has one; see encoding_of."""
+    """Return the encoding of the first readable message of every topic of raw images, or of compressed depth."""
     found: dict[str, str] = {}
     for name, topic in bag.details.items():
-        if topic.type not in (IMAGE, COMPRESSED_IMAGE) or not topic.count:
+        if not topic.count or not (topic.type == IMAGE or (topic.type == COMPRESSED_IMAGE and sends_depth(name))):
             continue
         for record in bag.messages([name]):
             with suppress(InputError):
-                encoding = encoding_of(name, record.message)
-                if encoding:
-                    found[name] = encoding
+                found[name] = encoding_of(name, record.message)
                 break
     return found
 
@@ -36,7 +34,7 @@ def encoding_of(topic: str, message: Any) -> str:
     """Return the encoding of an Image, or of the depth image that a CompressedImage was; empty of other ones."""
     if not hasattr(message, "format"):
         return str(message.encoding)
-    return sent_encoding(message.format) if topic.endswith(f"/{COMPRESSED_DEPTH}") else ""
+    return sent_encoding(message.format) if sends_depth(topic) else ""
 
 
 def holds_depth(topic: str, encoding: str) -> bool:

@@ -12,7 +12,7 @@ from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.keypoints import Keypoints
 from flowing_puppet_ros.image.video import Frame
-from flowing_puppet_ros.stream.component import COMPRESSED_DEPTH, COMPRESSED_IMAGE, IMAGE, PUPPETS, untransported
+from flowing_puppet_ros.stream.component import COMPRESSED_IMAGE, IMAGE, PUPPETS, sends_depth, untransported
 from flowing_puppet_ros.stream.images import decode_image
 from flowing_puppet_ros.stream.messages import stamp_ns
 from flowing_puppet_ros.stream.people import keypoints_of
@@ -57,8 +57,8 @@ def open_bag_frames(
     with open_bag(path, salvage) as bag:
         for note in bag.notes:
             warn(note)
-        pictures = {name: kind for name, kind in bag.topics.items() if not name.endswith(f"/{COMPRESSED_DEPTH}")}
-        images = sorted(name for name, kind in pictures.items() if kind in (IMAGE, COMPRESSED_IMAGE))
+        kinds = (IMAGE, COMPRESSED_IMAGE)
+        images = sorted(name for name, kind in bag.topics.items() if kind in kinds and not sends_depth(name))
         people_topics = [name for name, kind in bag.topics.items() if kind == PUPPETS and name.endswith("/detections")]
         detected = {name.removesuffix("/detections"): name for name in people_topics}
         chosen = [topic] if topic else [name for name in images if _namespace(name) in detected]

@@ -9,10 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.messages import (
-    MessageFactory,
-    message_bytes,
-)
+from flowing_puppet_ros.stream.messages import MessageFactory, message_bytes
 
 # sensor_msgs/PointField datatype -> numpy
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}

@@ -43,6 +43,11 @@ def untransported(topic: str) -> str:
     return topic
 
 
+def sends_depth(topic: str) -> bool:
+    """Whether a topic is that of the transport of depth images."""
+    return topic.endswith(f"/{COMPRESSED_DEPTH}")
+
+
 @dataclass(frozen=True, slots=True)
 class Port:
     """One topic of a component: its name relative to the node's namespace, or global when it starts with a slash.

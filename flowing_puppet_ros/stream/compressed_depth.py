@@ -20,6 +20,8 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages import message_bytes
 
 LARGEST_PIXELS = 100_000_000
+"""Pixels of the largest image that is decoded; sizes beyond are lies or mistakes, and would take the memory."""
+
 HEADER = struct.Struct("<iff")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _TRUNCATED = -1
@@ -32,7 +34,7 @@ def sent_encoding(form: str) -> str:
 
 def is_compressed_depth(form: str) -> bool:
     """Whether a message's `format` is that of a depth image: "compressedDepth" with or without the codec's name."""
-    return "compresseddepth" in form.lower()
+    return "compresseddepth" in form.lower().replace(" ", "")
 
 
 def unpack_depth(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
