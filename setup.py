@@ -35,7 +35,7 @@ setup(
         NAME: [
             "py.typed",
             "annotate/page/*",
-            "view/web/*",
+            "report/web/*",
             "weights/*.npz",
             "weights/*.md",
             "interfaces/*/*/*.msg",
@@ -58,7 +58,7 @@ setup(
     entry_points={
         "console_scripts": [
             "flowing-puppet = flowing_puppet_ros.cli:main",
-            *(f"{node} = {NAME}.node.{node}:main" for node in NODES),
+            *(f"{node} = {NAME}.node.main:{node}" for node in NODES),
         ],
     },
     zip_safe=False,

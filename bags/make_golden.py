@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make the golden bag: a tiny synthetic recording of a body in four cameras, its truth, and what a replay makes of it.
 
-The body is Anny (see learn/anny.py), never a sample of the learned puppets. `--expected` replays the bag that is there
-and writes the expected results; do that when an algorithm changes on purpose, and look at the difference.
+The body is Anny (see learn/anny/body.py), never a sample of the learned puppets. `--expected` replays the bag that is
+there and writes the expected results; do that when an algorithm changes on purpose, and look at the difference.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
-from flowing_puppet_ros.body.camera import Camera
-from flowing_puppet_ros.learn.anny import AnnyBody
+from flowing_puppet_ros.draw.mesh_render import render
+from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.model import rotation
-from flowing_puppet_ros.stream import component, images, messages
-from flowing_puppet_ros.view.mesh_render import render
+from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.stream.messages import geometry, images, message_types
 
 HERE = Path(__file__).resolve().parent
 FOLDER = HERE / "golden"
@@ -34,7 +34,7 @@ FRAMES = 8
 RATE = 30
 SIZE = (192, 240)
 FOCAL = 215.0
-START_NS = 1_600_000_000 * messages.NANOSECONDS
+START_NS = 1_600_000_000 * geometry.NANOSECONDS
 DETECTOR_DELAY_NS = 5_000_000
 PHASES = 1.2  # radians of the swing that the recording shows
 UNDETECTED = (3, 6)  # frames in which the detector said nothing: there the flow must carry the puppet
@@ -104,23 +104,23 @@ class Recording:
     def __init__(self, writer: BagWriter) -> None:
         """Announce the topics and write the poses of the cameras."""
         self.writer, self.factory, self.cameras = writer, BagMessageFactory(), cameras()
-        writer.add_topic("/tf_static", component.TRANSFORMS, "latched")
-        world = messages.make_header(self.factory, START_NS, "world")
+        writer.add_topic("/tf_static", message_types.TRANSFORMS, "latched")
+        world = geometry.make_header(self.factory, START_NS, "world")
         poses = []
         for name, camera in self.cameras.items():
-            writer.add_topic(f"/{name}/image/compressed", component.COMPRESSED_IMAGE, "sensor")
-            writer.add_topic(f"/{name}/camera_info", component.CAMERA_INFO, "sensor")
-            writer.add_topic(f"/{name}/detections", component.PUPPETS)
+            writer.add_topic(f"/{name}/image/compressed", message_types.COMPRESSED_IMAGE, "sensor")
+            writer.add_topic(f"/{name}/camera_info", message_types.CAMERA_INFO, "sensor")
+            writer.add_topic(f"/{name}/detections", message_types.PUPPETS)
             child = f"{name}_optical_frame"
-            poses.append(messages.make_transform(self.factory, world, child, camera.centre, camera.rotation.T))
-        writer.write("/tf_static", START_NS, self.factory.make(component.TRANSFORMS, transforms=poses))
+            poses.append(geometry.make_transform(self.factory, world, child, camera.centre, camera.rotation.T))
+        writer.write("/tf_static", START_NS, self.factory.make(message_types.TRANSFORMS, transforms=poses))
 
     def write_image(self, name: str, stamp: int, rgb: NDArray[np.uint8]) -> None:
         """Write one image with its camera_info."""
-        header = messages.make_header(self.factory, stamp, f"{name}_optical_frame")
+        header = geometry.make_header(self.factory, stamp, f"{name}_optical_frame")
         matrix = self.cameras[name].matrix
         info = self.factory.make(
-            component.CAMERA_INFO,
+            message_types.CAMERA_INFO,
             header=header,
             height=SIZE[1],
             width=SIZE[0],
@@ -131,7 +131,7 @@ class Recording:
             p=np.hstack([matrix, np.zeros((3, 1))]),
         )
         data = images.jpeg(rgb, 90)
-        image = self.factory.make(component.COMPRESSED_IMAGE, header=header, format="jpeg", data=data)
+        image = self.factory.make(message_types.COMPRESSED_IMAGE, header=header, format="jpeg", data=data)
         self.writer.write(f"/{name}/camera_info", stamp, info)
         self.writer.write(f"/{name}/image/compressed", stamp, image)
 
@@ -142,8 +142,8 @@ class Recording:
             for joint, (x, y) in zip(COCO, pixels, strict=True)
         ]
         puppet = self.factory.make("flowing_puppet_msgs/msg/Puppet", confidence=0.8, joints=joints)
-        header = messages.make_header(self.factory, stamp, f"{name}_optical_frame")
-        array = self.factory.make(component.PUPPETS, header=header, puppets=[puppet])
+        header = geometry.make_header(self.factory, stamp, f"{name}_optical_frame")
+        array = self.factory.make(message_types.PUPPETS, header=header, puppets=[puppet])
         self.writer.write(f"/{name}/detections", stamp + DETECTOR_DELAY_NS, array)
 
 
@@ -158,7 +158,7 @@ def make_bag() -> None:
         recording = Recording(writer)
         backgrounds = {name: texture(rng, SIZE[::-1], 120.0) for name in recording.cameras}
         for frame in range(FRAMES):
-            stamp = START_NS + frame * messages.NANOSECONDS // RATE
+            stamp = START_NS + frame * geometry.NANOSECONDS // RATE
             vertices, joints = body.pose(rest, pose_rotations(body, PHASES * (frame / (FRAMES - 1) - 0.5)))
             named = body.landmarks(vertices, joints)
             truth[str(stamp)] = {joint: np.round(place, 5).tolist() for joint, place in named.items()}
@@ -178,7 +178,7 @@ def results(path: Path) -> dict[str, Any]:
     found: dict[str, Any] = {"puppets": {}, "bodies": {}}
     with open_bag(path) as bag:
         for record in bag.messages([f"/{name}/puppets" for name in cameras()] + ["/bodies"]):
-            stamp = str(messages.stamp_ns(record.message))
+            stamp = str(geometry.stamp_ns(record.message))
             if record.topic == "/bodies":
                 found["bodies"][stamp] = [
                     {j.name: [round(c, 4) for c in (j.position.x, j.position.y, j.position.z)] for j in each.joints}

@@ -29,12 +29,12 @@ from tqdm import tqdm
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.stream import component, images, messages
+from flowing_puppet_ros.stream.messages import geometry, images, message_types
 
 HERE = Path(__file__).resolve().parent
 FRAMES = 100
 RATE = 60
-START_NS = 1_700_000_000 * messages.NANOSECONDS
+START_NS = 1_700_000_000 * geometry.NANOSECONDS
 DETECTOR_DELAY_NS = 8_000_000
 # The keypoint files lag the videos: file j describes video frame j + 1.
 KEYPOINT_LAG = 1
@@ -110,26 +110,26 @@ class Recipe:
         self.writer = writer
         self.calibration = calibration
         self.factory = BagMessageFactory()
-        writer.add_topic("/tf_static", component.TRANSFORMS, "latched")
+        writer.add_topic("/tf_static", message_types.TRANSFORMS, "latched")
         for camera in calibration:
-            writer.add_topic(f"/{camera}/image/compressed", component.COMPRESSED_IMAGE, "sensor")
-            writer.add_topic(f"/{camera}/camera_info", component.CAMERA_INFO, "sensor")
-            writer.add_topic(f"/{camera}/detections", component.PUPPETS, "reliable")
+            writer.add_topic(f"/{camera}/image/compressed", message_types.COMPRESSED_IMAGE, "sensor")
+            writer.add_topic(f"/{camera}/camera_info", message_types.CAMERA_INFO, "sensor")
+            writer.add_topic(f"/{camera}/detections", message_types.PUPPETS, "reliable")
 
     def header(self, stamp: int, camera: str) -> Any:
         """Return the header of what `camera` saw at `stamp`."""
-        return messages.make_header(self.factory, stamp, f"{camera}_optical_frame")
+        return geometry.make_header(self.factory, stamp, f"{camera}_optical_frame")
 
     def write_cameras(self) -> None:
         """Write the poses of the cameras in the world."""
-        world = messages.make_header(self.factory, START_NS, "world")
+        world = geometry.make_header(self.factory, START_NS, "world")
         poses = []
         for camera, c in self.calibration.items():
             rotation = cv2.Rodrigues(np.array(c["rotation"]))[0].T
             position = -rotation @ np.array(c["translation"])
             child = f"{camera}_optical_frame"
-            poses.append(messages.make_transform(self.factory, world, child, position, rotation))
-        self.writer.write("/tf_static", START_NS, self.factory.make(component.TRANSFORMS, transforms=poses))
+            poses.append(geometry.make_transform(self.factory, world, child, position, rotation))
+        self.writer.write("/tf_static", START_NS, self.factory.make(message_types.TRANSFORMS, transforms=poses))
 
     def write_image(self, camera: str, stamp: int, rgb: NDArray[np.uint8]) -> None:
         """Write one frame and the camera_info that belongs to it."""
@@ -140,7 +140,7 @@ class Recipe:
         matrix = np.array(c["matrix"])
         matrix[0, 2] -= c["crop"]
         info = self.factory.make(
-            component.CAMERA_INFO,
+            message_types.CAMERA_INFO,
             header=header,
             height=height,
             width=width,
@@ -150,7 +150,7 @@ class Recipe:
             r=np.eye(3),
             p=np.hstack([matrix, np.zeros((3, 1))]),
         )
-        image = self.factory.make(component.COMPRESSED_IMAGE, header=header, format="jpeg", data=images.jpeg(rgb))
+        image = self.factory.make(message_types.COMPRESSED_IMAGE, header=header, format="jpeg", data=images.jpeg(rgb))
         self.writer.write(f"/{camera}/camera_info", stamp, info)
         self.writer.write(f"/{camera}/image/compressed", stamp, image)
 
@@ -166,7 +166,7 @@ class Recipe:
             ]
             confidence = float(person[:, 2].mean())
             puppets.append(self.factory.make("flowing_puppet_msgs/msg/Puppet", confidence=confidence, joints=joints))
-        array = self.factory.make(component.PUPPETS, header=self.header(stamp, camera), puppets=puppets)
+        array = self.factory.make(message_types.PUPPETS, header=self.header(stamp, camera), puppets=puppets)
         self.writer.write(f"/{camera}/detections", stamp + DETECTOR_DELAY_NS, array)
 
 
@@ -182,7 +182,7 @@ def make(out: Path, cache: Path) -> None:
             recipe = Recipe(writer, calibration)
             recipe.write_cameras()
             for index in tqdm(range(FRAMES), "sample bag", unit="frame"):
-                stamp = START_NS + index * messages.NANOSECONDS // RATE
+                stamp = START_NS + index * geometry.NANOSECONDS // RATE
                 for camera, video in videos.items():
                     rgb = next(video, None)
                     if rgb is None:

@@ -3,7 +3,7 @@
 
 from pathlib import Path
 
-from flowing_puppet_ros.node.registry import COMPONENTS, parameter_yaml
+from flowing_puppet_ros.stream.components.registry import COMPONENTS, parameter_yaml
 
 if __name__ == "__main__":
     for name in COMPONENTS:

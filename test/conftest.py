@@ -4,11 +4,15 @@
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from typing import TYPE_CHECKING
 
 import pytest
 from playwright.sync_api import Browser, sync_playwright
 
 from scripts.ensure_browser import NAMES
+
+if TYPE_CHECKING:
+    from flowing_puppet_ros.model.sp import StitchedPuppet
 
 # Below 102 no domain's ports meet the ports that Linux gives to other programs.
 os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
@@ -28,6 +32,15 @@ DRAWING_FLAGS = (
     *(flag for flag in BROWSER_FLAGS if flag != "--disable-gpu"),
     *("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
 )
+
+
+@pytest.fixture(scope="session")
+def model() -> "StitchedPuppet":
+    """Return the shipped neutral model, which cannot be changed."""
+    # Not at the top: Numba reads the number of threads, set above, when it is first imported.
+    from flowing_puppet_ros.model.sp import StitchedPuppet
+
+    return StitchedPuppet.load("neutral")
 
 
 @pytest.fixture(scope="session")

@@ -18,27 +18,154 @@ ROOT = PACKAGE.parent
 NAME = PACKAGE.name
 MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
-FOUNDATION = {"blas", "errors", "settings"}
+FOUNDATION = {"blas", "errors", "ids", "parallel", "settings", "units"}
+"""Modules beside the rooms, which everything may import."""
 OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "rerun"}
-OPTIONAL = {"learn": "learn", "cli.cluster": "cluster", "view.rerun_file": "rerun"}
+OPTIONAL = {"learn": "learn", "cli.batch.cluster": "cluster", "report.rerun_file": "rerun"}
 """Where what a requirements file other than runtime.txt lists may be imported."""
-BELOW_STREAM = {"model", "evidence", "inference", "flow", "image", "body"}
-MAY_IMPORT = {
+MAX_FILES = 10
+MAY_IMPORT: dict[str, set[str]] = {
+    "annotate": {"draw", "flow", "image.formats", "image.tracking", "model.ds"},
+    "bag": {"image.formats", "multiview", "stream", "stream.components", "stream.messages"},
+    "body": set(),
+    "body.cloud": {"evidence.cloud"},
+    "body.fit": {"body.cloud", "body.refine", "body.scans", "body.search", "evidence.cloud", "model"},
+    "body.refine": {"body.cloud", "body.search", "model"},
+    "body.scans": {"body.cloud", "model"},
+    "body.search": {"body.cloud", "evidence.cloud", "inference", "model"},
+    "body.segmentation": {"body.scans"},
+    "body.track": {"body.cloud", "body.fit", "body.refine", "body.search", "body.segmentation", "model"},
+    "cli": {
+        "annotate",
+        "bag",
+        "body.fit",
+        "body.scans",
+        "body.segmentation",
+        "cli.batch",
+        "draw",
+        "evidence.image",
+        "flow",
+        "image.arms",
+        "image.detector",
+        "image.formats",
+        "image.pose",
+        "image.tracking",
+        "image.video",
+        "model",
+        "model.ds",
+        "report",
+    },
+    "cli.batch": set(),
+    "cli.evaluate": {
+        "bag",
+        "body.fit",
+        "draw",
+        "evaluate",
+        "evaluate.bag",
+        "evaluate.body",
+        "evaluate.image",
+        "evaluate.video",
+        "evidence.image",
+        "image.arms",
+        "image.detector",
+        "image.formats",
+        "image.pose",
+        "image.thesis_loop",
+        "image.tracking",
+        "learn.likelihood",
+        "model",
+        "model.ds",
+        "report",
+    },
+    "cli.sample": {"body.scans", "draw", "model", "model.ds"},
+    "draw": {"flow"},
+    "evaluate": {"image.formats", "model"},
+    "evaluate.bag": {"bag", "body.scans", "evaluate", "image.formats", "multiview", "stream", "stream.messages"},
+    "evaluate.body": {"body.fit", "body.scans", "learn.anny", "model"},
+    "evaluate.image": {
+        "evidence.image",
+        "flow",
+        "image.formats",
+        "image.pose",
+        "learn.likelihood",
+        "learn.thesis_loop",
+        "model.ds",
+    },
+    "evaluate.video": {
+        "evaluate",
+        "evaluate.bag",
+        "evidence.image",
+        "flow",
+        "image.arms",
+        "image.detector",
+        "image.formats",
+        "image.thesis_loop",
+        "image.tracking",
+        "image.video",
+        "model.ds",
+    },
+    "evidence": set(),
+    "evidence.cloud": set(),
+    "evidence.image": {"model", "model.ds"},
+    "flow": set(),
+    "image": set(),
+    "image.arms": {"evidence.image", "flow", "image.detector", "image.pose", "image.tracking", "model.ds"},
+    "image.detector": {"evidence.image", "image.formats", "model"},
+    "image.formats": {"model", "model.ds"},
+    "image.pose": {"image.formats", "inference", "model", "model.ds"},
+    "image.thesis_loop": {
+        "evidence.image",
+        "flow",
+        "image.arms",
+        "image.formats",
+        "image.pose",
+        "image.tracking",
+        "inference",
+        "model.ds",
+    },
+    "image.tracking": {"flow", "image.formats", "model.ds"},
+    "image.video": {"flow", "image.arms", "image.detector", "image.formats", "image.tracking", "model.ds"},
+    "inference": {"model"},
+    "learn": set(),
+    "learn.anny": {"model"},
+    "learn.detector": {"evidence.image", "image.detector", "image.formats", "model.ds"},
+    "learn.ds": {"learn.anny", "model", "model.ds"},
+    "learn.likelihood": {"evidence.image", "image.formats", "model", "model.ds"},
+    "learn.sp": {"learn.anny", "model"},
+    "learn.thesis_loop": {
+        "evidence.image",
+        "flow",
+        "image.formats",
+        "image.pose",
+        "image.thesis_loop",
+        "image.tracking",
+        "learn.likelihood",
+        "model.ds",
+    },
     "model": set(),
-    "evidence": {"model"},
-    "inference": {"model", "evidence"},
-    "flow": {"model"},
-    "image": {"model", "evidence", "inference", "flow"},
-    "body": {"model", "evidence", "inference", "flow", "image"},
-    "stream": BELOW_STREAM | {"view"},
-    "bag": BELOW_STREAM | {"stream", "view"},
-    "node": BELOW_STREAM | {"stream", "view"},
-    "view": BELOW_STREAM | {"evaluate", "stream", "bag"},
-    "learn": BELOW_STREAM,
-    "evaluate": BELOW_STREAM | {"stream", "bag", "learn"},
-    "annotate": BELOW_STREAM | {"view"},
-    "cli": BELOW_STREAM | {"stream", "bag", "view", "evaluate", "learn", "annotate"},
+    "model.ds": {"model"},
+    "multiview": {"body.cloud", "body.fit", "body.refine", "body.search", "model"},
+    "node": {"stream", "stream.components", "stream.messages"},
+    "report": {"bag", "draw", "evaluate", "evaluate.bag", "flow", "model", "model.ds", "multiview", "stream.messages"},
+    "stream": {"stream.messages"},
+    "stream.components": {
+        "body.fit",
+        "body.scans",
+        "body.track",
+        "draw",
+        "flow",
+        "image.formats",
+        "image.tracking",
+        "image.video",
+        "model",
+        "model.ds",
+        "multiview",
+        "stream",
+        "stream.messages",
+    },
+    "stream.messages": {"body.fit", "image.formats", "image.tracking", "model", "model.ds", "multiview"},
 }
+"""The other rooms (folders of modules) that each room imports; the layers in docs/architecture.md are made from it."""
 
 
 def module_name(path: Path) -> str:
@@ -60,22 +187,70 @@ def imports(path: Path) -> set[str]:
     return found
 
 
-def subpackage(dotted: str) -> str:
-    """Return the part of the package that a dotted name belongs to, empty for the package itself."""
-    return [*dotted.split("."), ""][1]
+def room_of(dotted: str) -> str:
+    """Return the room of a module, class or function of the package; empty for the package itself."""
+    parts = dotted.split(".")[1:]
+    while parts and not (PACKAGE.joinpath(*parts) / "__init__.py").is_file():
+        if len(parts) == 1 and (PACKAGE / f"{parts[0]}.py").is_file():
+            break
+        parts.pop()
+    return ".".join(parts)
 
 
-@pytest.mark.parametrize("path", MODULES, ids=module_name)
-def test_arrows_point_down(path: Path) -> None:
-    own = subpackage(module_name(path))
-    allowed = MAY_IMPORT.get(own, {"cli"} if own == "__main__" else set()) | FOUNDATION | {own, "__version__", ""}
-    used = {subpackage(name) for name in imports(path) if name.split(".")[0] == NAME}
-    assert used <= allowed, f"{module_name(path)} imports {sorted(used - allowed)}"
+def layers() -> list[list[str]]:
+    """Return the rooms from the lowest layer up: those of one layer import only from the layers before it."""
+    sorter = TopologicalSorter(MAY_IMPORT)
+    sorter.prepare()
+    found: list[list[str]] = []
+    while sorter.is_active():
+        ready = sorter.get_ready()
+        sorter.done(*ready)
+        found.append(sorted(room for room in ready if files_in(room)))
+    return [layer for layer in found if layer]
 
 
-def test_every_part_has_its_rule() -> None:
-    parts = {path.name for path in PACKAGE.iterdir() if (path / "__init__.py").is_file()}
-    assert parts == set(MAY_IMPORT)
+def files_in(room: str) -> list[Path]:
+    """Return the modules that stand in a room itself."""
+    return [path for path in PACKAGE.joinpath(*room.split(".")).glob("*.py") if path.name != "__init__.py"]
+
+
+def package_of(room: str) -> str:
+    """Return the outermost folder that a room is in."""
+    return room.partition(".")[0]
+
+
+def test_rooms_import_exactly_what_is_listed() -> None:
+    found: dict[str, set[str]] = {room: set() for room in MAY_IMPORT}
+    for path in MODULES:
+        own = room_of(module_name(path))
+        if own in FOUNDATION | {"", "__main__"}:
+            continue
+        used = {room_of(name) for name in imports(path) if name.split(".")[0] == NAME}
+        found.setdefault(own, set()).update(used - FOUNDATION - {own, ""})
+    assert found == MAY_IMPORT
+
+
+def test_no_circle_of_rooms_or_of_packages() -> None:
+    list(TopologicalSorter(MAY_IMPORT).static_order())
+    packages: dict[str, set[str]] = {}
+    for room, used in MAY_IMPORT.items():
+        above = packages.setdefault(package_of(room), set())
+        above.update({package_of(other) for other in used} - {package_of(room)})
+    list(TopologicalSorter(packages).static_order())
+
+
+def test_images_and_bodies_do_not_know_each_other() -> None:
+    for room, used in MAY_IMPORT.items():
+        packages = {package_of(other) for other in used}
+        assert not (package_of(room) == "image" and packages & {"body", "multiview", "stream"})
+        assert not (package_of(room) == "body" and packages & {"image", "multiview", "stream"})
+
+
+@pytest.mark.parametrize("room", MAY_IMPORT)
+def test_rooms_are_small_and_say_what_they_are_for(room: str) -> None:
+    assert len(files_in(room)) <= MAX_FILES
+    said = ast.get_docstring(ast.parse((PACKAGE.joinpath(*room.split(".")) / "__init__.py").read_text())) or ""
+    assert "\n\n" in said, "a summary, then what comes in, what goes out and what to read first"
 
 
 def test_no_import_cycles() -> None:
@@ -86,7 +261,7 @@ def test_no_import_cycles() -> None:
 
 def test_all_but_node_imports_without_ros() -> None:
     """Every other module imports where rclpy, the message packages and what is optional are absent."""
-    names = [module_name(path) for path in MODULES if subpackage(module_name(path)) not in ("node", "__main__")]
+    names = [module_name(path) for path in MODULES if room_of(module_name(path)) not in ("node", "__main__")]
     code = f"""
 import importlib, sys
 class Absent:
@@ -114,7 +289,7 @@ def test_third_party_imports_are_required() -> None:
         for name in ("runtime", *OPTIONAL.values())
     }
     for path in MODULES:
-        own = subpackage(module_name(path))
+        own = room_of(module_name(path))
         dotted = module_name(path).removeprefix(f"{NAME}.")
         optional = next((name for place, name in OPTIONAL.items() if f"{dotted}.".startswith(f"{place}.")), "runtime")
         allowed = listed["runtime"] | listed[optional]

@@ -2,12 +2,7 @@
 """What the documentation site is made of: generated pages hold what the code has, figures are those that are drawn."""
 
 import re
-import sys
 from pathlib import Path
-
-import pytest
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "docs" / "_tools"))
 
 import docstrings  # type: ignore[import-not-found]
 import figures_2d  # type: ignore[import-not-found]
@@ -15,11 +10,12 @@ import figures_3d  # type: ignore[import-not-found]
 import interfaces  # type: ignore[import-not-found]
 import mathml  # type: ignore[import-not-found]
 import pages  # type: ignore[import-not-found]
+import pytest
 from docutils import nodes
 from sphinx.errors import SphinxError
 
 from flowing_puppet_ros.cli import VERBS
-from flowing_puppet_ros.node.registry import COMPONENTS
+from flowing_puppet_ros.stream.components.registry import COMPONENTS
 
 ROOT = Path(__file__).resolve().parent.parent
 

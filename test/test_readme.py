@@ -11,9 +11,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
 from shown_commands import ROOT, WrongCommand, blocks, check, commands, pages  # type: ignore[import-not-found]
 
 PAGES = pages()

@@ -6,9 +6,8 @@ from __future__ import annotations
 import argparse
 import re
 from collections.abc import Iterator
-from importlib import import_module
 
-from flowing_puppet_ros.cli import VERBS, verb_with_parser
+from flowing_puppet_ros.cli import VERBS, verb_module, verb_with_parser
 
 
 def pages() -> Iterator[tuple[str, str]]:
@@ -28,7 +27,7 @@ def pages() -> Iterator[tuple[str, str]]:
 
 def parsers(verb: str) -> Iterator[tuple[str, argparse.ArgumentParser]]:
     """Yield the parser of a verb, of its sub-verbs and of its sub-commands, with the words that lead there."""
-    subverbs = getattr(import_module(f"flowing_puppet_ros.cli.{verb}"), "SUBVERBS", {})
+    subverbs = getattr(verb_module(verb), "SUBVERBS", {})
     for given in ([], *([name] for name in subverbs)):
         _, parser, _ = verb_with_parser(verb, list(given))
         yield from below(" ".join([verb, *given]), parser)

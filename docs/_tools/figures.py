@@ -12,7 +12,7 @@ import figures_2d
 import figures_3d
 import numpy as np
 
-from flowing_puppet_ros.view.pictures import save
+from flowing_puppet_ros.draw.pictures import save
 
 FOLDER = Path(__file__).resolve().parent.parent / "drawn"
 WIDEST = 1400  # px

@@ -10,18 +10,18 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flowing_puppet_ros.cli.sample_ds import picture as puppet_picture
-from flowing_puppet_ros.image.keypoints import Keypoints
-from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackResult
-from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.model.ds_multiview import VIEW_HEADINGS, MultiViewStructures
-from flowing_puppet_ros.model.ds_render import depth_order, render_labels
-from flowing_puppet_ros.model.ds_shape import PuppetShape
-from flowing_puppet_ros.view.flow_colour import flow_scale, flow_to_rgb
-from flowing_puppet_ros.view.overlay import DrawnPuppet, draw_puppets
-from flowing_puppet_ros.view.palette import part_colours
-from flowing_puppet_ros.view.pictures import contact_sheet, row
-from flowing_puppet_ros.view.plots import Series, line_plot
+from flowing_puppet_ros.cli.sample.ds import picture as puppet_picture
+from flowing_puppet_ros.draw.flow_colour import flow_scale, flow_to_rgb
+from flowing_puppet_ros.draw.overlay import DrawnPuppet, draw_puppets
+from flowing_puppet_ros.draw.palette import part_colours
+from flowing_puppet_ros.draw.pictures import contact_sheet, row
+from flowing_puppet_ros.draw.plots import Series, line_plot
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
+from flowing_puppet_ros.model.ds.multiview import VIEW_HEADINGS, MultiViewStructures
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.ds.render import depth_order, render_labels
+from flowing_puppet_ros.model.ds.shape import PuppetShape
 
 SIZE = (320, 400)
 SCALE = 190.0
@@ -212,7 +212,7 @@ def tracking() -> str:
 
 
 def standalone(plot: str, names: list[str]) -> str:
-    """A plot of `view.plots` as an SVG file, with colours and a legend of its own."""
+    """A plot of `draw.plots` as an SVG file, with colours and a legend of its own."""
     svg = plot[: plot.index("</svg>")].replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
     colours = ("#b23a48", "#2f6f9f", "#2a9d5c")
     style = "text{font:12px sans-serif;fill:#333}.line{fill:none;stroke-width:1.8}.grid{stroke:#ddd}"

@@ -9,23 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.body.camera import Camera
-from flowing_puppet_ros.body.correspondence import Cloud, two_way_distance
-from flowing_puppet_ros.body.energy import JointTargets
-from flowing_puppet_ros.body.hull import HullSettings, bounds_of_joints, visual_hull
-from flowing_puppet_ros.body.initial import sampled_bodies, turned_around
-from flowing_puppet_ros.body.particles import particles_of, state_of
-from flowing_puppet_ros.body.points import part_points
-from flowing_puppet_ros.body.proposals import Proposer
-from flowing_puppet_ros.body.refine import Refiner, RefineWeights
-from flowing_puppet_ros.body.schedule import WIDE, four_stages
-from flowing_puppet_ros.body.search import Search, SearchWeights
-from flowing_puppet_ros.evaluate.synthetic_scans import surface_samples
-from flowing_puppet_ros.evidence.cloud import CloudGrid
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
+from flowing_puppet_ros.body.fit.initialisation import sampled_bodies, turned_around
+from flowing_puppet_ros.body.refine.gauss_newton import Refiner, RefineWeights
+from flowing_puppet_ros.body.search.dpmp import Search, SearchWeights
+from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.search.part_points import part_points
+from flowing_puppet_ros.body.search.particles import particles_of, state_of
+from flowing_puppet_ros.body.search.proposals import Proposer
+from flowing_puppet_ros.body.search.schedule import WIDE, four_stages
+from flowing_puppet_ros.draw.mesh_render import Canvas, OrthographicCamera, orthographic, render
+from flowing_puppet_ros.draw.palette import part_colours
+from flowing_puppet_ros.draw.pictures import caption, contact_sheet
+from flowing_puppet_ros.evaluate.body.synthetic_scans import surface_samples
+from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.view.mesh_render import Canvas, OrthographicCamera, orthographic, render
-from flowing_puppet_ros.view.palette import part_colours
-from flowing_puppet_ros.view.pictures import caption, contact_sheet
+from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.multiview.visual_hull import HullSettings, bounds_of_joints, visual_hull
 
 FRONT, ASIDE = (-1.0, -0.35, -0.12), (-1.0, 0.9, -0.2)
 NOISE, POINTS = 0.003, 4000

@@ -12,9 +12,9 @@ import commands
 import interfaces
 
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
-from flowing_puppet_ros.node.registry import COMPONENTS, node_settings
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.component import Component, Port
+from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_settings
 
 ROOT = Path(__file__).resolve().parent.parent.parent
 PACKAGE = ROOT / "flowing_puppet_ros"
@@ -25,14 +25,16 @@ API = {
     "inference": "How the best puppet is found",
     "flow": "Optical flow and puppet flow",
     "image": "People in images and videos",
-    "body": "Bodies in clouds and silhouettes",
+    "body": "Bodies in clouds",
+    "multiview": "People in calibrated cameras",
     "stream": "Messages in, messages out, without ROS",
     "bag": "Recordings",
     "node": "Nodes",
     "learn": "Learning the models",
     "evaluate": "Measuring",
     "annotate": "The annotation tool",
-    "view": "Pictures and reports",
+    "draw": "Pictures",
+    "report": "Reports",
 }
 # Settings that open every topic of a component.
 EVERYTHING = {"cameras": "CAMERA,other", "humans": True}
@@ -148,9 +150,11 @@ def api_pages() -> Iterator[tuple[str, str]]:
             ]
         ),
     )
-    yield "api/settings.md", api_page("settings", "Settings and errors", ["settings", "errors"])
+    beside = [path.stem for path in sorted(PACKAGE.glob("*.py")) if not path.stem.startswith("__")]
+    yield "api/settings.md", api_page("settings", "Settings, errors and what else all parts share", beside)
     for part, title in API.items():
-        modules = [f"{part}.{path.stem}" for path in sorted((PACKAGE / part).glob("*.py")) if path.stem != "__init__"]
+        files = sorted(path for path in (PACKAGE / part).rglob("*.py") if path.stem != "__init__")
+        modules = [".".join(file.relative_to(PACKAGE).with_suffix("").parts) for file in files]
         yield f"api/{part}.md", api_page(part, title, modules)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.video import IMAGE_SUFFIXES, natural_order
+from flowing_puppet_ros.image.formats.video_reader import IMAGE_SUFFIXES, natural_order
 
 type Image = NDArray[np.uint8]
 

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from flowing_puppet_ros.annotate.store import Person
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import OpticalFlow
-from flowing_puppet_ros.image.keypoints import Keypoints
-from flowing_puppet_ros.image.people import TrackerSettings
-from flowing_puppet_ros.image.tracker import FlowingPuppetTracker
-from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.model.ds_render import depth_order
-from flowing_puppet_ros.model.ds_shape import View
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.tracking.track import TrackerSettings
+from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.ds.render import depth_order
+from flowing_puppet_ros.model.ds.shape import View
 
 START_HEIGHT = 0.9  # of the image that a new puppet's trunk, head and arms take
 

@@ -17,8 +17,8 @@ from werkzeug.exceptions import HTTPException
 from flowing_puppet_ros.annotate import puppets
 from flowing_puppet_ros.annotate.folder import ImageFolder
 from flowing_puppet_ros.annotate.store import GENDERS, VIEWS, AnnotationStore, ConflictError, checked_people
+from flowing_puppet_ros.draw.palette import joint_colour, part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.view.palette import joint_colour, part_colours
 
 MOST_REQUEST = 1_000_000
 POLICY = (

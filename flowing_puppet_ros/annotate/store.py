@@ -20,7 +20,7 @@ import numpy as np
 
 from flowing_puppet_ros.annotate.folder import split_key
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.image.sticks import sticks_of, write_sticks
+from flowing_puppet_ros.image.formats.stickmen import sticks_of, write_sticks
 
 FILE = "annotations.json"
 GENDERS = ("neutral", "female", "male")

@@ -9,9 +9,10 @@ from typing import Any
 
 from flowing_puppet_ros.bag.reader import Bag
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.component import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, sends_depth, untransported
-from flowing_puppet_ros.stream.compressed_depth import sent_encoding
-from flowing_puppet_ros.stream.images import is_depth
+from flowing_puppet_ros.stream.component import sends_depth, untransported
+from flowing_puppet_ros.stream.messages.compressed_depth import sent_encoding
+from flowing_puppet_ros.stream.messages.images import is_depth
+from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
 
 RECTIFIED_FIRST = ("depth", "image_rect", "image_rect_raw", "image_raw")
 """Which of the depth images of one namespace is taken: the driver's own rectified one comes first."""

@@ -10,12 +10,13 @@ from typing import Any
 
 from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.keypoints import Keypoints
-from flowing_puppet_ros.image.video import Frame
-from flowing_puppet_ros.stream.component import COMPRESSED_IMAGE, IMAGE, PUPPETS, sends_depth, untransported
-from flowing_puppet_ros.stream.images import decode_image
-from flowing_puppet_ros.stream.messages import stamp_ns
-from flowing_puppet_ros.stream.people import keypoints_of
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.formats.video_reader import Frame
+from flowing_puppet_ros.stream.component import sends_depth, untransported
+from flowing_puppet_ros.stream.messages.geometry import stamp_ns
+from flowing_puppet_ros.stream.messages.images import decode_image
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, IMAGE, PUPPETS
+from flowing_puppet_ros.stream.messages.puppets import keypoints_of
 
 
 @dataclass(frozen=True, slots=True)

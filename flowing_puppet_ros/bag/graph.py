@@ -8,24 +8,23 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flowing_puppet_ros.bag.depth_topics import depth_topics, holds_depth
-from flowing_puppet_ros.body.camera import Camera as CameraModel
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.multiview.camera import Camera as CameraModel
 from flowing_puppet_ros.settings import Settings
-from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent
-from flowing_puppet_ros.stream.component import (
+from flowing_puppet_ros.stream.component import Component, Port, untransported
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
+from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
+from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
+from flowing_puppet_ros.stream.messages.geometry import FrameTree
+from flowing_puppet_ros.stream.messages.message_types import (
     BODIES,
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IMAGE,
     POINT_CLOUD,
     PUPPETS,
-    Component,
-    Port,
-    untransported,
+    MessageFactory,
 )
-from flowing_puppet_ros.stream.messages import FrameTree, MessageFactory
-from flowing_puppet_ros.stream.puppet_tracker import PuppetTrackerComponent
-from flowing_puppet_ros.stream.visual_hull import VisualHullComponent
 
 IMAGE_NAMES = ("image", "image_raw", "image_color", "image_rect", "image_rect_color")
 LEAST_CAMERAS = 2

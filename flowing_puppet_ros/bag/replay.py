@@ -23,9 +23,10 @@ from flowing_puppet_ros.bag.reader import Bag, Record, open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.component import CAMERA_INFO, COMPRESSED_IMAGE, PUPPETS, TRANSFORMS, Output, Port
-from flowing_puppet_ros.stream.images import compress
-from flowing_puppet_ros.stream.messages import FrameTree
+from flowing_puppet_ros.stream.component import Output, Port
+from flowing_puppet_ros.stream.messages.geometry import FrameTree
+from flowing_puppet_ros.stream.messages.images import compress
+from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, PUPPETS, TRANSFORMS
 
 STATIC = "/tf_static"
 NOTE = "flowing_puppet_ros"

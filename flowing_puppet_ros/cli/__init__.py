@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line `flowing-puppet <verb>`: one module a verb, imported only when that verb is used."""
+"""The command line `flowing-puppet <verb>`: one module a verb, imported only when that verb is used.
+
+Arguments come in; files, tables and an exit status go out. Read `fit` first: its neighbours are built alike.
+"""
 
 from __future__ import annotations
 
 import argparse
 import sys
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 
 from flowing_puppet_ros import __version__
-from flowing_puppet_ros.errors import PuppetError
+from flowing_puppet_ros.errors import InputError, PuppetError
 
 VERBS = {
     "fit": "fit the 3D Stitched Puppet to meshes and clouds",
@@ -26,16 +30,39 @@ VERBS = {
 }
 
 
+ROOMS = ("evaluate", "sample")
+"""Verbs of several kinds: each kind is a module of its own, in a folder."""
+
+
+def verb_module(verb: str) -> ModuleType:
+    """Import the module of a verb; InputError when it is not in what was installed."""
+    if verb == "bench":
+        return _benchmarks()
+    return import_module(f"{__name__}.{verb}.verb" if verb in ROOMS else f"{__name__}.{verb}")
+
+
+def _benchmarks() -> ModuleType:
+    """Import the benchmarks, which stand beside the package in its source tree and are not installed."""
+    source_tree = Path(__file__).resolve().parents[2]
+    if not (source_tree / "benchmarks" / "verb.py").is_file():
+        raise InputError(
+            "bench compares with plain and foreign programs that are not installed; run it in a source tree"
+        )
+    if str(source_tree) not in sys.path:
+        sys.path.append(str(source_tree))
+    return import_module("benchmarks.verb")
+
+
 def verb_with_parser(verb: str, arguments: list[str]) -> tuple[ModuleType, argparse.ArgumentParser, list[str]]:
     """Return the module of a verb, its parser, and what of its arguments is left to parse.
 
     A module may name in `SUBVERBS` the modules of optional sub-verbs: a first argument that is one leads there.
     """
-    module, name = import_module(f"flowing_puppet_ros.cli.{verb}"), verb
+    module, name = verb_module(verb), verb
     subverbs = getattr(module, "SUBVERBS", {})
     if arguments and arguments[0] in subverbs:
         name, arguments = f"{verb} {arguments[0]}", arguments[1:]
-        module = import_module(f"flowing_puppet_ros.cli.{subverbs[name.split()[1]]}")
+        module = import_module(subverbs[name.split()[1]])
     parser = argparse.ArgumentParser(prog=f"flowing-puppet {name}", description=module.__doc__)
     module.add_arguments(parser)
     return module, parser, arguments

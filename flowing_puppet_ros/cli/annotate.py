@@ -17,7 +17,7 @@ from flowing_puppet_ros.annotate.folder import ImageFolder
 from flowing_puppet_ros.annotate.server import MOST_REQUEST, make_app
 from flowing_puppet_ros.annotate.store import AnnotationStore
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.model.ds_joints import JOINT_NAMES
+from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 
 WILDCARDS = ("", "0.0.0.0", "::")
 

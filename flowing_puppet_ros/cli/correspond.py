@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.body.io import read_scan, storable
-from flowing_puppet_ros.body.surface import correspond
+from flowing_puppet_ros.body.scans.scan import read_scan, storable
+from flowing_puppet_ros.body.scans.scan_correspondence import correspond
 from flowing_puppet_ros.errors import InputError
 
 

@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.body.fitter import FitterSettings
-from flowing_puppet_ros.body.frames import UNITS, UP_NAMES
-from flowing_puppet_ros.body.io import SUFFIXES, read_scan
-from flowing_puppet_ros.body.people import ExtractionSettings
-from flowing_puppet_ros.cli import batch
+from flowing_puppet_ros.body.fit.fitter import FitterSettings
+from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
+from flowing_puppet_ros.body.scans.scan_frame import UNITS, UP_NAMES
+from flowing_puppet_ros.body.segmentation.people import ExtractionSettings
+from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.cli.fit_file import FitOptions, files_of, fit_file
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.settings import make_out_folder
@@ -63,14 +63,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     ExtractionSettings.add_arguments(parser)
     parser.add_argument("--rerun", type=Path, metavar="RRD", help="write the fits as a recording for the Rerun viewer")
-    batch.add_arguments(parser)
+    runner.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object per input on stdout")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit every input; one that fails is reported and the others go on."""
     options = FitOptions(
-        out=batch.placed(arguments.out, arguments),
+        out=runner.placed(arguments.out, arguments),
         model=arguments.model,
         up=arguments.up,
         upright=arguments.upright,
@@ -80,11 +80,11 @@ def run(arguments: argparse.Namespace) -> int:
         settings=FitterSettings.from_arguments(arguments),
         extraction=ExtractionSettings.from_arguments(arguments),
     )
-    sources = [batch.placed(source, arguments) for given in arguments.inputs for source in _scans(given)]
+    sources = [runner.placed(source, arguments) for given in arguments.inputs for source in _scans(given)]
     several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
     finished: list[dict[str, Any]] = []
     if arguments.rerun is not None:
-        from flowing_puppet_ros.view.rerun_file import rerun_sdk
+        from flowing_puppet_ros.report.rerun_file import rerun_sdk
 
         rerun_sdk()
 
@@ -92,19 +92,19 @@ def run(arguments: argparse.Namespace) -> int:
         _tell(summary, arguments.json)
         finished.extend([] if "error" in summary else [summary])
 
-    verb = batch.Verb("fit", fit_file, files_of, tell)
+    verb = runner.Verb("fit", fit_file, files_of, tell)
     if several:
-        status = batch.run_batch(verb, sources, options, arguments.out, arguments)
+        status = runner.run_batch(verb, sources, options, arguments.out, arguments)
     else:
         status = _one(verb, sources[0], options)
     if arguments.rerun is not None and finished:
-        from flowing_puppet_ros.view.rerun_file import write_fits
+        from flowing_puppet_ros.report.rerun_file import write_fits
 
         write_fits(_fits(finished), arguments.rerun)
     return status
 
 
-def _one(verb: batch.Verb, source: Path, options: FitOptions) -> int:
+def _one(verb: runner.Verb, source: Path, options: FitOptions) -> int:
     make_out_folder(options.out)
     try:
         verb.tell(fit_file(source, options, shown=True))

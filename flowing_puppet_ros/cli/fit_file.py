@@ -15,8 +15,10 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from flowing_puppet_ros.body.fitter import BodyFit, BodyFitter, FitterSettings
-from flowing_puppet_ros.body.frames import (
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.up_axis_search import fit_in_best_frame
+from flowing_puppet_ros.body.scans.scan import Scan, read_scan, storable, write_ply
+from flowing_puppet_ros.body.scans.scan_frame import (
     UNITS,
     Frame,
     all_candidates,
@@ -25,13 +27,11 @@ from flowing_puppet_ros.body.frames import (
     seen_from_origin,
     up_candidates,
 )
-from flowing_puppet_ros.body.io import Scan, read_scan, storable, write_ply
-from flowing_puppet_ros.body.people import ExtractionSettings
-from flowing_puppet_ros.body.scene import people_of_scene
-from flowing_puppet_ros.body.upright import fit_in_best_frame
+from flowing_puppet_ros.body.segmentation.people import ExtractionSettings
+from flowing_puppet_ros.body.segmentation.up_axis import people_of_scene
+from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
-from flowing_puppet_ros.view.palette import part_colours
 
 WRITTEN_SHAPES = 4
 SCENE_POINTS = 300_000

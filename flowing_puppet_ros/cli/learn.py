@@ -10,12 +10,12 @@ from types import ModuleType
 from flowing_puppet_ros.errors import InputError
 
 MODULES = {
-    "ds": "ds",
-    "sp": "sp_command",
-    "likelihood": "likelihood_command",
-    "detector": "detector_command",
-    "hands": "hands_command",
-    "flowing": "flowing_command",
+    "ds": "ds.command",
+    "sp": "sp.command",
+    "likelihood": "likelihood.command",
+    "detector": "detector.command",
+    "hands": "thesis_loop.hands_command",
+    "flowing": "thesis_loop.energy_weights_command",
 }
 
 

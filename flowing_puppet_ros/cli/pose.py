@@ -20,16 +20,16 @@ import numpy as np
 from tqdm import tqdm
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evidence.likelihood import PartLikelihood
-from flowing_puppet_ros.image.detector import DetectorSettings, PartDetector
-from flowing_puppet_ros.image.detector_person import PersonDetection
-from flowing_puppet_ros.image.pose import PoseEstimator
-from flowing_puppet_ros.image.pose_answer import PosedPuppet
-from flowing_puppet_ros.image.pose_settings import PoseSettings
-from flowing_puppet_ros.image.tracks import DECIMALS, puppet_entry, read_keypoints, write_tracks
-from flowing_puppet_ros.image.video import FOLDER_FPS, IMAGE_SUFFIXES, open_frames
-from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.model.ds_multiview import MultiViewStructures
+from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
+from flowing_puppet_ros.image.detector.detection import PersonDetection
+from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
+from flowing_puppet_ros.image.formats.tracks_json import DECIMALS, puppet_entry, read_keypoints, write_tracks
+from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, IMAGE_SUFFIXES, open_frames
+from flowing_puppet_ros.image.pose.estimator import PoseEstimator
+from flowing_puppet_ros.image.pose.result import PosedPuppet
+from flowing_puppet_ros.image.pose.settings import PoseSettings
+from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.tree import PartTree
 
 GENDERS = ("neutral", "female", "male")

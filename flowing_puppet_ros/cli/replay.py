@@ -23,7 +23,7 @@ from ruamel.yaml.error import YAMLError
 
 from flowing_puppet_ros.bag.paths import is_bag
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
-from flowing_puppet_ros.cli import batch
+from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.errors import InputError
 
 _OF_NODES_ONLY = ("queue", "autostart", "use_sim_time")
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rerun", type=Path, metavar="RRD", help="write a recording for the Rerun viewer; of several, a folder"
     )
-    batch.add_arguments(parser)
+    runner.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object an input")
 
 
@@ -91,22 +91,22 @@ def run(arguments: argparse.Namespace) -> int:
         salvage=arguments.salvage,
     )
     if arguments.rerun is not None:
-        from flowing_puppet_ros.view.rerun_file import rerun_sdk
+        from flowing_puppet_ros.report.rerun_file import rerun_sdk
 
         rerun_sdk()
-    sources = [batch.placed(source, arguments) for given in arguments.inputs for source in bags_of(given)]
+    sources = [runner.placed(source, arguments) for given in arguments.inputs for source in bags_of(given)]
     if sources == arguments.inputs and len(sources) == 1 and arguments.scheduler is None:
         return _one(sources[0], arguments, options)
     if arguments.out.suffix == ".mcap":
         raise InputError(f"--out is {arguments.out}: the results of several bags need a folder")
     told = Told(
-        out=batch.placed(arguments.out, arguments),
-        reports=arguments.report and batch.placed(arguments.report, arguments),
-        recordings=arguments.rerun and batch.placed(arguments.rerun, arguments),
+        out=runner.placed(arguments.out, arguments),
+        reports=arguments.report and runner.placed(arguments.report, arguments),
+        recordings=arguments.rerun and runner.placed(arguments.rerun, arguments),
         options=replace(options, progress=False),
     )
-    verb = batch.Verb("replay", replay_one, files_of, lambda summary: _tell(summary, arguments.json))
-    return batch.run_batch(verb, sources, told, arguments.out, arguments)
+    verb = runner.Verb("replay", replay_one, files_of, lambda summary: _tell(summary, arguments.json))
+    return runner.run_batch(verb, sources, told, arguments.out, arguments)
 
 
 def _one(source: Path, arguments: argparse.Namespace, options: ReplayOptions) -> int:
@@ -124,7 +124,7 @@ def _one(source: Path, arguments: argparse.Namespace, options: ReplayOptions) ->
 
 def replay_one(source: Path, told: Told) -> dict[str, Any]:
     """Replay one bag of several into a file of its own, with its report if that is wanted, and return the summary."""
-    name = batch.stem_of(source)
+    name = runner.stem_of(source)
     target = told.out / f"{name}.mcap"
     summary = replay(source, target, told.options)
     if told.reports is not None:
@@ -140,14 +140,14 @@ def files_of(summary: dict[str, Any]) -> list[Path]:
 
 
 def _report(source: Path, target: Path, report: Path, summary: dict[str, Any]) -> None:
-    from flowing_puppet_ros.view.report import write_report
+    from flowing_puppet_ros.report.report import write_report
 
     write_report(source, target, report, summary)
     summary["report"] = str(report)
 
 
 def _record(source: Path, target: Path, recording: Path, summary: dict[str, Any]) -> None:
-    from flowing_puppet_ros.view.rerun_file import write_replay
+    from flowing_puppet_ros.report.rerun_file import write_replay
 
     write_replay(source, target, recording)
     summary["rerun"] = str(recording)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from flowing_puppet_ros.view.report import write_report
+from flowing_puppet_ros.report.report import write_report
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -20,21 +20,21 @@ from typing import Any
 from tqdm import tqdm
 
 from flowing_puppet_ros.bag.paths import is_bag
+from flowing_puppet_ros.draw.overlay_video import check_overlay, drawn_tracks, write_overlay
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowSettings
-from flowing_puppet_ros.image.arm_path import PathSettings
-from flowing_puppet_ros.image.clip import Clip
-from flowing_puppet_ros.image.detector import PartDetector
-from flowing_puppet_ros.image.keypoints import Keypoints
-from flowing_puppet_ros.image.people import TrackerSettings
-from flowing_puppet_ros.image.sight import Eyes, Sight
-from flowing_puppet_ros.image.smoothing import SmoothingSettings
-from flowing_puppet_ros.image.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
-from flowing_puppet_ros.image.tracks import puppet_entry, read_keypoints, write_tracks
-from flowing_puppet_ros.image.video import Frame, open_frames
-from flowing_puppet_ros.image.video_tracker import DetectionSettings, VideoTracker
-from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.view.overlay_video import check_overlay, drawn_tracks, write_overlay
+from flowing_puppet_ros.image.arms.evidence import Eyes, Sight
+from flowing_puppet_ros.image.arms.viterbi import PathSettings
+from flowing_puppet_ros.image.detector.part_detector import PartDetector
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.formats.tracks_json import puppet_entry, read_keypoints, write_tracks
+from flowing_puppet_ros.image.formats.video_reader import Frame, open_frames
+from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings
+from flowing_puppet_ros.image.tracking.track import TrackerSettings
+from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
+from flowing_puppet_ros.image.video.offline_smoother import Clip
+from flowing_puppet_ros.image.video.tracking_by_detection import DetectionSettings, VideoTracker
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 type Detected = tuple[Frame, list[Keypoints] | None]
 type Stepped = tuple[TrackResult, dict[str, Sight] | None]

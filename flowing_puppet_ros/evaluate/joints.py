@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.keypoints import normalise_name
+from flowing_puppet_ros.image.formats.keypoints import normalise_name
 from flowing_puppet_ros.model.tree import mirrored_name
 
 ARM_JOINTS = ("shoulder", "elbow", "wrist")

@@ -1,2 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the best puppet is found: particle max-product over trees and its diverse selection."""
+"""How the best puppet is found: particle max-product over trees, diverse selection, particle swarms.
+
+Costs of particles and of pairs of particles come in; the best particles go out. Nothing here knows of bodies. Read
+`max_product` first.
+"""

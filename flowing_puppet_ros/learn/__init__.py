@@ -1,2 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a puppet comes from: bodies of a 3D model become Deformable Structures and Stitched Puppets."""
+"""Where the shipped models come from: the commands of `flowing-puppet learn`, a folder for each product.
+
+Synthetic bodies or annotated images come in; weights with a model card go out. Nothing else imports it but `evaluate`.
+"""

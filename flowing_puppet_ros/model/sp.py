@@ -107,7 +107,7 @@ class StitchedPuppet:
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, Array]) -> StitchedPuppet:
-        """Build from the arrays of a weights file, as `learn.sp` writes them."""
+        """Build from the arrays of a weights file, as `learn.sp.training` writes them."""
         tree = PartTree.from_parents(SP_PARENTS)
         topology = PartTopology.from_faces(arrays["faces"], arrays["part_of_face"], tree)
         joint_weight = arrays["joint_weight"].astype(np.float64)

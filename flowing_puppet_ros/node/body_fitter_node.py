@@ -13,7 +13,7 @@ from rclpy.action.server import ServerGoalHandle
 from flowing_puppet_ros.errors import PuppetError
 from flowing_puppet_ros.node.component_node import ComponentNode
 from flowing_puppet_ros.node.session import Session
-from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
 
 
 class _Cancelled(Exception):

@@ -21,9 +21,9 @@ from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.node.diagnostics import Condition, Diagnostics
 from flowing_puppet_ros.node.factory import RosMessageFactory
 from flowing_puppet_ros.node.parameters import changed, declare, with_floats
-from flowing_puppet_ros.node.registry import COMPONENTS, FIXED, node_settings
 from flowing_puppet_ros.node.session import Session
 from flowing_puppet_ros.stream.component import Component
+from flowing_puppet_ros.stream.components.registry import COMPONENTS, FIXED, node_settings
 
 C = TypeVar("C", bound=Component)
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE

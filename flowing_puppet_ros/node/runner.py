@@ -47,7 +47,7 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
 
 
 def _parser(name: str, description: str | None) -> argparse.ArgumentParser:
-    from flowing_puppet_ros.node.registry import COMPONENTS, node_settings
+    from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_settings
 
     infos = [*COMPONENTS[name].settings_type.describe(), *node_settings(name).describe()]
     parameters = "\n".join(f"  {info.name} [{info.default}]: {info.description}" for info in infos)

@@ -24,10 +24,12 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.diagnostics import Diagnostics
 from flowing_puppet_ros.node.factory import message_type
 from flowing_puppet_ros.node.worker import Worker
-from flowing_puppet_ros.stream.component import COMPRESSED_IMAGE, Component, Output, Port
-from flowing_puppet_ros.stream.images import compress
-from flowing_puppet_ros.stream.messages import NANOSECONDS, header_ns
-from flowing_puppet_ros.stream.pairing import BACKWARD_JUMP_NS
+from flowing_puppet_ros.stream.component import Component, Output, Port
+from flowing_puppet_ros.stream.messages.geometry import header_ns
+from flowing_puppet_ros.stream.messages.images import compress
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
+from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
+from flowing_puppet_ros.units import NANOSECONDS
 
 QUIET_SECONDS = 5.0
 """Shortest time between two log lines about the same trouble."""

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings
-from flowing_puppet_ros.stream.messages import MessageFactory
+from flowing_puppet_ros.stream.messages.message_types import MessageFactory
 
 Output = list[tuple[str, Any]]
 """Names of output ports, or of a person's topic of one (`Port.of`), each with a message; None closes such a topic."""
@@ -25,15 +25,7 @@ _ID = "{id}"
 MOST_WARNINGS = 100
 """Different sentences that a component logs in its life; what can be wrong with hostile input has no end."""
 
-IMAGE = "sensor_msgs/msg/Image"
-COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 COMPRESSED, COMPRESSED_DEPTH = "compressed", "compressedDepth"  # transports of images
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
-TRANSFORMS = "tf2_msgs/msg/TFMessage"
-PUPPETS = "flowing_puppet_msgs/msg/PuppetArray"
-BODIES = "flowing_puppet_msgs/msg/BodyArray"
-SILHOUETTES = "flowing_puppet_msgs/msg/SilhouetteSet"
 
 
 def untransported(topic: str) -> str:

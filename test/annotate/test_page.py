@@ -16,7 +16,7 @@ import pytest
 from playwright.sync_api import Browser, Page, ViewportSize
 
 from flowing_puppet_ros.annotate.store import FILE
-from flowing_puppet_ros.model.ds_joints import JOINT_NAMES
+from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 
 ELBOW = JOINT_NAMES[10].index("left_elbow")
 WINDOW = ViewportSize(width=1100, height=700)

@@ -13,8 +13,8 @@ from flask.testing import FlaskClient
 from flowing_puppet_ros.annotate.folder import ImageFolder
 from flowing_puppet_ros.annotate.server import MOST_REQUEST, make_app
 from flowing_puppet_ros.annotate.store import AnnotationStore
-from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.model.ds_joints import JOINT_NAMES
+from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 HOST = "localhost:8008"
 

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from flowing_puppet_ros.annotate.store import FILE, AnnotationStore, ConflictError, checked_people
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.image.sticks import read_sticks
-from flowing_puppet_ros.model.ds_joints import JOINT_NAMES
+from flowing_puppet_ros.image.formats.stickmen import read_sticks
+from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 
 NAMES = JOINT_NAMES[10]
 

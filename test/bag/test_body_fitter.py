@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
-from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent, BodyFitterSettings
-from flowing_puppet_ros.stream.clouds import decode_cloud, make_cloud
-from flowing_puppet_ros.stream.component import BODIES
-from flowing_puppet_ros.stream.messages import make_header, rotation_matrix, stamp_ns
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
+from flowing_puppet_ros.stream.messages.clouds import decode_cloud, make_cloud
+from flowing_puppet_ros.stream.messages.geometry import make_header, rotation_matrix, stamp_ns
+from flowing_puppet_ros.stream.messages.message_types import BODIES
 
 FACTORY = BagMessageFactory()
 # z up -> y down, as in an optical frame: x right, z forward.

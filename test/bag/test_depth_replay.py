@@ -1,28 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recorded depth images drive the body fitter as they do live; which topics are taken for depth, and what is said."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.body_fitter import BodyFitterComponent, BodyFitterSettings
-from flowing_puppet_ros.stream.clouds import make_cloud
-from flowing_puppet_ros.stream.component import BODIES, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
-from flowing_puppet_ros.stream.images import make_image
-from flowing_puppet_ros.stream.messages import make_header
-from flowing_puppet_ros.view.report_data import gather
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "body"))
-from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
+from flowing_puppet_ros.report.data import gather
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.geometry import make_header
+from flowing_puppet_ros.stream.messages.images import make_image
+from flowing_puppet_ros.stream.messages.message_types import BODIES, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 
 FACTORY = BagMessageFactory()
 FAST = {

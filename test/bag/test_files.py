@@ -17,8 +17,8 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.clouds import make_cloud
-from flowing_puppet_ros.stream.messages import make_header
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.geometry import make_header
 
 FACTORY = BagMessageFactory()
 CLOUD = "sensor_msgs/msg/PointCloud2"

@@ -10,7 +10,7 @@ from flowing_puppet_ros.bag.frames import open_bag_frames
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.images import decode_image
+from flowing_puppet_ros.stream.messages.images import decode_image
 
 GOLDEN = Path(__file__).resolve().parents[2] / "bags" / "golden" / "golden.mcap"
 

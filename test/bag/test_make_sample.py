@@ -16,8 +16,8 @@ import pytest
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import PuppetError
-from flowing_puppet_ros.stream.images import decode_image
-from flowing_puppet_ros.stream.messages import FrameTree
+from flowing_puppet_ros.stream.messages.geometry import FrameTree
+from flowing_puppet_ros.stream.messages.images import decode_image
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 

@@ -19,8 +19,8 @@ from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.images import decode_image, make_image
-from flowing_puppet_ros.view.report import write_report
+from flowing_puppet_ros.report.report import write_report
+from flowing_puppet_ros.stream.messages.images import decode_image, make_image
 
 FACTORY = BagMessageFactory()
 IMAGE = "sensor_msgs/msg/Image"

@@ -16,9 +16,9 @@ from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.clouds import make_cloud
-from flowing_puppet_ros.stream.images import make_image
-from flowing_puppet_ros.stream.messages import make_header
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.geometry import make_header
+from flowing_puppet_ros.stream.messages.images import make_image
 
 FACTORY = BagMessageFactory()
 IMAGE = "sensor_msgs/msg/Image"

@@ -13,7 +13,7 @@ from ruamel.yaml import YAML
 
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import typestore
-from flowing_puppet_ros.stream.messages import FrameTree
+from flowing_puppet_ros.stream.messages.geometry import FrameTree
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 SHOWN_BY = {

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.cli import main
-from flowing_puppet_ros.model.ds import DeformableStructures
-from flowing_puppet_ros.model.ds_render import depth_order, render_labels
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.ds.render import depth_order, render_labels
 
 MODEL = DeformableStructures.load()
 JOINTS = MODEL.likely().joints * 70 + [110, 60]

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.io import read_scan
+from flowing_puppet_ros.body.scans.scan import read_scan
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.model.sp import StitchedPuppet
 

@@ -12,7 +12,7 @@ import pytest
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.cli import main
-from flowing_puppet_ros.model.ds import DeformableStructures
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 GOLDEN = Path(__file__).parents[2] / "bags" / "golden" / "golden.mcap"
 MODEL = DeformableStructures.load()

@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests of this folder share: the Anny body, and the painted people of the image tests to import."""
-
-import sys
-from pathlib import Path
+"""The Anny body, for the tests of this folder."""
 
 import pytest
 
-from flowing_puppet_ros.learn.anny import AnnyBody
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "image"))
+from flowing_puppet_ros.learn.anny.body import AnnyBody
 
 
 @pytest.fixture(scope="session")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from flowing_puppet_ros.node.registry import COMPONENTS, node_settings, parameter_yaml
+from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_settings, parameter_yaml
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 

@@ -16,12 +16,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from flowing_puppet_msgs.msg import BodyArray, Puppet, PuppetArray, PuppetJoint
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
-from flowing_puppet_ros.evaluate.drawn_person import JOINTS, DrawnPerson
+from benchmarks.drawn_person import JOINTS, DrawnPerson
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.node.factory import RosMessageFactory
-from flowing_puppet_ros.stream.clouds import make_cloud
-from flowing_puppet_ros.stream.images import make_image
-from flowing_puppet_ros.stream.messages import make_header
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.geometry import make_header
+from flowing_puppet_ros.stream.messages.images import make_image
 from test.node.conftest import Peer, running_nodes
 
 pytestmark = pytest.mark.ros

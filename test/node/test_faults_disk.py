@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
-from flowing_puppet_ros.stream.images import make_image
-from flowing_puppet_ros.stream.messages import make_header
+from flowing_puppet_ros.stream.messages.images import make_image
+from flowing_puppet_ros.stream.messages.geometry import make_header
 factory, rng = BagMessageFactory(), np.random.default_rng(0)
 writer = BagWriter(Path(sys.argv[1]))
 writer.add_topic("/image", "sensor_msgs/msg/Image")

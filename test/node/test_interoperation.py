@@ -22,7 +22,7 @@ from rclpy.qos import QoSProfile
 
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.node.factory import RosMessageFactory
-from flowing_puppet_ros.stream.messages import make_header, make_point, make_pose
+from flowing_puppet_ros.stream.messages.geometry import make_header, make_point, make_pose
 
 pytestmark = pytest.mark.ros
 FACTORY = RosMessageFactory()

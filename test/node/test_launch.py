@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from flowing_puppet_ros.node.registry import COMPONENTS
+from flowing_puppet_ros.stream.components.registry import COMPONENTS
 
 LAUNCH = Path(__file__).resolve().parents[2] / "launch"
 

@@ -19,8 +19,8 @@ from sensor_msgs.msg import Image
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.component_node import ComponentNode
 from flowing_puppet_ros.node.factory import RosMessageFactory
-from flowing_puppet_ros.stream.images import make_image
-from flowing_puppet_ros.stream.messages import make_header
+from flowing_puppet_ros.stream.messages.geometry import make_header
+from flowing_puppet_ros.stream.messages.images import make_image
 
 pytestmark = pytest.mark.ros
 FACTORY = RosMessageFactory()

@@ -16,7 +16,7 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import typestore
 from flowing_puppet_ros.node.factory import message_type
-from flowing_puppet_ros.stream.messages import stamp_ns
+from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 
 pytestmark = pytest.mark.ros
 GOLDEN = Path(__file__).resolve().parents[2] / "bags" / "golden" / "golden.mcap"

@@ -21,9 +21,9 @@ from std_srvs.srv import Trigger
 
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.node.factory import RosMessageFactory
-from flowing_puppet_ros.stream.clouds import make_cloud
-from flowing_puppet_ros.stream.images import make_image
-from flowing_puppet_ros.stream.messages import make_header
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.geometry import make_header
+from flowing_puppet_ros.stream.messages.images import make_image
 
 pytestmark = pytest.mark.ros
 FACTORY = RosMessageFactory()

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Feed a node over DDS with prepared images or clouds and measure what comes back: rate, latency, lock-on, memory.
+
+`python -m benchmarks.live_node NODE INPUT.npz --rate HZ --seconds S [-- ROS arguments of the node]` starts
+the node as a process of its own, publishes the array `images` (N,H,W,3) or `clouds` (N,P,3) of the file to and fro with
+the present time as stamps, and prints one JSON object. Input travels reliably: of images of a megabyte a best-effort
+subscriber of Fast DDS as it is shipped misses a quarter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import signal
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+
+from flowing_puppet_ros.node.factory import RosMessageFactory, message_type
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.geometry import header_ns, make_header
+from flowing_puppet_ros.stream.messages.images import make_image
+from flowing_puppet_ros.stream.messages.message_types import BODIES, IMAGE, POINT_CLOUD, PUPPETS
+
+STREAMS = {
+    "puppet_tracker": ("images", "image", IMAGE, "puppets", PUPPETS),
+    "body_fitter": ("clouds", "points", POINT_CLOUD, "bodies", BODIES),
+}
+"""Node -> array of the input file, input topic and type, output topic and type."""
+NAMESPACE = "/measured"
+PATIENCE = 120.0
+"""Seconds that a node may take to start."""
+SETTLING = 60.0
+"""Seconds after which memory should not grow any more."""
+
+
+class Feeder(Node):
+    """Publishes the input and notes what comes back."""
+
+    def __init__(self, name: str, arrays: Any) -> None:
+        """Make the messages; only their stamps change later."""
+        super().__init__("measure", namespace=NAMESPACE)
+        array, topic, kind, output, output_kind = STREAMS[name]
+        factory = RosMessageFactory()
+        header = make_header(factory, 0, "sensor")
+        once = [
+            make_image(factory, header, item, "rgb8") if array == "images" else make_cloud(factory, header, item)
+            for item in arrays[array]
+        ]
+        self.messages = [*once, *once[-2:0:-1]]
+        self.feed = self.create_publisher(message_type(kind), topic, QoSProfile(depth=2))
+        self.people = output
+        self.sent = 0
+        self.came: list[tuple[float, float, int]] = []
+        """Arrival (s, monotonic), latency (s) and number of people of every result."""
+        self.create_subscription(message_type(output_kind), output, self._result, QoSProfile(depth=50))
+
+    def send(self) -> None:
+        """Publish the next message, stamped now."""
+        message = self.messages[self.sent % len(self.messages)]
+        message.header.stamp = self.get_clock().now().to_msg()
+        self.feed.publish(message)
+        self.sent += 1
+
+    def _result(self, message: Any) -> None:
+        latency = (self.get_clock().now().nanoseconds - header_ns(message.header)) * 1e-9
+        self.came.append((time.monotonic(), latency, len(getattr(message, self.people))))
+
+
+def measure(name: str, arrays: Any, rate: float, seconds: float, ros_arguments: list[str]) -> dict[str, Any]:
+    """Run the node for `seconds` of input and return what was measured; RuntimeError when it does not start."""
+    reliable = f"qos_overrides.{NAMESPACE}/{STREAMS[name][1]}.subscription.reliability:=reliable"
+    command = [sys.executable, "-m", "flowing_puppet_ros.node.main", name, "--ros-args"]
+    command += ["-r", f"__ns:={NAMESPACE}", "-p", reliable]
+    feeder = Feeder(name, arrays)
+    executor = SingleThreadedExecutor()
+    executor.add_node(feeder)
+    with subprocess.Popen([*command, *ros_arguments], stdin=subprocess.DEVNULL) as process:
+        try:
+            _wait(feeder, executor, process)
+            return {"node": name, "input_hz": rate, **_run(feeder, executor, process.pid, rate, seconds)}
+        finally:
+            process.send_signal(signal.SIGINT)
+
+
+def _wait(feeder: Feeder, executor: SingleThreadedExecutor, process: subprocess.Popen[bytes]) -> None:
+    until = time.monotonic() + PATIENCE
+    while not feeder.feed.get_subscription_count():
+        if process.poll() is not None or time.monotonic() > until:
+            raise RuntimeError("the node did not start")
+        executor.spin_once(timeout_sec=0.1)
+
+
+def _run(feeder: Feeder, executor: SingleThreadedExecutor, pid: int, rate: float, seconds: float) -> dict[str, Any]:
+    memory: list[tuple[float, float]] = []
+    start = time.monotonic()
+    while (now := time.monotonic()) < start + seconds:
+        due = start + feeder.sent / rate
+        if now >= due:
+            feeder.send()
+        if not memory or now > memory[-1][0] + 1.0:
+            memory.append((now, _megabytes(pid)))
+        executor.spin_once(timeout_sec=max(0.0, min(due - now, 0.05)))
+    found = [arrival for arrival, _, people in feeder.came if people]
+    lock_on = found[0] if found else float("inf")
+    steady = [(arrival, latency) for arrival, latency, _ in feeder.came if arrival > lock_on]
+    latencies = sorted(1000 * latency for _, latency in steady)
+    settled = [megabytes for at, megabytes in memory if at >= start + min(SETTLING, seconds / 2)]
+    return {
+        "sent": feeder.sent,
+        "results": len(feeder.came),
+        "with_people": len(found),
+        "lock_on_s": round(lock_on - start, 2) if found else None,
+        "output_hz": round(len(steady) / (start + seconds - lock_on), 2) if found else 0.0,
+        "latency_median_ms": round(statistics.median(latencies), 1) if latencies else None,
+        "latency_p95_ms": round(latencies[int(0.95 * (len(latencies) - 1))], 1) if latencies else None,
+        "memory_mb": round(memory[-1][1], 1),
+        "growth_mb": round(settled[-1] - settled[0], 1),
+    }
+
+
+def _megabytes(pid: int) -> float:
+    """Resident memory of a process."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS"))
+
+
+def main() -> int:
+    """Measure as the command line says and print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("node", choices=STREAMS)
+    parser.add_argument("input", type=Path)
+    parser.add_argument("--rate", type=float, required=True)
+    parser.add_argument("--seconds", type=float, required=True)
+    split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    given, ros_arguments = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
+    rclpy.init(args=[])
+    try:
+        with np.load(given.input) as arrays:
+            print(json.dumps(measure(given.node, arrays, given.rate, given.seconds, ros_arguments)))
+    except (RuntimeError, KeyboardInterrupt, ExternalShutdownException) as error:
+        print(f"measure {given.node}: {error or 'interrupted'}", file=sys.stderr)
+        return 1
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Speed of the 2D tracker by image size and people, on puppets drawn over noise, and of the replay of a recording.
+
+Processor time of the whole process, after a first run that compiles.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.blas import one_blas_thread
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evaluate.tables import Row
+from flowing_puppet_ros.flow.estimate import FlowSettings
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.ds.render import depth_order, render_labels
+
+SIZES = ((320, 240), (640, 480), (1280, 960))
+PEOPLE = (1, 2, 4, 8)
+MIDDLE, ALONE = (640, 480), 1
+FRAMES, STEP = 6, 3.0  # images, and pixels a person moves from one to the next
+GOLDEN = Path(__file__).resolve().parent.parent.parent / "bags" / "golden"
+
+type People = list[tuple[np.ndarray, float]]  # joints (J,2) px, scale px/m
+
+
+def tracking(seed: int) -> list[Row]:
+    """Milliseconds of the tracker an image, with `preset: fast`, by the size of the image and by people."""
+    rows = [_tracked(size, ALONE, seed) for size in SIZES]
+    return rows + [_tracked(MIDDLE, people, seed) for people in PEOPLE if people != ALONE]
+
+
+def _tracked(size: tuple[int, int], people: int, seed: int) -> Row:
+    model, rng = DeformableStructures.load(), np.random.default_rng(seed)
+    ground = cv2.resize(rng.integers(0, 255, (48, 64, 3)).astype(np.uint8), size, interpolation=cv2.INTER_CUBIC)
+    crowd = _crowd(model, size, people)
+    tracker = FlowingPuppetTracker(model, None, FlowSettings(preset="fast"))
+    seconds = []
+    cv2.setNumThreads(1)
+    with one_blas_thread():
+        for number in range(FRAMES):
+            moved = [(joints + np.array([STEP * number, 0.0]), scale) for joints, scale in crowd]
+            image = _drawn(model, np.asarray(ground), moved)
+            certain = np.ones(len(model.joint_names))
+            detections = [Keypoints(model.joint_names, joints, certain) for joints, _ in moved] if not number else None
+            started = time.process_time()
+            result = tracker.step(image, number * 33_000_000, detections)
+            seconds.append(time.process_time() - started)
+    # The first image starts the people, the second may compile.
+    spent = 1000 * float(np.median(seconds[2:]))
+    row = {"width": size[0], "height": size[1], "people": people, "tracked": len(result.puppets)}
+    return row | {"milliseconds_an_image": spent}
+
+
+def _crowd(model: DeformableStructures, size: tuple[int, int], count: int) -> People:
+    """People beside each other who fill two thirds of the height, or as much as so many can."""
+    joints = model.likely().joints
+    joints = joints - joints.min(axis=0)
+    width, height = joints.max(axis=0)
+    room = (size[0] - STEP * FRAMES) / count
+    scale = min(0.66 * size[1] / height, 0.9 * room / width)
+    corners = [np.array([room * (k + 0.5) - scale * width / 2, 0.2 * size[1]]) for k in range(count)]
+    return [(joints * scale + corner, scale) for corner in corners]
+
+
+def _drawn(model: DeformableStructures, ground: np.ndarray, people: People) -> np.ndarray:
+    image, colours = ground.copy(), np.random.default_rng(0).integers(0, 255, (len(model.tree), 3))
+    for joints, scale in people:
+        contours = model.puppet_from_joints(joints, scale).contours
+        labels = render_labels(contours, depth_order(model), (ground.shape[0], ground.shape[1]))
+        image[labels > 0] = colours[labels[labels > 0] - 1]
+    return image
+
+
+def replaying(seed: int) -> list[Row]:
+    """Replay of the repository's small recording of four cameras, with all that it writes: images, bodies, times."""
+    if not GOLDEN.is_dir():
+        raise InputError(f"the replay is measured on {GOLDEN}, which only the source tree has")
+    with tempfile.TemporaryDirectory() as folder:
+        for attempt in range(2):
+            started = time.process_time(), time.perf_counter()
+            summary = replay(GOLDEN, Path(folder) / f"{attempt}.mcap", ReplayOptions(seed=seed))
+            spent = time.process_time() - started[0], time.perf_counter() - started[1]
+    row = {"images": summary["frames"], "bodies": summary["bodies"], "processor_seconds": spent[0], "seconds": spent[1]}
+    return [row | {"images_a_second": summary["frames"] / spent[1]}]

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits of clouds whose up axis is not known: directions are compared coarsely and the best are fitted in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, checked_cloud
+from flowing_puppet_ros.body.fit.hypotheses import Progress, part_of
+from flowing_puppet_ros.body.scans.scan_frame import Frame, upright
+
+MOST_FITS = 3
+
+
+def fit_in_best_frame(
+    fitter: BodyFitter,
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    *,
+    scale: float,
+    ups: Sequence[np.ndarray],
+    sensor: np.ndarray | None = None,
+    progress: Progress,
+) -> tuple[Frame, BodyFit]:
+    """Fit a cloud of one person in the frame that explains it best.
+
+    The directions are ordered by `BodyFitter.promise`; at most three are fitted in, until a fit is reliable.
+
+    Args:
+        fitter: does the fits.
+        points: (N, 3) in the scan's frame and unit.
+        normals: (N, 3) in the scan's frame, or None.
+        scale: metres a unit.
+        ups: directions (3,) of the scan's frame that may point up.
+        sensor: (3,) where the sensor stood, in the scan's frame and unit, for a cloud from one side.
+        progress: called with the fraction done.
+
+    Returns:
+        The frame and the fit, in metres with z up.
+
+    Raises:
+        InputError: when the cloud cannot be the surface of a person.
+    """
+    points, normals = checked_cloud(points, normals)
+    frames = [Frame(scale, upright(up)) for up in ups]
+    if len(frames) > 1:
+        promise = [fitter.promise(frame.to_body(points), _moved(frame, sensor)) for frame in frames]
+        frames = [frames[index] for index in np.argsort(promise, kind="stable")[:MOST_FITS]]
+    fits: list[tuple[Frame, BodyFit]] = []
+    for turn, frame in enumerate(frames):
+        fit = fitter.fit(
+            frame.to_body(points),
+            None if normals is None else normals @ frame.rotation.T,
+            viewpoint=_moved(frame, sensor),
+            progress=part_of(progress, turn / len(frames), (turn + 1) / len(frames)),
+        )
+        fits.append((frame, fit))
+        if fit.reliable:
+            break
+    progress(1.0)
+    return min(fits, key=lambda pair: pair[1].two_way_distance)
+
+
+def _moved(frame: Frame, sensor: np.ndarray | None) -> np.ndarray | None:
+    return None if sensor is None else frame.to_body(sensor)

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Levenberg-Marquardt moves: every new particle is drawn to its closest cloud points (thesis Eqs. 55-64).
+
+The unknowns are rotation, translation and pose deformation. Residuals are taken in the part's own frame, which leaves
+the sum of squares as it is: with y = R^T (v - o) for cloud point v and p for the model point in that frame the
+residual is p - y, its derivative with respect to a rotation increment on the right of R is -[p]x, with respect to the
+translation (in the part's frame) the identity, and with respect to the deformation the constant basis.
+
+Other than the thesis, which damps with lambda I and takes every residual alike: the damping is scaled by the diagonal
+of J J^T (Marquardt 1963), so that radians, metres and coefficients are damped alike; points whose normals contradict
+the cloud's count less, believed joints pull too, and a weak prior keeps the deformation bounded.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.search.part_points import PartPoints
+from flowing_puppet_ros.body.search.particles import Particles
+from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, look_up
+from flowing_puppet_ros.model.sp import DEVIATIONS
+
+DAMPING = 0.1
+DAMPING_FACTOR = 10.0
+MAX_TURN = 0.6
+POSE_PRIOR = 5e-5
+CONTRADICTING_WEIGHT = 0.3
+# Points, normals, nearest indices, origin and cell of a CloudGrid.
+CloudArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
+# Basis (K, D, 3), normals and weights of the surface points and then the joints, the joints' targets, and the weighted
+# sums over all points of the basis (D, 3) and of its products (D, D).
+PartArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+Triple = tuple[float, float, float]
+
+
+def improve(
+    points: PartPoints, particles: Particles, grid: CloudGrid, targets: JointTargets, steps: int, count: int
+) -> Particles:
+    """Run `steps` LM steps on every particle of one part, with the closest points renewed at each step.
+
+    Args:
+        points: the part's points.
+        particles: where to start.
+        grid: the cloud; a closest point whose normal contradicts the model's counts less.
+        targets: believed joints, which pull with their weights.
+        steps: tried steps a particle.
+        count: how many surface points to use.
+
+    Returns:
+        Particles of the same shape coefficients whose sum of squares is not larger.
+    """
+    center, rotation, pose = particles.center.copy(), particles.rotation.copy(), particles.pose.copy()
+    mean, part = prepared_part(points, particles, targets, min(count, len(points.surface)))
+    cloud = (grid.points, grid.normals, grid.nearest, grid.origin, grid.cell)
+    _improve_all(center, rotation, pose, mean, part, cloud, steps)
+    return Particles(center, rotation, pose, particles.shape)
+
+
+def prepared_part(
+    points: PartPoints, particles: Particles, targets: JointTargets, count: int
+) -> tuple[np.ndarray, PartArrays]:
+    """Undeformed points (P, count + M, 3) of every particle, surface before joints, and what all particles share."""
+    surface, joints = points.surface, points.joints
+    mean = np.concatenate([surface.shaped(particles.shape)[:, :count], joints.shaped(particles.shape)], axis=1)
+    basis = np.concatenate([surface.pose_basis[:count], joints.pose_basis]).transpose(0, 2, 1).copy()
+    weight = np.concatenate([np.full(count, 1.0 / count), targets.weight[points.joint_index]])
+    first = np.tensordot(weight, basis, 1)
+    second = np.tensordot(basis * weight[:, None, None], basis, axes=([0, 2], [0, 2]))
+    target = np.ascontiguousarray(targets.points[points.joint_index])
+    return mean, (basis, np.ascontiguousarray(points.normals[:count]), weight, target, first, second)
+
+
+@njit(cache=True, nogil=True)
+def _improve_all(
+    center: np.ndarray,
+    rotation: np.ndarray,
+    pose: np.ndarray,
+    mean: np.ndarray,
+    part: PartArrays,
+    cloud: CloudArrays,
+    steps: int,
+) -> None:
+    unknowns = 6 + pose.shape[1]
+    hessian, gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    new_hessian, new_gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    step, factor = np.zeros(unknowns), np.zeros((unknowns, unknowns))
+    for p in range(len(center)):
+        damping = DAMPING
+        cost = assemble(center[p], rotation[p], pose[p], mean[p], part, cloud, hessian, gradient)
+        for _ in range(steps):
+            _solve(hessian, gradient, damping, factor, step)
+            turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+            if turn > MAX_TURN:
+                step *= MAX_TURN / turn
+            new_center = center[p] + rotation[p] @ step[3:6]
+            new_rotation = rotation[p] @ _rotation(step[:3])
+            new_pose = np.minimum(np.maximum(pose[p] + step[6:], -DEVIATIONS), DEVIATIONS)
+            new_cost = assemble(new_center, new_rotation, new_pose, mean[p], part, cloud, new_hessian, new_gradient)
+            if new_cost < cost:
+                center[p], rotation[p], pose[p], cost = new_center, new_rotation, new_pose, new_cost
+                hessian, new_hessian = new_hessian, hessian
+                gradient, new_gradient = new_gradient, gradient
+                damping /= DAMPING_FACTOR
+            else:
+                damping *= DAMPING_FACTOR
+
+
+@njit(cache=True, nogil=True)
+def assemble(
+    center: np.ndarray,
+    rotation: np.ndarray,
+    pose: np.ndarray,
+    mean: np.ndarray,
+    part: PartArrays,
+    cloud: CloudArrays,
+    hessian: np.ndarray,
+    gradient: np.ndarray,
+) -> float:
+    """Fill the normal equations (the lower triangle) and return half the weighted sum of squares.
+
+    The unknowns are increments of turn and place in the part's own frame, then the deformation. What all particles
+    share is in the sums that come with the part; points that contradict the cloud take their share of it back.
+    """
+    basis, normals, weight, target, first, second = part
+    points, point_normals, nearest, origin, cell = cloud
+    deformations = len(pose)
+    gradient[:] = 0.0
+    hessian[:6, :6] = 0.0
+    hessian[6:, :3] = 0.0
+    hessian[6:, 3:6] = first
+    hessian[6:, 6:] = second
+    cost = 0.0
+    for k in range(len(mean)):
+        x, y, z = mean[k, 0], mean[k, 1], mean[k, 2]
+        for d in range(deformations):
+            x += basis[k, d, 0] * pose[d]
+            y += basis[k, d, 1] * pose[d]
+            z += basis[k, d, 2] * pose[d]
+        a = center[0] + rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z
+        b = center[1] + rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z
+        c = center[2] + rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
+        importance = weight[k]
+        if k < len(normals):
+            found = look_up(nearest, origin, cell, a, b, c)
+            a, b, c = a - points[found, 0], b - points[found, 1], c - points[found, 2]
+            if _contradicts(rotation, normals[k], point_normals[found]):
+                importance *= CONTRADICTING_WEIGHT
+                _take_back(weight[k] - importance, basis[k], hessian)
+        else:
+            goal = target[k - len(normals)]
+            a, b, c = a - goal[0], b - goal[1], c - goal[2]
+        u = rotation[0, 0] * a + rotation[1, 0] * b + rotation[2, 0] * c
+        v = rotation[0, 1] * a + rotation[1, 1] * b + rotation[2, 1] * c
+        w = rotation[0, 2] * a + rotation[1, 2] * b + rotation[2, 2] * c
+        cost += 0.5 * importance * (u * u + v * v + w * w)
+        _add_rigid(importance, (x, y, z), (u, v, w), hessian, gradient)
+        _add_deformed(importance, (x, y, z), (u, v, w), basis[k], hessian, gradient)
+    for d in range(deformations):
+        cost += 0.5 * POSE_PRIOR * pose[d] ** 2
+        hessian[6 + d, 6 + d] += POSE_PRIOR
+        gradient[6 + d] += POSE_PRIOR * pose[d]
+    return cost
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _contradicts(rotation: np.ndarray, normal: np.ndarray, found: np.ndarray) -> bool:
+    """Whether the part's normal, once turned, looks away from the cloud's."""
+    cosine = 0.0
+    for axis in range(3):
+        turned = rotation[axis, 0] * normal[0] + rotation[axis, 1] * normal[1] + rotation[axis, 2] * normal[2]
+        cosine += found[axis] * turned
+    return cosine < 0.0
+
+
+@njit(cache=True, nogil=True)
+def _take_back(weight: float, basis: np.ndarray, hessian: np.ndarray) -> None:
+    """Lessen what the sums over all points hold of one point's deformation."""
+    for d in range(len(basis)):
+        for axis in range(3):
+            hessian[6 + d, 3 + axis] -= weight * basis[d, axis]
+        for e in range(d + 1):
+            product = basis[d, 0] * basis[e, 0] + basis[d, 1] * basis[e, 1] + basis[d, 2] * basis[e, 2]
+            hessian[6 + d, 6 + e] -= weight * product
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_rigid(weight: float, point: Triple, residual: Triple, hessian: np.ndarray, gradient: np.ndarray) -> None:
+    """Add a point's J^T W J and J^T W r of turn and place, J = (-[p]x, I)."""
+    x, y, z = point
+    u, v, w = residual
+    gradient[0] += weight * (y * w - z * v)
+    gradient[1] += weight * (z * u - x * w)
+    gradient[2] += weight * (x * v - y * u)
+    gradient[3] += weight * u
+    gradient[4] += weight * v
+    gradient[5] += weight * w
+    hessian[0, 0] += weight * (y * y + z * z)
+    hessian[1, 1] += weight * (x * x + z * z)
+    hessian[2, 2] += weight * (x * x + y * y)
+    hessian[1, 0] -= weight * x * y
+    hessian[2, 0] -= weight * x * z
+    hessian[2, 1] -= weight * y * z
+    hessian[3, 1] += weight * z
+    hessian[3, 2] -= weight * y
+    hessian[4, 0] -= weight * z
+    hessian[4, 2] += weight * x
+    hessian[5, 0] += weight * y
+    hessian[5, 1] -= weight * x
+    hessian[3, 3] += weight
+    hessian[4, 4] += weight
+    hessian[5, 5] += weight
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _add_deformed(
+    weight: float, point: Triple, residual: Triple, basis: np.ndarray, hessian: np.ndarray, gradient: np.ndarray
+) -> None:
+    """Add a point's part of the normal equations that is not the same for all particles: deformation with turn."""
+    x, y, z = point
+    u, v, w = residual
+    for d in range(len(basis)):
+        i, j, k = weight * basis[d, 0], weight * basis[d, 1], weight * basis[d, 2]
+        gradient[6 + d] += i * u + j * v + k * w
+        hessian[6 + d, 0] += y * k - z * j
+        hessian[6 + d, 1] += z * i - x * k
+        hessian[6 + d, 2] += x * j - y * i
+
+
+@njit(cache=True, nogil=True)
+def _solve(hessian: np.ndarray, gradient: np.ndarray, damping: float, factor: np.ndarray, step: np.ndarray) -> None:
+    """Write into `step` what solves (H + damping diag H) step = -g, by Cholesky; of H the lower triangle is read."""
+    unknowns = len(gradient)
+    for row in range(unknowns):
+        total = -gradient[row]
+        for column in range(row + 1):
+            value = hessian[row, column]
+            if row == column:
+                value += damping * value + 1e-9
+            for k in range(column):
+                value -= factor[row, k] * factor[column, k]
+            if row == column:
+                factor[row, row] = np.sqrt(max(value, 1e-12))
+            else:
+                factor[row, column] = value / factor[column, column]
+                total -= factor[row, column] * step[column]
+        step[row] = total / factor[row, row]
+    for row in range(unknowns - 1, -1, -1):
+        for k in range(row + 1, unknowns):
+            step[row] -= factor[k, row] * step[k]
+        step[row] /= factor[row, row]
+
+
+@njit(cache=True, nogil=True)
+def _rotation(vector: np.ndarray) -> np.ndarray:
+    """Rodrigues' formula for one vector."""
+    angle = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    cross = np.zeros((3, 3))
+    cross[0, 1], cross[0, 2] = -vector[2], vector[1]
+    cross[1, 0], cross[1, 2] = vector[2], -vector[0]
+    cross[2, 0], cross[2, 1] = -vector[1], vector[0]
+    first = np.sin(angle) / angle if angle > 1e-8 else 1.0
+    second = (1 - np.cos(angle)) / angle**2 if angle > 1e-8 else 0.5
+    return np.eye(3) + first * cross + second * (cross @ cross)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`flowing-puppet evaluate bodies`: fits of scanned synthetic people, whose every vertex is known."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+from tqdm import tqdm
+
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evaluate.body.bodies import KINDS, BodyScore, drawn_scans, scored_fit, summary
+from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
+from flowing_puppet_ros.evaluate.tables import json_text, text_table, write_csv, write_json
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.settings import make_out_folder
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flowing-puppet evaluate bodies`."""
+    parser.add_argument(
+        "--kind", choices=KINDS, default="whole", help="whole scans, depth views or LiDAR [%(default)s]"
+    )
+    parser.add_argument("--count", type=int, default=20, help="people [%(default)s]")
+    parser.add_argument("--people-seed", type=int, default=1, help="seed of the people and their scans [%(default)s]")
+    parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture; without it all poses are hard ones")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for bodies_KIND.csv and bodies_KIND.json")
+    parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
+    FitterSettings.add_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fit every drawn person, print the figures and return the exit status."""
+    if arguments.count < 1:
+        raise InputError(f"--count is {arguments.count}; measure at least 1 person")
+    if arguments.people_seed < 0:
+        raise InputError(f"--people-seed is {arguments.people_seed}; it must be 0 or more")
+    fitter = BodyFitter(StitchedPuppet.load(), FitterSettings.from_arguments(arguments))
+    if arguments.out is not None:
+        make_out_folder(arguments.out)
+    source = BodySource(arguments.mocap)
+    scans = drawn_scans(arguments.kind, source, arguments.count, arguments.people_seed)
+    scores: list[BodyScore] = []
+    with tqdm(scans, total=arguments.count, file=sys.stderr, disable=arguments.json) as bar:
+        for body, scene, cloud in bar:
+            scores.append(scored_fit(fitter, body, scene, cloud, source.joint_names)[1])
+            bar.set_postfix_str(f"{100 * scores[-1].vertex_error:.2f} cm")
+    figures = summary(scores)
+    if arguments.out is not None:
+        rows = [asdict(score) for score in scores]
+        write_csv(arguments.out / f"bodies_{arguments.kind}.csv", rows)
+        write_json(arguments.out / f"bodies_{arguments.kind}.json", {"summary": figures, "bodies": rows})
+    print(json_text(figures) if arguments.json else text_table([{"kind": arguments.kind} | figures]))
+    return 0

@@ -1,0 +1,276 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Track annotated clips by several methods and measure each: `flowing-puppet evaluate video FOLDER --truth FILE`.
+
+The tracks are kept in --out and read from there the next time, unless --again is given.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from flowing_puppet_ros.blas import one_blas_thread
+from flowing_puppet_ros.draw.plots import Series, line_plot
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evaluate.tables import text_table, write_csv, write_json
+from flowing_puppet_ros.evaluate.video.errors import (
+    CALIBRATED,
+    MEASURED,
+    THRESHOLDS,
+    ClipErrors,
+    TrackedPerson,
+    calibration,
+    calibration_error,
+    clip_errors,
+    gain,
+    summary,
+)
+from flowing_puppet_ros.evaluate.video.methods import (
+    INIT,
+    MEDIAN,
+    METHODS,
+    ClipRun,
+    Located,
+    VideoSettings,
+    all_names,
+    checked_names,
+    median_filtered,
+    run_method,
+)
+from flowing_puppet_ros.evaluate.video.truth import People, find_clips, read_people
+from flowing_puppet_ros.image.arms.viterbi import PathSettings
+from flowing_puppet_ros.image.formats.tracks_json import write_tracks
+from flowing_puppet_ros.image.formats.video_reader import open_frames
+from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings
+from flowing_puppet_ros.image.thesis_loop.loop import LoopSettings
+from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings
+from flowing_puppet_ros.report.page import page, paragraph, table
+from flowing_puppet_ros.settings import make_out_folder
+
+MOST_FRAMES = 2000
+BASES = {"": "detector", INIT: f"{INIT}detector"}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Flags of `evaluate video`."""
+    names = ", ".join(METHODS)
+    parser.add_argument("input", type=Path, help="folder of videos or of sub-folders of frames")
+    parser.add_argument("--truth", type=Path, required=True, help="JSON of the clips' joints, or folder of keypoints")
+    parser.add_argument("--init", type=Path, help="keypoints that rows with init- start from, in a form of the truth's")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the tracks, video.json, .csv and .html")
+    parser.add_argument("--clips", default="", help="names of clips, with commas between [all that the truth has]")
+    parser.add_argument(
+        "--methods", default="", help=f"{names}; {INIT}NAME starts from --init, NAME{MEDIAN} is median-filtered [all]"
+    )
+    parser.add_argument("--again", action="store_true", help="track again what was tracked before")
+    parser.add_argument("--processes", type=int, default=2, help="clips at a time [%(default)s]")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    PathSettings.add_arguments(parser)
+    SmoothingSettings.add_arguments(parser)
+    LoopSettings.add_arguments(parser)
+    EnergySettings.add_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Track, measure, print the table and write the files."""
+    if arguments.processes < 1:
+        raise InputError(f"--processes is {arguments.processes}; it must be 1 or more")
+    clips = find_clips(arguments.input, _listed(arguments.clips))
+    truth = read_people(arguments.truth, clips)
+    given = {} if arguments.init is None else read_people(arguments.init, clips)
+    chosen = _listed(arguments.methods) or all_names(arguments.init is not None)
+    methods = checked_names(chosen, arguments.init is not None)
+    settings = VideoSettings(
+        path=PathSettings.from_arguments(arguments),
+        smoothing=SmoothingSettings.from_arguments(arguments),
+        loop=LoopSettings.from_arguments(arguments),
+        energy=EnergySettings.from_arguments(arguments),
+    )
+    make_out_folder(arguments.out)
+    tasks = [_Task(name, clips[name], given.get(name), methods, settings, arguments) for name in truth]
+    for _ in tqdm(_done(tasks, arguments.processes), total=len(tasks), unit="clip", disable=None):
+        pass
+    errors = {name: {task.name: task.errors(name, truth[task.name]) for task in tasks} for name in methods}
+    _write(arguments, errors, {name: [task.seconds(name) for task in tasks] for name in methods})
+    return 0
+
+
+def _listed(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """One clip, tracked by all methods; `given` are the people of --init."""
+
+    name: str
+    path: Path
+    given: People | None
+    methods: list[str]
+    settings: VideoSettings
+    arguments: argparse.Namespace
+
+    def file(self, method: str) -> Path:
+        """Where the tracks of a method are kept."""
+        return Path(self.arguments.out) / method / f"{self.name}.json"
+
+    def __call__(self) -> None:
+        """Track the clip by the methods that have no file yet."""
+        plain = dict.fromkeys(name.removesuffix(MEDIAN) for name in self.methods)
+        missing = [name for name in plain if self.arguments.again or not self.file(name).is_file()]
+        if missing:
+            cv2.setNumThreads(1)
+            with one_blas_thread():
+                self._track(missing)
+        for name in self.methods:
+            if name.endswith(MEDIAN):
+                self._filter(name)
+
+    def _track(self, missing: Sequence[str]) -> None:
+        source = open_frames(self.path)
+        frames = list(source)
+        if len(frames) > MOST_FRAMES:
+            raise InputError(f"{self.path} has {len(frames)} frames; clips of up to {MOST_FRAMES} can be measured")
+        made = ClipRun.load(frames, self.given, self.settings)
+        size = [int(side) for side in frames[0].image.shape[1::-1]]
+        for name in missing:
+            began = time.process_time()
+            track = run_method(name, made)
+            entries = (_entry(frame.index, people) for frame, people in zip(frames, track, strict=True))
+            write_tracks(self.file(name), made.joint_names, source.fps, entries)
+            about = {"seconds": round((time.process_time() - began) / len(frames), 4), "size": size}
+            self._about_file(name).write_text(json.dumps(about))
+
+    def _filter(self, name: str) -> None:
+        """Filter the tracks of the plain method."""
+        plain = name.removesuffix(MEDIAN)
+        data = json.loads(self.file(plain).read_text(encoding="utf-8"))
+        track = [[_located(puppet) for puppet in frame["puppets"]] for frame in data["frames"]]
+        indices = [frame["index"] for frame in data["frames"]]
+        entries = (_entry(index, people) for index, people in zip(indices, median_filtered(track), strict=True))
+        write_tracks(self.file(name), tuple(data["joint_names"]), data["fps"], entries)
+        self._about_file(name).write_text(self._about_file(plain).read_text())
+
+    def seconds(self, method: str) -> float:
+        """CPU seconds a frame that a method took, without what an earlier one had done for it."""
+        return float(self._about(method)["seconds"])
+
+    def errors(self, method: str, truth: People) -> ClipErrors:
+        """Compare the tracks of a method with the truth."""
+        data = json.loads(self.file(method).read_text(encoding="utf-8"))
+        width, height = self._about(method)["size"]
+        found = {
+            int(frame["index"]): [_person(data["joint_names"], _located(puppet)) for puppet in frame["puppets"]]
+            for frame in data["frames"]
+        }
+        return clip_errors(found, truth, (width, height))
+
+    def _about(self, method: str) -> dict[str, Any]:
+        return dict(json.loads(self._about_file(method).read_text()))
+
+    def _about_file(self, method: str) -> Path:
+        return self.file(method).with_suffix(".about")
+
+
+def _entry(index: int, people: Sequence[Located]) -> dict[str, Any]:
+    puppets = []
+    for person in people:
+        rows = np.column_stack([np.round(person.joints, 2), np.round(person.confidence, 4)])
+        puppets.append({"id": person.id, "joints": [[float(v) if np.isfinite(v) else None for v in r] for r in rows]})
+    return {"index": index, "puppets": puppets}
+
+
+def _located(puppet: Mapping[str, Any]) -> Located:
+    rows = np.array(puppet["joints"], np.float64)
+    return Located(puppet["id"], rows[:, :2], rows[:, 2])
+
+
+def _person(names: Sequence[str], person: Located) -> TrackedPerson:
+    return TrackedPerson.of(names, person.joints, person.confidence)
+
+
+def _call(task: _Task) -> None:
+    task()
+
+
+def _done(tasks: Sequence[_Task], processes: int) -> Iterator[None]:
+    """Run the tasks, some at a time; a fresh process each would import everything again, so workers are kept."""
+    if processes == 1 or len(tasks) == 1:
+        for task in tasks:
+            task()
+            yield
+        return
+    with ProcessPoolExecutor(min(processes, len(tasks)), mp_context=get_context("spawn")) as pool:
+        for future in as_completed([pool.submit(_call, task) for task in tasks]):
+            future.result()
+            yield
+
+
+def _write(
+    arguments: argparse.Namespace,
+    errors: Mapping[str, Mapping[str, ClipErrors]],
+    seconds: Mapping[str, Sequence[float]],
+) -> None:
+    rows: list[dict[str, Any]] = []
+    curves = {}
+    for name, clips in errors.items():
+        curves[name] = calibration(clips)
+        row = {"method": name} | summary(clips)
+        row |= {"calibration_error": calibration_error(curves[name])}
+        rows.append(row | {"seconds_a_frame": round(float(np.mean(seconds[name])), 3)})
+    gains = {name: _gains(name, errors) for name in errors}
+    by_clip = {name: {clip: summary({clip: one}) for clip, one in clips.items()} for name, clips in errors.items()}
+    figures = {"methods": {row["method"]: row for row in rows}, "gains": gains, "calibration": curves, "clips": by_clip}
+    write_csv(arguments.out / "video.csv", rows)
+    write_json(arguments.out / "video.json", figures)
+    (arguments.out / "video.html").write_text(_page(rows, gains, curves), encoding="utf-8")
+    if arguments.json:
+        print(json.dumps({row["method"]: row for row in rows}))
+        return
+    print(text_table([{key.replace("_px", ""): value for key, value in row.items()} for row in rows]))
+    for name, text in gains.items():
+        if text:
+            print(f"{name} over {BASES[INIT if name.startswith(INIT) else '']}: {text}")
+
+
+def _gains(name: str, errors: Mapping[str, Mapping[str, ClipErrors]]) -> str:
+    base = BASES[INIT if name.startswith(INIT) else ""]
+    if name == base or base not in errors:
+        return ""
+    found = []
+    for kind in MEASURED:
+        for threshold in THRESHOLDS:
+            points, low, high = gain(errors[name], errors[base], kind, threshold)
+            found.append(f"{kind}s within {threshold:g} px {points:+.1f} [{low:+.1f}, {high:+.1f}]")
+    return ", ".join(found)
+
+
+def _page(
+    rows: Sequence[Mapping[str, Any]],
+    gains: Mapping[str, str],
+    curves: Mapping[str, Sequence[Mapping[str, float]]],
+) -> str:
+    heads = list(rows[0])
+    cells = [[f"{row[head]:g}" if isinstance(row[head], float) else str(row[head]) for head in heads] for row in rows]
+    figures = table(heads, cells, range(1, len(heads)), "Joints within some pixels, medians, shake")
+    figures += "".join(paragraph(f"{name}: {text}") for name, text in gains.items() if text)
+    diagonal = Series("perfect", np.array([0.0, 1.0]), np.array([0.0, 1.0]))
+    lines = [diagonal] + [
+        Series(name, np.array([r["confidence"] for r in curve]), np.array([r["right"] for r in curve]))
+        for name, curve in curves.items()
+        if curve
+    ]
+    plot = line_plot(lines, "confidence against truth", "confidence", f"share within {CALIBRATED:g} px")
+    lead = paragraph("True joints inside the image; who is not found counts as wrong. Intervals: bootstrap over clips.")
+    return page("Tracks against the truth", lead, [("Figures", figures), ("Calibration", plot)])

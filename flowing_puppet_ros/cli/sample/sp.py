@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`flowing-puppet sample sp`: random 3D puppets as .ply meshes, and a contact sheet of them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from flowing_puppet_ros.body.scans.scan import write_ply
+from flowing_puppet_ros.draw.mesh_render import orthographic, render
+from flowing_puppet_ros.draw.palette import part_colours
+from flowing_puppet_ros.draw.pictures import contact_sheet, save
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+SIZE = (300, 440)  # pixels
+SCALE = 200.0  # pixels per metre, the same for all bodies
+VIEWS = ((-1.0, -0.4, -0.15), (0.4, -1.0, -0.15))  # looking directions: from the front and from behind at the left
+COLUMNS = 8
+FILES = "sp_GENDER_000.ply ... and sp_GENDER.png"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """`sample sp` has no flags of its own."""
+
+
+def draw(arguments: argparse.Namespace, rng: np.random.Generator) -> Iterator[Path]:
+    """Write the bodies as meshes and on one sheet, and yield their paths."""
+    model = StitchedPuppet.load(arguments.gender)
+    colours = part_colours(model.tree.names)[model.part_of_vertex]
+    pictures = []
+    for index in range(arguments.count):
+        vertices = model.vertices(model.sample(rng))
+        path = arguments.out / f"sp_{model.name}_{index:03d}.ply"
+        write_ply(path, vertices, model.faces, colours)
+        yield path
+        for looking in VIEWS:
+            camera = orthographic(vertices, looking, SIZE, scale=SCALE)
+            pictures.append(render(vertices, model.faces, camera, SIZE, colours.astype(np.float64)).rgb)
+    sheet = arguments.out / f"sp_{model.name}.png"
+    save(contact_sheet(pictures, COLUMNS), sheet)
+    yield sheet

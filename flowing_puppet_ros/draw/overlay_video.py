@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tracks as a video in the manner of the thesis's Figure 10: each frame and its forward flow, puppets over both."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from flowing_puppet_ros.draw.flow_colour import flow_scale, flow_to_rgb
+from flowing_puppet_ros.draw.overlay import FIXED_BITS, DrawnPuppet, draw_puppets
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.flow.estimate import SMALLEST_SIDE, OpticalFlow, resize_flow
+
+CODECS = {".mp4": "mp4v", ".m4v": "mp4v", ".avi": "MJPG", ".mkv": "MJPG"}
+LONGEST_SIDE = 960  # px of a frame in the video; there are two beside each other
+CALM = 0.1  # share of a frame in the motion that is shown at full colour, so that colours do not flicker
+
+FARTHEST = 1e6  # px; contours beyond are not drawn
+
+type Image = np.ndarray[Any, np.dtype[np.uint8]]
+
+
+def check_overlay(path: Path) -> None:
+    """InputError when a video of this name cannot be written."""
+    if path.suffix.lower() not in CODECS:
+        raise InputError(f"--overlay {path} must end in {', '.join(CODECS)}")
+
+
+def drawn_tracks(path: Path) -> Iterator[tuple[int, list[DrawnPuppet]]]:
+    """The puppets of each frame of a tracks.json as `tracks.write_tracks` writes it, a line a frame."""
+    with path.open(encoding="utf-8") as file:
+        names = tuple(json.loads(file.readline().rstrip() + "]}")["joint_names"])
+        for line in file:
+            if line.startswith("{"):
+                frame = json.loads(line.rstrip().rstrip(","))
+                yield frame["index"], [_drawn(names, puppet) for puppet in frame["puppets"]]
+
+
+def _drawn(names: tuple[str, ...], puppet: dict[str, Any]) -> DrawnPuppet:
+    rows = np.array(puppet["joints"], np.float64)
+    parts = puppet["parts"]
+    order = tuple(sorted(range(len(parts)), key=lambda k: parts[k]["depth"]))
+    contours = tuple(np.array(part["contour"], np.float64) for part in parts)
+    return DrawnPuppet(
+        puppet["id"], names, rows[:, :2], rows[:, 2], tuple(part["name"] for part in parts), contours, order
+    )
+
+
+def write_overlay(
+    path: Path, images: Iterable[tuple[int, Image]], tracks: Iterable[tuple[int, list[DrawnPuppet]]], fps: float
+) -> int:
+    """Write the video and return how many frames it has.
+
+    `images` are (index, (H, W, 3) RGB), `tracks` (index, puppets), both in order; an image without an entry is shown
+    without puppets. The flow of the last frame, and of one before a change of size, is unknown: black. InputError when
+    no video can be written.
+    """
+    check_overlay(path)
+    flow, full, writer = OpticalFlow(), 0.0, _Writer(path, fps)
+    shown: tuple[Image, list[DrawnPuppet]] | None = None
+    try:
+        for image, puppets in _joined(images, tracks):
+            factor = min(1.0, LONGEST_SIDE / max(image.shape[:2]))
+            small = cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1 else image
+            following = np.asarray(small, np.uint8), [puppet.placed(factor) for puppet in puppets]
+            if shown is not None:
+                field = _flow(flow, shown[0], following[0])
+                if field is not None:
+                    full = flow_scale(field) if full == 0.0 else (1 - CALM) * full + CALM * flow_scale(field)
+                writer.add(beside(*shown, field, full))
+            shown = following
+        if shown is not None:
+            writer.add(beside(*shown, None, full))
+    finally:
+        writer.close()
+    return writer.count
+
+
+def _joined(
+    images: Iterable[tuple[int, Image]], tracks: Iterable[tuple[int, list[DrawnPuppet]]]
+) -> Iterator[tuple[Image, list[DrawnPuppet]]]:
+    entries = iter(tracks)
+    entry = next(entries, None)
+    for index, image in images:
+        while entry is not None and entry[0] < index:
+            entry = next(entries, None)
+        yield image, entry[1] if entry is not None and entry[0] == index else []
+
+
+def _flow(flow: OpticalFlow, image: Image, following: Image) -> np.ndarray | None:
+    if image.shape != following.shape or min(image.shape[:2]) < SMALLEST_SIDE:
+        return None
+    return resize_flow(flow.at_working_scale(image, following)[0], (image.shape[1], image.shape[0]))
+
+
+def beside(image: Image, puppets: Sequence[DrawnPuppet], flow: np.ndarray | None, full: float) -> Image:
+    """An image (H,W,3) with puppets, and beside it its flow (H,W,2) in colour with their outlines in black."""
+    left = draw_puppets(image, puppets, labels=False)
+    right = np.zeros_like(left) if flow is None else flow_to_rgb(flow, full)
+    width = max(1, round(min(image.shape[:2]) / 360))
+    for puppet in puppets:
+        for part in puppet.order:
+            contour = puppet.contours[part]
+            if len(contour) >= 3 and np.isfinite(contour).all() and np.abs(contour).max() < FARTHEST:
+                fixed = np.rint(contour * (1 << FIXED_BITS)).astype(np.int32)
+                colour = (0, 0, 0) if flow is not None else (255, 255, 255)
+                cv2.polylines(right, [fixed], True, colour, width, cv2.LINE_AA, FIXED_BITS)
+    return np.concatenate([left, right], axis=1)
+
+
+class _Writer:
+    """A video file whose size is that of its first picture; others are fitted into it."""
+
+    def __init__(self, path: Path, fps: float) -> None:
+        self.count = 0
+        self._path, self._fps = path, fps
+        self._size = (0, 0)
+        self._video: cv2.VideoWriter | None = None
+
+    def add(self, picture: Image) -> None:
+        """Write one picture (H,W,3) RGB."""
+        if self._video is None:
+            # Codecs want even sides.
+            self._size = (picture.shape[1] // 2 * 2, picture.shape[0] // 2 * 2)
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            code = cv2.VideoWriter.fourcc(*CODECS[self._path.suffix.lower()])
+            self._video = cv2.VideoWriter(str(self._path), code, self._fps, self._size)
+            if not self._video.isOpened():
+                raise InputError(f"--overlay {self._path} cannot be written; choose another folder")
+        factor = min(self._size[0] / picture.shape[1], self._size[1] / picture.shape[0])
+        canvas = np.zeros((self._size[1], self._size[0], 3), np.uint8)
+        if picture.shape[1::-1] != self._size:
+            size = [max(1, min(limit, round(side * factor)))
+                    for side, limit in zip(picture.shape[1::-1], self._size, strict=True)]  # fmt: skip
+            picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), np.uint8)
+        canvas[: picture.shape[0], : picture.shape[1]] = picture
+        self._video.write(cv2.cvtColor(canvas, cv2.COLOR_RGB2BGR))
+        self.count += 1
+
+    def close(self) -> None:
+        """Finish the file."""
+        if self._video is not None:
+            self._video.release()

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far fitted bodies are from the people that were scanned, on synthetic scans of which every vertex is known."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
+from flowing_puppet_ros.evaluate.body.synthetic_scans import (
+    DepthSettings,
+    Scene,
+    SensedCloud,
+    depth_view,
+    lidar_view,
+    sensor_place,
+    whole_scan,
+)
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+WHOLE_POINTS = 10000
+# Of every so many people one is in a hard pose.
+HARD_EVERY = {"whole": 2, "single": 4, "lidar": 0}
+KINDS = tuple(HARD_EVERY)
+DEPTH_DISTANCE, DEPTH_HEIGHT = (2.0, 4.0), (0.8, 1.8)  # metres
+LIDAR_DISTANCE, LIDAR_HEIGHT = (4.5, 7.5), (1.6, 1.9)  # metres: 300 to 800 points on a person
+BAD = 0.04  # metres: mean vertex error of a body with a limb in a wrong place
+SIGHT = 0.005  # metres: a vertex this much behind the first hit of its ray is still seen
+
+
+@dataclass(frozen=True, slots=True)
+class BodyScore:
+    """One fit against the truth; distances are means in metres.
+
+    Attributes:
+        hard: whether the pose was drawn from joint limits alone.
+        points: of the cloud.
+        vertex_error: over all vertices of the template.
+        visible_error: over those that the sensor saw; of a whole scan all.
+        joint_error: over all joints.
+        flipped: whether the body is nearer to the truth with left and right swapped.
+        two_way_distance, confidence, reliable: as the fit says.
+        seconds: processor time of the fit.
+    """
+
+    hard: bool
+    points: int
+    vertex_error: float
+    visible_error: float
+    joint_error: float
+    flipped: bool
+    two_way_distance: float
+    confidence: float
+    reliable: bool
+    seconds: float
+
+
+def drawn_scans(kind: str, source: BodySource, count: int, seed: int) -> Iterator[tuple[TrueBody, Scene, SensedCloud]]:
+    """Draw `count` people and scan them: whole, from a single side by a depth camera, or by a LiDAR.
+
+    Every pose is hard when the source has no motion capture.
+    """
+    rng = np.random.default_rng(seed)
+    every = HARD_EVERY[kind]
+    for index in range(count):
+        body = source.body(rng, hard=not source.has_mocap or (every > 0 and index % every == every - 1))
+        scene = Scene(body.vertices, source.triangles)
+        if kind == "whole":
+            yield body, scene, whole_scan(scene, rng, WHOLE_POINTS)
+        elif kind == "single":
+            eye = sensor_place(rng, body.vertices, DEPTH_DISTANCE, DEPTH_HEIGHT)
+            yield body, scene, depth_view(scene, rng, eye, DepthSettings())
+        else:
+            eye = sensor_place(rng, body.vertices, LIDAR_DISTANCE, LIDAR_HEIGHT)
+            yield body, scene, lidar_view(scene, rng, eye)
+
+
+def scored_fit(
+    fitter: BodyFitter, body: TrueBody, scene: Scene, cloud: SensedCloud, joint_names: Sequence[str]
+) -> tuple[BodyFit, BodyScore]:
+    """Fit a model to a synthetic cloud and compare; `joint_names` are those of the body's joints."""
+    started = time.process_time()
+    fit = fitter.fit(cloud.points, cloud.normals, viewpoint=cloud.viewpoint)
+    seconds = time.process_time() - started
+    truth = body.template_vertices(fitter.model.name)
+    joints = body.joints[[list(joint_names).index(name) for name in fitter.model.joint_names]]
+    error = np.linalg.norm(fit.vertices - truth, axis=1)
+    return fit, BodyScore(
+        hard=body.hard,
+        points=len(cloud.points),
+        vertex_error=float(error.mean()),
+        visible_error=float(error[seen_vertices(scene, truth, cloud.viewpoint)].mean()),
+        joint_error=float(np.linalg.norm(fit.joints - joints, axis=1).mean()),
+        flipped=is_flipped(fit.vertices, truth, fitter.model),
+        two_way_distance=fit.two_way_distance,
+        confidence=fit.confidence,
+        reliable=fit.reliable,
+        seconds=seconds,
+    )
+
+
+def is_flipped(vertices: np.ndarray, truth: np.ndarray, model: StitchedPuppet) -> bool:
+    """Whether a body (V, 3) is nearer to the truth (V, 3) with left and right swapped, as when it faces backward."""
+    own = np.linalg.norm(vertices - truth, axis=1).mean()
+    return bool(np.linalg.norm(vertices[model.mirror_vertex] - truth, axis=1).mean() < own)
+
+
+def seen_vertices(scene: Scene, vertices: np.ndarray, viewpoint: np.ndarray | None) -> np.ndarray:
+    """Which vertices (V,) on the surface of a scene a sensor at `viewpoint` sees; without a viewpoint all."""
+    if viewpoint is None:
+        return np.ones(len(vertices), dtype=bool)
+    rays = vertices - viewpoint
+    length = np.linalg.norm(rays, axis=1)
+    return scene.cast(viewpoint, rays / length[:, None])[0] > length - SIGHT
+
+
+def summary(scores: Sequence[BodyScore]) -> dict[str, float]:
+    """Figures over many fits; distances in centimetres.
+
+    `unreliable` counts the fits that say so of themselves, `bad` those that are wrong by more than 4 cm on average.
+    """
+    vertex = 100 * np.array([score.vertex_error for score in scores])
+    return {
+        "bodies": len(scores),
+        "vertex_mean_cm": float(vertex.mean()),
+        "vertex_median_cm": float(np.median(vertex)),
+        "vertex_worst_cm": float(vertex.max()),
+        "visible_mean_cm": 100 * float(np.mean([score.visible_error for score in scores])),
+        "joints_mean_cm": 100 * float(np.mean([score.joint_error for score in scores])),
+        "two_way_mean_cm": 100 * float(np.mean([score.two_way_distance for score in scores])),
+        "flipped": sum(score.flipped for score in scores),
+        "unreliable": sum(not score.reliable for score in scores),
+        "bad": sum(score.vertex_error > BAD for score in scores),
+        "bad_unreliable": sum(score.vertex_error > BAD and not score.reliable for score in scores),
+        "confidence_lowest": min(score.confidence for score in scores),
+        "seconds_mean": float(np.mean([score.seconds for score in scores])),
+        "seconds_worst": max(score.seconds for score in scores),
+    }

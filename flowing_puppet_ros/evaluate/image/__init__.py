@@ -1,0 +1,5 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses in single images against the truth: correct parts (PCP), ranks of limbs and of hands.
+
+Images with annotated people come in; figures go out. Read `pcp` first.
+"""

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well the image likelihood tells right limbs from wrong ones: ranks among moved limbs, with and without each term.
+
+Every part is judged alone: the right contour is that of the puppet on the annotated joints, the wrong ones are turned,
+moved and stretched until their points are off by 5 cm on average. The torso's and the face's colours are taken from the
+right torso and head, as they are once these are found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.evidence.image.contour import LEVELS, ContourFilter, describe, kind_of, on_right
+from flowing_puppet_ros.evidence.image.likelihood import TERMS_OF, PartLikelihood, Scene
+from flowing_puppet_ros.evidence.image.steered_hog import SIDES
+from flowing_puppet_ros.learn.likelihood.samples import Moves, Posed, wrong_contours
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+
+Array = np.ndarray[Any, Any]
+
+CUES = {"contour": ("contour",), "skin": ("skin", "skin_around", "hand"), "torso colour": ("torso", "torso_around")}
+"""Terms that are taken away together."""
+
+SIDE_NAMES = ("inside", "on", "outside")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ranks:
+    """Places (n,) of right contours among `wrong` wrong ones, from 0; a tie counts as half a place."""
+
+    places: NDArray[np.float64]
+    wrong: int
+
+    def row(self) -> tuple[float, float, float, float]:
+        """Share of wrong ones that the right one beats, its median rank from 1, and how often it is first, in 5."""
+        beaten = 1.0 - self.places.mean() / self.wrong
+        first, five = np.mean(self.places < 1.0), np.mean(self.places < 5.0)
+        return float(beaten), float(np.median(self.places) + 1.0), float(first), float(five)
+
+
+def rank(
+    model: DeformableStructures, likelihood: PartLikelihood, people: Iterator[Posed], wrong: int, seed: int
+) -> dict[str, dict[str, Ranks]]:
+    """Ranks by kind of part and variant ("all", "only skin", "without skin", "contour only inside", ...)."""
+    rng = np.random.default_rng(seed)
+    places: dict[str, dict[str, list[float]]] = {kind: {} for kind in likelihood.terms}
+    for posed in people:
+        scene = likelihood.scene(posed.image).with_torso(*posed.puppet.contours[:2])
+        for part, name in enumerate(model.tree.names):
+            kind = kind_of(name)
+            if kind not in places or not posed.shows(model, part):
+                continue
+            moved = wrong_contours(model, posed.puppet, part, wrong, Moves(), rng)
+            contours = np.concatenate([posed.puppet.contours[part][None], moved])
+            scores = _term_scores(scene, part, contours, posed.puppet.scale)
+            scores |= _contour_scores(scene, part, contours, posed.puppet.scale)
+            for variant, score in scores.items():
+                better = np.sum(score[1:] > score[0]) + 0.5 * np.sum(score[1:] == score[0])
+                places[kind].setdefault(variant, []).append(float(better))
+    return {
+        kind: {variant: Ranks(np.array(found), wrong) for variant, found in variants.items()}
+        for kind, variants in places.items()
+    }
+
+
+def _term_scores(scene: Scene, part: int, contours: Array, scale: float) -> dict[str, Array]:
+    """Weighted sums (P,) with all terms, with each cue alone, and without each where two others are left."""
+    kind = kind_of(scene.names[part])
+    weighted = scene.terms(part, contours, scale) * scene.likelihood.terms[kind]
+    cues = {cue: np.isin(TERMS_OF[kind], terms) for cue, terms in CUES.items() if set(terms) & set(TERMS_OF[kind])}
+    scores = {"all": weighted.sum(axis=1)}
+    for cue, own in cues.items():
+        if len(cues) > 1:
+            scores[f"only {cue}"] = weighted[:, own].sum(axis=1)
+        if len(cues) > 2:
+            scores[f"without {cue}"] = weighted[:, ~own].sum(axis=1)
+    return scores
+
+
+def _contour_scores(scene: Scene, part: int, contours: Array, scale: float) -> dict[str, Array]:
+    """Margins (P,) of the contour's filter with only, and without, the descriptors of a side or of a pyramid level."""
+    name = scene.names[part]
+    known = scene.likelihood.contour.filters[kind_of(name)]
+    ordered = on_right(name, contours)
+    found, visible = describe(scene.features, ordered, known.weights.shape[1], np.full(len(contours), scale))
+    scores = {}
+    for label, kept in _masks():
+        margin = _masked(known, kept).margin(found, visible)
+        scores[f"contour, only {label}"] = margin
+        scores[f"contour, without {label}"] = known.margin(found, visible) - margin
+    return scores
+
+
+def _masks() -> Iterator[tuple[str, Array]]:
+    for side, label in enumerate(SIDE_NAMES):
+        yield label, np.broadcast_to(np.arange(SIDES) == side, (LEVELS, 1, SIDES))
+    for level in range(LEVELS):
+        yield f"level {level + 1}", np.broadcast_to((np.arange(LEVELS) == level)[:, None, None], (LEVELS, 1, SIDES))
+
+
+def _masked(known: ContourFilter, kept: Array) -> ContourFilter:
+    """The filter with the weights of all but some descriptors set to 0; `kept` (LEVELS,1,SIDES)."""
+    weights = (known.weights * kept[..., None]).astype(np.float32)
+    return replace(known, weights=weights, unseen=(known.unseen * kept).astype(np.float32), bias=0.0)
+
+
+def table(ranks: Mapping[str, Mapping[str, Ranks]]) -> str:
+    """Tell the ranks as a Markdown table."""
+    lines = [
+        "| part | terms | n | wrong ones beaten | median rank | first | in first 5 |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for kind, variants in ranks.items():
+        for variant, found in variants.items():
+            beaten, median, first, five = found.row()
+            lines.append(
+                f"| {kind} | {variant} | {len(found.places)} | {100 * beaten:.1f} % | {median:g} of {found.wrong + 1} "
+                f"| {100 * first:.0f} % | {100 * five:.0f} % |"
+            )
+    return "\n".join(lines)

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Percentage of correctly estimated body parts (PCP), and elbows and wrists within a distance, over many images.
+
+A part is correct when its ends lie within half of the true stick's length from the true ends: each of them (strict;
+Pishchulin et al., "Articulated people detection and pose estimation", CVPR 2012), or both on average (loose, as the
+Buffy Stickmen software does; Ferrari, Marin-Jimenez and Zisserman, CVPR 2008). Sticks are (6,2,2) px in the order of
+`image.formats.stickmen.STICKS`; a stick with a NaN is unknown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from flowing_puppet_ros.image.formats.stickmen import STICKS
+
+Array = np.ndarray[Any, Any]
+
+THRESHOLD = 0.5
+FOUND = 0.75
+"""Share of the true torso's length that the ends of torso and head of a found person are off, on average, at most."""
+
+GROUPS = {
+    "torso": ("torso",),
+    "head": ("head",),
+    "upper arms": ("left_upper_arm", "right_upper_arm"),
+    "lower arms": ("left_lower_arm", "right_lower_arm"),
+    "total": STICKS,
+}
+_TORSO, _HEAD = STICKS.index("torso"), STICKS.index("head")
+_LOWER_ARMS = [STICKS.index("left_lower_arm"), STICKS.index("right_lower_arm")]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedSticks:
+    """One estimated person: sticks (6,2,2) px, and those of all its solutions (n,6,2,2), the best included."""
+
+    sticks: Array
+    solutions: Array
+
+
+def end_distances(sticks: Array, truth: Array) -> Array:
+    """Distances (6,2) of the ends of sticks (6,2,2) from the true ones, each stick in the order that fits better."""
+    straight = np.linalg.norm(sticks - truth, axis=2)
+    swapped = np.linalg.norm(sticks[:, ::-1] - truth, axis=2)
+    return np.where((swapped.sum(axis=1) < straight.sum(axis=1))[:, None], swapped, straight)
+
+
+def correct_parts(sticks: Array, truth: Array) -> tuple[Array, Array]:
+    """Whether each stick (6,) is correct, strictly and loosely; an unknown estimate is wrong."""
+    allowed = THRESHOLD * np.linalg.norm(truth[:, 1] - truth[:, 0], axis=1)
+    apart = np.where(np.isfinite(sticks).all(axis=(1, 2))[:, None], end_distances(sticks, truth), np.inf)
+    return (apart <= allowed[:, None]).all(axis=1), apart.mean(axis=1) <= allowed
+
+
+def match_people(people: Sequence[PosedSticks], truths: Sequence[Array]) -> list[PosedSticks | None]:
+    """For each true person the estimated one whose torso and head fit best; None where nobody is near."""
+    cost = np.full((len(truths), len(people)), np.inf)
+    for row, truth in enumerate(truths):
+        length = np.linalg.norm(truth[_TORSO, 1] - truth[_TORSO, 0])
+        if not np.isfinite(length):
+            length = 3.0 * np.linalg.norm(truth[_HEAD, 1] - truth[_HEAD, 0])
+        for column, person in enumerate(people):
+            apart = end_distances(person.sticks, truth)[[_TORSO, _HEAD]]
+            if np.isfinite(apart).any():
+                cost[row, column] = np.nanmean(apart) / length
+    matched: list[PosedSticks | None] = [None] * len(truths)
+    while cost.size and cost.min() <= FOUND:
+        row, column = divmod(int(cost.argmin()), cost.shape[1])
+        matched[row] = people[column]
+        cost[row], cost[:, column] = np.inf, np.inf
+    return matched
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts over all true people; people who are not found count as wrong in every part that is known."""
+
+    pixels: float = 20.0
+    people: int = 0
+    found: int = 0
+    known: Array = field(default_factory=lambda: np.zeros(len(STICKS)))
+    strict: Array = field(default_factory=lambda: np.zeros(len(STICKS)))
+    loose: Array = field(default_factory=lambda: np.zeros(len(STICKS)))
+    ends: Array = field(default_factory=lambda: np.zeros(2))
+    near: Array = field(default_factory=lambda: np.zeros(2))
+    near_of_several: Array = field(default_factory=lambda: np.zeros(2))
+
+    def add(self, people: Sequence[PosedSticks], truths: Sequence[Array]) -> None:
+        """Count one image."""
+        for truth, person in zip(truths, match_people(people, truths), strict=True):
+            self.people += 1
+            known = np.isfinite(truth).all(axis=(1, 2))
+            self.known += known
+            ends = np.isfinite(truth[_LOWER_ARMS]).all(axis=2)
+            self.ends += ends.sum(axis=0)
+            if person is None:
+                continue
+            self.found += 1
+            strict, loose = correct_parts(person.sticks, truth)
+            self.strict += strict & known
+            self.loose += loose & known
+            self.near += self._near(person.sticks[None], truth, ends)
+            self.near_of_several += self._near(person.solutions, truth, ends)
+
+    def _near(self, several: Array, truth: Array, ends: Array) -> Array:
+        """How many elbows and wrists (2,) lie within `pixels` in at least one of several poses (n,6,2,2)."""
+        apart = np.linalg.norm(several[:, _LOWER_ARMS] - truth[_LOWER_ARMS], axis=3)
+        near = (np.nan_to_num(apart, nan=np.inf) <= self.pixels).any(axis=0)
+        return np.asarray((near & ends).sum(axis=0))
+
+    def figures(self) -> dict[str, float]:
+        """Percentages by name, JSON-ready; names of parts that are nowhere known are left out."""
+        figures = {"people": float(self.people), "found": _percent(self.found, self.people)}
+        for name, counts in (("strict", self.strict), ("loose", self.loose)):
+            for group, parts in GROUPS.items():
+                rows = [STICKS.index(part) for part in parts]
+                if self.known[rows].sum():
+                    figures[f"{name} {group}"] = _percent(counts[rows].sum(), self.known[rows].sum())
+        for row, joint in enumerate(("elbows", "wrists")):
+            if self.ends[row]:
+                figures[f"{joint} within {self.pixels:g} px"] = _percent(self.near[row], self.ends[row])
+                figures[f"{joint} of the best solution"] = _percent(self.near_of_several[row], self.ends[row])
+        return figures
+
+
+def _percent(count: float, total: float) -> float:
+    return round(100.0 * float(count) / float(total), 2) if total else float("nan")

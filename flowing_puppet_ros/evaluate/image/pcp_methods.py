@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rows of the thesis's Table 1: the detector alone, and the search without likelihood, without shape, and whole."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from flowing_puppet_ros.evaluate.image.pcp import PosedSticks, Tally
+from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
+from flowing_puppet_ros.image.formats.stickmen import sticks_of
+from flowing_puppet_ros.image.pose.estimator import Detector, PoseEstimator
+from flowing_puppet_ros.image.pose.evidence import Found, Likelihood
+from flowing_puppet_ros.image.pose.result import PosedPuppet
+from flowing_puppet_ros.image.pose.settings import PoseSettings
+from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+
+Array = np.ndarray[Any, Any]
+
+METHODS: dict[str, dict[str, bool]] = {
+    "NL": {"likelihood": False},
+    "NS": {"shape": False},
+    "DS, PMP": {"diverse": False},
+    "DS, D-PMP": {},
+}
+"""Settings of each row that differ from those of the whole search: no likelihood, no shape, plain particles."""
+
+DETECTOR = "detector"
+
+
+class _Once:
+    """A detector that looks at each image once, for all rows."""
+
+    def __init__(self, detector: Detector) -> None:
+        self._detector = detector
+        self._seen: tuple[bytes, Sequence[Found]] | None = None
+
+    def detect(self, image: Array) -> Sequence[Found]:
+        pixels = image.tobytes()
+        if self._seen is None or self._seen[0] != pixels:
+            self._seen = pixels, self._detector.detect(image)
+        return self._seen[1]
+
+
+def measure_methods(
+    images: Iterable[tuple[Array, Sequence[Array]]],
+    model: DeformableStructures,
+    sides: MultiViewStructures,
+    detector: Detector,
+    likelihood: Likelihood,
+    settings: PoseSettings,
+    pixels: float,
+    progress: Callable[[], None],
+) -> dict[str, dict[str, float]]:
+    """Figures of `Tally` and CPU seconds an image by method, over images (H,W,3) with the true sticks of their people.
+
+    `progress` is called after each image. The time of the search is without the detector's.
+    """
+    once = _Once(detector)
+    tallies = {name: Tally(pixels) for name in (DETECTOR, *METHODS)}
+    seconds = dict.fromkeys(tallies, 0.0)
+    estimators = {
+        name: PoseEstimator([model], once, likelihood, replace(settings, **changes), [sides])
+        for name, changes in METHODS.items()
+    }
+    count = 0
+    for image, truths in images:
+        began = time.process_time()
+        people = [_detected(found, model) for found in once.detect(np.ascontiguousarray(image))]
+        seconds[DETECTOR] += time.process_time() - began
+        tallies[DETECTOR].add(people, truths)
+        for name, estimator in estimators.items():
+            began = time.process_time()
+            posed = [_posed(one, model) for one in estimator.estimate(image)]
+            seconds[name] += time.process_time() - began
+            tallies[name].add(posed, truths)
+        count += 1
+        progress()
+    return {
+        name: tally.figures() | {"seconds an image": round(seconds[name] / max(count, 1), 3)}
+        for name, tally in tallies.items()
+    }
+
+
+def _posed(posed: PosedPuppet, model: DeformableStructures) -> PosedSticks:
+    solutions = [sticks_of(model.joint_names, solution.joints) for solution in posed.solutions]
+    return PosedSticks(sticks_of(model.joint_names, posed.joints), np.stack(solutions))
+
+
+def _detected(found: Found, model: DeformableStructures) -> PosedSticks:
+    """The detector's own answer: its best pose, and as many others as it knows."""
+    several = []
+    for keypoints, _ in found.modes(10):
+        joints, _ = joints_from_keypoints(model, keypoints)
+        several.append(sticks_of(model.joint_names, joints))
+    return PosedSticks(several[0], np.stack(several))

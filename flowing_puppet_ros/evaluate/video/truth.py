@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A folder of clips, and the people of their frames: the true ones, or those that start the tracker.
+
+A clip is a video file or a sub-folder of images. People are read from one JSON of all clips, from one keypoints.json
+when there is one clip, or from a folder with a keypoints.json called like each clip. See `image.formats.annotations`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.formats.annotations import Annotations
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
+from flowing_puppet_ros.image.formats.video_reader import IMAGE_SUFFIXES, open_frames
+
+VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".m4v", ".mkv", ".mov", ".mpg", ".mpeg", ".webm"})
+
+type Clips = Mapping[str, Path]
+"""Video files and folders of images by the name of the clip."""
+
+type People = Mapping[int, Sequence[Keypoints]]
+"""People of a clip by frame; frames that nobody looked at are absent."""
+
+
+def find_clips(folder: Path, wanted: Sequence[str] = ()) -> dict[str, Path]:
+    """The clips of a folder, or only those that are `wanted`; InputError when there is none or one is not there.
+
+    A folder that holds images itself, and a video file, is one clip.
+    """
+    if not folder.exists():
+        raise InputError(f"{folder} does not exist; name a folder of videos, or of sub-folders of images")
+    if folder.is_file() or _has_images(folder):
+        clips = {folder.name: folder}
+    else:
+        places = sorted(folder.iterdir())
+        clips = {place.name: place for place in places if place.suffix.lower() in VIDEO_SUFFIXES or _has_images(place)}
+    if not clips:
+        raise InputError(f"{folder} has no clip: no video ({' '.join(sorted(VIDEO_SUFFIXES))}) and no folder of images")
+    if not wanted:
+        return clips
+    chosen = {name: path for name, path in clips.items() if name in wanted or path.stem in wanted}
+    missing = [name for name in wanted if name not in chosen and name not in {path.stem for path in chosen.values()}]
+    if missing:
+        raise InputError(f"{folder} has no clip {missing[0]!r}; it has {', '.join(list(clips)[:3])} ...")
+    return chosen
+
+
+def _has_images(place: Path) -> bool:
+    return place.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in place.iterdir())
+
+
+def read_people(path: Path, clips: Clips) -> dict[str, People]:
+    """People by clip, of the clips that the file or folder `path` speaks of; InputError when it speaks of none."""
+    if path.is_dir():
+        files = {name: path / f"{clip.stem}.json" for name, clip in clips.items()}
+        found: dict[str, People] = {name: read_keypoints(file) for name, file in files.items() if file.is_file()}
+    elif "frames" in _keys(path):
+        if len(clips) != 1:
+            raise InputError(f"{path} has the frames of one clip, but there are {len(clips)}; choose one with --clips")
+        found = {name: read_keypoints(path) for name in clips}
+    else:
+        found = _of_annotations(Annotations.load(path), clips)
+    found = {name: people for name, people in found.items() if any(people.values())}
+    if not found:
+        raise InputError(f"{path} has nobody in any of the clips {', '.join(list(clips)[:3])} ...")
+    return found
+
+
+def _keys(path: Path) -> Mapping[str, object]:
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no JSON file: {error}") from error
+    return data if isinstance(data, dict) else {}
+
+
+def _of_annotations(annotations: Annotations, clips: Clips) -> dict[str, People]:
+    """The annotated people; images of a clip's folder are its frames in natural order."""
+    names = {known: name for name, clip in clips.items() for known in (name, clip.stem)}
+    found: dict[str, dict[int, Sequence[Keypoints]]] = {}
+    for file, frames in annotations.people.items():
+        place = Path(file)
+        people = {index: [person.keypoints for person in persons] for index, persons in frames.items()}
+        if file in names or place.stem in names:
+            found.setdefault(names.get(file) or names[place.stem], {}).update(people)
+        elif place.parent.name in names:
+            clip = clips[names[place.parent.name]]
+            order = [image.name for image in open_frames(clip).files]
+            if place.name in order:
+                found.setdefault(names[place.parent.name], {})[order.index(place.name)] = people[0]
+    return {name: dict(people) for name, people in found.items()}

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A second look at places that may show a person: boosted decision trees over gradients and colours of the window.
+
+The trees see what rigid filters miss: 16 x 16 cells of S / 7 around head and shoulders, in each cell the 32 dimensions
+of HOG and its colour (CIE L*a*b*) less the window's mean, every value quantised to 0..31.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.evidence.image.hog import DIMENSIONS
+
+type Floats = NDArray[np.float32]
+type Codes = NDArray[np.uint8]
+
+SIDE = 16  # cells
+ABOVE, ASIDE = 1, 2  # cells that the window reaches beyond the head-and-shoulders filters' at the top and the left
+COLOURS = 3
+FEATURES = SIDE * SIDE * (DIMENSIONS + COLOURS)
+BINS = 32
+HOG_RANGE = 0.4  # a value of this size or more gets the last code
+COLOUR_RANGE = 0.3  # of +-1; the same for colours
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forest:
+    """T complete trees of depth D: go right where code > threshold; the leaves' sum is the score.
+
+    `feature` (T, 2**D - 1) int32 and `threshold` (T, 2**D - 1) uint8 of the inner nodes, breadth first, and
+    `leaves` (T, 2**D).
+    """
+
+    feature: NDArray[np.int32]
+    threshold: Codes
+    leaves: Floats
+
+    def scores(self, codes: Codes) -> Floats:
+        """Scores (N,) of windows (N, FEATURES)."""
+        return np.asarray(_scores(codes, self.feature, self.threshold, self.leaves), np.float32)
+
+
+def colours_of(image: NDArray[np.uint8], rows: int, columns: int) -> Floats:
+    """CIE L*a*b* (rows, columns, 3), each divided by 255, averaged over the cells that cover the image."""
+    coloured = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+    means = cv2.resize(coloured, (columns, rows), interpolation=cv2.INTER_AREA)
+    colours = np.asarray(cv2.cvtColor(means, cv2.COLOR_RGB2LAB), np.float32)
+    colours /= 255
+    return colours
+
+
+def codes_of(features: Floats, colours: Floats, row: int, column: int) -> Codes:
+    """Codes (FEATURES,) of the window whose filters start at (row, column) of a level (R, C, 32) and (R, C, 3).
+
+    Beyond the level its border is repeated.
+    """
+    rows = np.clip(np.arange(row - ABOVE, row - ABOVE + SIDE), 0, features.shape[0] - 1)
+    columns = np.clip(np.arange(column - ASIDE, column - ASIDE + SIDE), 0, features.shape[1] - 1)
+    gradients = features[rows[:, None], columns[None, :]] * np.float32(BINS / HOG_RANGE)
+    colour = colours[rows[:, None], columns[None, :]]
+    relative = (colour - colour.mean(axis=(0, 1))) * np.float32(BINS / 2 / COLOUR_RANGE) + np.float32(BINS / 2)
+    both = np.concatenate([gradients, relative], axis=2)
+    return np.clip(both, 0, BINS - 1).astype(np.uint8).ravel()
+
+
+@njit(cache=True, nogil=True)
+def _scores(codes: Codes, feature: NDArray[np.int32], threshold: Codes, leaves: Floats) -> Any:
+    inner = feature.shape[1]
+    out = np.zeros(len(codes), np.float32)
+    for i in range(len(codes)):
+        for tree in range(len(feature)):
+            node = 0
+            while node < inner:
+                node = 2 * node + 1 + (1 if codes[i, feature[tree, node]] > threshold[tree, node] else 0)
+            out[i] += leaves[tree, node - inner]
+    return out

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The part filters of the detector: the window around a person in which they look, its features, their responses.
+
+The window is 4.6 S wide and 4.4 S high in cells of S / 10 around the neck, S being the person's scale. To the 32
+dimensions of HOG come four of colour: how much more frequent a cell's hue and its lightness are on the face, and on
+the upper chest, than in the whole window (logarithm of the ratio of two histograms in CIE L*a*b*). A grey image has
+no hue to tell: those two dimensions are 0 there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.evidence.image.hog import DIMENSIONS, OUTSIDE, hog
+from flowing_puppet_ros.image.detector.pictorial_structure import PartTree
+from flowing_puppet_ros.image.detector.root_filters import pad, respond
+
+type Floats = NDArray[np.float32]
+type Doubles = NDArray[np.float64]
+
+CELLS_PER_SCALE = 10
+CELL = 6  # px of a cell in the resized window
+LEFT, UP = 23, 20  # cells from the window's border to the neck
+COLUMNS, ROWS = 46, 44
+FILTER = 5  # cells of a part filter's side
+COLOURS = 4
+FACE_RADIUS, CHEST_RADIUS, CHEST_BELOW = 0.2, 0.25, 0.35  # units of S; the chest lies below the neck
+HUE_BINS, LIGHT_BINS = 32, 16
+RATIO_LIMIT = 3.0
+
+PARTS = (
+    *("neck", "face", "belly", "right_hip", "left_hip"),
+    *(
+        f"{side}_{part}"
+        for side in ("right", "left")
+        for part in ("shoulder", "upper_arm", "elbow", "forearm", "wrist")
+    ),
+)
+"""Parts in the order of the tree; upper_arm and forearm lie midway between the joints."""
+PARENTS = (-1, 0, 0, 2, 2, 0, 5, 6, 7, 8, 0, 10, 11, 12, 13)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """`features` (ROWS, COLUMNS, 36) around a neck; cell (x, y) has its centre at `origin` + `cell` * (x, y) px.
+
+    `mirror` is the image's width where that place is one of its mirror image.
+    """
+
+    features: Floats
+    origin: tuple[float, float]
+    cell: float
+    mirror: int | None = None
+
+    @property
+    def outside(self) -> float:
+        """Share of the window that lies outside of the image."""
+        return float(np.mean(self.features[..., OUTSIDE] > 0))
+
+    def cells_of(self, points: Doubles) -> Doubles:
+        """Grid coordinates (..., 2) of image points (..., 2)."""
+        cells: Doubles = (self._turned(np.asarray(points, np.float64)) - self.origin) / self.cell
+        return cells
+
+    def points_of(self, cells: Doubles) -> Doubles:
+        """Image points (..., 2) of grid coordinates (..., 2)."""
+        points: Doubles = np.asarray(cells, np.float64) * self.cell + self.origin
+        return self._turned(points)
+
+    def _turned(self, points: Doubles) -> Doubles:
+        """Points (..., 2) of the image in its mirror image, or the other way round, if that was looked at."""
+        if self.mirror is None:
+            return points
+        return np.stack([self.mirror - 1 - points[..., 0], points[..., 1]], axis=-1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PartFilters:
+    """`filters` (L, 5, 5, 36), one a layer of `tree`."""
+
+    filters: Floats
+    tree: PartTree
+
+    def unary(self, window: Window) -> Floats:
+        """Responses (L, ROWS, COLUMNS) of all layers."""
+        return responses(window.features, self.filters)
+
+
+def responses(features: Floats, filters: Floats) -> Floats:
+    """Responses (L, ROWS, COLUMNS) of filters (L, 5, 5, D), each centred on the cell that it scores."""
+    framed = pad_window(features)
+    return np.ascontiguousarray(respond(framed, filters).transpose(2, 0, 1))
+
+
+def pad_window(features: Floats) -> Floats:
+    """The features with a frame of half a filter that is marked as outside."""
+    return pad(features, FILTER // 2)
+
+
+def window_at(image: NDArray[np.uint8], neck: tuple[float, float], face: tuple[float, float], scale: float) -> Window:
+    """Look at an image (H, W, 3) or (H, W) around a neck, with the face and the scale S given, all in px."""
+    step = scale / CELLS_PER_SCALE
+    corner = np.array([neck[0] + 0.5 - (LEFT + 0.5) * step, neck[1] + 0.5 - (UP + 0.5) * step])
+    size = np.array([image.shape[1], image.shape[0]])
+    # Whole cells that lie outside of the image are not looked at: the crop starts with the first that is inside.
+    skipped = np.maximum(0, np.ceil(-corner / step)).astype(int)
+    cells = np.minimum(np.floor((size - corner) / step).astype(int), (COLUMNS, ROWS)) - skipped
+    begin = np.maximum(0, np.round(corner + skipped * step)).astype(int)
+    features = np.zeros((ROWS, COLUMNS, DIMENSIONS + COLOURS), np.float32)
+    features[..., OUTSIDE] = 1
+    origin = tuple((corner + 0.5 * step - 0.5).tolist())
+    if (cells > 0).all():
+        end = np.minimum(size, np.maximum(begin + 1, np.round(corner + (skipped + cells) * step).astype(int)))
+        crop = image[begin[1] : end[1], begin[0] : end[0]]
+        if crop.size:
+            inside = _look(crop, cells, begin, np.array(neck), np.array(face), scale)
+            features[skipped[1] : skipped[1] + cells[1], skipped[0] : skipped[0] + cells[0]] = inside
+    return Window(features, origin, step)
+
+
+def _look(
+    crop: NDArray[np.uint8],
+    cells: NDArray[np.int64],
+    begin: NDArray[np.int64],
+    neck: Doubles,
+    face: Doubles,
+    scale: float,
+) -> Floats:
+    """Features (rows, columns, 36) of a crop that holds `cells` (columns, rows) cells."""
+    size = int(cells[0]) * CELL, int(cells[1]) * CELL
+    method = cv2.INTER_AREA if crop.shape[1] > size[0] else cv2.INTER_LINEAR
+    resized = np.asarray(cv2.resize(crop, size, interpolation=method), np.uint8)
+    factor = CELL * CELLS_PER_SCALE / scale
+    places = [((at - begin + 0.5) * factor - 0.5) for at in (face, neck + np.array([0.0, CHEST_BELOW * scale]))]
+    features = np.zeros((int(cells[1]), int(cells[0]), DIMENSIONS + COLOURS), np.float32)
+    features[..., :DIMENSIONS] = hog(resized, CELL)
+    features[..., DIMENSIONS:] = _colours(resized, places, (int(cells[0]), int(cells[1])))
+    return features
+
+
+def _colours(image: NDArray[np.uint8], places: list[Doubles], cells: tuple[int, int]) -> Floats:
+    """Means (rows, columns, 4) over cells: hue like the face, lightness like it, hue and lightness like the chest."""
+    coloured = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+    lab = cv2.cvtColor(coloured, cv2.COLOR_RGB2LAB)
+    # Hues fill a small part of the a*b* plane: twice the resolution around grey.
+    hue = np.clip((lab[..., 1:].astype(np.int32) - 128) // 3 + HUE_BINS // 2, 0, HUE_BINS - 1)
+    codes = hue[..., 0] * HUE_BINS + hue[..., 1], lab[..., 0].astype(np.int32) * LIGHT_BINS // 256
+    shapes = (HUE_BINS, HUE_BINS), (LIGHT_BINS, 1)
+    out = np.zeros((cells[1], cells[0], COLOURS), np.float32)
+    for index, (place, radius) in enumerate(zip(places, (FACE_RADIUS, CHEST_RADIUS), strict=True)):
+        mask = np.zeros(image.shape[:2], np.uint8)
+        cv2.circle(mask, tuple(np.round(place).astype(int).tolist()), round(radius * CELL * CELLS_PER_SCALE), 1, -1)
+        if not mask.any():
+            continue
+        for kind, (code, shape) in enumerate(zip(codes, shapes, strict=True)):
+            ratio = _log_ratio(code, mask.astype(bool), shape)
+            means = cv2.resize(ratio[code], cells, interpolation=cv2.INTER_AREA)
+            out[..., 2 * index + kind] = means / RATIO_LIMIT
+    return out
+
+
+def _log_ratio(code: NDArray[np.int32], mask: NDArray[np.bool_], shape: tuple[int, int]) -> Floats:
+    """Logarithm of how much more frequent each code is inside the mask than everywhere, at most RATIO_LIMIT."""
+    bins = shape[0] * shape[1]
+    inside, whole = (
+        _smooth(np.bincount(values, minlength=bins).reshape(shape)) for values in (code[mask], code.ravel())
+    )
+    ratio: Floats = np.clip(np.log(inside / whole), -RATIO_LIMIT, RATIO_LIMIT).astype(np.float32).ravel()
+    return ratio
+
+
+def _smooth(counts: NDArray[np.int64]) -> Doubles:
+    """Blurred shares of the bins, never 0."""
+    blurred = cv2.GaussianBlur(counts.astype(np.float64), (5, 5), 1.0, borderType=cv2.BORDER_REPLICATE)
+    share: Doubles = blurred / blurred.sum() + 0.1 / blurred.size
+    return share

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From an image to the places where a pose is worth looking for: rigid filters propose, boosted trees choose."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.image.detector.boosted_trees import Forest
+from flowing_puppet_ros.image.detector.root_filters import Candidate, RootFilters, find
+
+type Doubles = NDArray[np.float64]
+
+WINDOWS = 80  # places that the rigid filters propose
+LEAST = -2.0
+SCALE_PRIOR = 0.3  # score of the rigid filters per logarithm of S: small windows are many
+FOREST_SHARE = 0.33  # units of the rigid filters' score per log-odds of the trees
+
+
+def propose(image: NDArray[np.uint8], root: RootFilters, smallest: float) -> list[Candidate]:
+    """Places of people with shoulders from `smallest` px, those that the rigid filters prefer first."""
+    found = find(image, root, smallest, WINDOWS, LEAST)
+    return sorted(found, key=lambda one: -(one.score + SCALE_PRIOR * np.log(one.scale)))
+
+
+def choose(candidates: list[Candidate], forest: Forest, count: int) -> list[tuple[Candidate, float]]:
+    """The `count` most promising candidates with the trees' score of each, best first."""
+    if not candidates:
+        return []
+    looks = forest.scores(np.stack([one.codes for one in candidates]))
+    value = [
+        one.score + FOREST_SHARE * float(look) + 1.5 * SCALE_PRIOR * np.log(one.scale)
+        for one, look in zip(candidates, looks, strict=True)
+    ]
+    return [(candidates[i], float(looks[i])) for i in np.argsort(-np.array(value), kind="stable")[:count]]

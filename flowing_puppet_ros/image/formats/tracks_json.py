@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The JSON files of the command line: keypoints that start and re-anchor people, and the tracks that come out.
+
+    keypoints.json  {"joint_names": [...], "frames": {"0": [[[x, y, confidence], ...], ...]}}   people of a frame
+    tracks.json     {"joint_names": [...], "fps": f, "frames": [{"index", "path", "stamp_ns", "puppets": [...]}]}
+
+Pixels of the input, person's left and right; NaN is written as null.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.formats.keypoints import Keypoints, normalise_name
+from flowing_puppet_ros.image.formats.stick_regression import StickRegression
+from flowing_puppet_ros.image.formats.stickmen import read_sticks
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.ds.shape import View
+from flowing_puppet_ros.model.tree import PartTree
+
+type Floats = NDArray[np.float64]
+
+DECIMALS = 2  # of a pixel
+MOST_DIGITS = 18  # of a frame's index
+
+
+class Puppet(Protocol):
+    """What the files say of one person in one image, see `tracker.TrackedPuppet`."""
+
+    @property
+    def id(self) -> str:
+        """Name of the person."""
+        ...
+
+    @property
+    def view(self) -> View:
+        """Side that the camera sees."""
+        ...
+
+    @property
+    def scale(self) -> float:
+        """Pixels per metre."""
+        ...
+
+    @property
+    def energy(self) -> float:
+        """Energy in nats; lower is more likely."""
+        ...
+
+    @property
+    def joints(self) -> Floats:
+        """Joints (J, 2) px."""
+        ...
+
+    @property
+    def confidence(self) -> Floats:
+        """Confidence (J,) in [0, 1]."""
+        ...
+
+    @property
+    def contours(self) -> tuple[Floats, ...]:
+        """Outline (K_i, 2) px of each part."""
+        ...
+
+    @property
+    def depth(self) -> tuple[int, ...]:
+        """Paint order of each part, 0 farthest."""
+        ...
+
+
+def read_keypoints(path: str | Path) -> dict[int, list[Keypoints]]:
+    """Read keypoints.json, or sticks.txt: {frame index: people}. A frame that is not listed had no detector run on it.
+
+    Sticks become the puppets that stand in their place, see `stick_figures`.
+    """
+    if Path(path).suffix.lower() == ".txt":
+        regression = StickRegression(DeformableStructures.load())
+        return {
+            number: [regression.keypoints(sticks) for sticks in people]
+            for number, people in read_sticks(Path(path)).items()
+        }
+    try:
+        data = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no JSON file: {error}") from error
+    if not isinstance(data, dict) or not isinstance(data.get("frames"), dict):
+        raise InputError(f'{path} needs "joint_names" and "frames": {{"0": [[[x, y, confidence], ...], ...]}}')
+    names = data.get("joint_names")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InputError(f'{path} needs "joint_names", a list of strings')
+    if not any(normalise_name(name) for name in names):
+        raise InputError(f"{path} has no joint name that is known here; {names[:3]} are not")
+    frames: dict[int, list[Keypoints]] = {}
+    for key, people in data["frames"].items():
+        if not key.isdecimal() or len(key) > MOST_DIGITS or not isinstance(people, list):
+            raise InputError(f"{path}: frame {key[:MOST_DIGITS]!r} must be an index with a list of people")
+        frames[int(key)] = [_person(tuple(names), rows, f"{path}, frame {key}") for rows in people]
+    if not any(frames.values()):
+        raise InputError(f"{path} has no person in any frame")
+    return frames
+
+
+def _person(names: tuple[str, ...], rows: Any, where: str) -> Keypoints:
+    try:
+        # null, the JSON for an unknown number, becomes NaN.
+        values = np.array(rows, dtype=np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (len(names), 3):
+        raise InputError(f"{where}: a person needs {len(names)} entries [x, y, confidence], one a joint name")
+    return Keypoints(names, values[:, :2], np.nan_to_num(values[:, 2]))
+
+
+def puppet_entry(puppet: Puppet, tree: PartTree) -> dict[str, Any]:
+    """The JSON object of one puppet."""
+    joints = [
+        [_number(x), _number(y), _number(confidence, 3)]
+        for (x, y), confidence in zip(puppet.joints, puppet.confidence, strict=True)
+    ]
+    parts = [
+        {"name": name, "contour": [[_number(x), _number(y)] for x, y in contour], "depth": depth}
+        for name, contour, depth in zip(tree.names, puppet.contours, puppet.depth, strict=True)
+    ]
+    scale, energy = _number(puppet.scale), _number(puppet.energy, 4)
+    return {"id": puppet.id, "view": puppet.view, "scale": scale, "energy": energy, "joints": joints, "parts": parts}
+
+
+def _number(value: float, decimals: int = DECIMALS) -> float | None:
+    return round(float(value), decimals) if math.isfinite(value) else None
+
+
+def write_tracks(path: str | Path, joint_names: tuple[str, ...], fps: float, frames: Iterable[dict[str, Any]]) -> None:
+    """Write tracks.json frame by frame, and put it in place when it is whole; InputError when it cannot be written."""
+    place = Path(path)
+    draft = place.with_name(f".{place.name}.part")
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with draft.open("w", encoding="utf-8") as file:
+            file.write(f'{{"joint_names": {json.dumps(list(joint_names))}, "fps": {json.dumps(fps)}, "frames": [')
+            for number, frame in enumerate(frames):
+                file.write(("," if number else "") + "\n" + json.dumps(frame, allow_nan=False))
+            file.write("\n]}\n")
+        draft.replace(place)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}") from error
+    finally:
+        draft.unlink(missing_ok=True)

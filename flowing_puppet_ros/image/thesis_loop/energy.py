@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The energy of flowing puppets (thesis Eqs. 33 to 35), for many puppets of one image at once.
+
+Prior, contour, colour and hands in the image, the same evidence at the puppet that the flow carries into its
+neighbours, and the detector's score, without which the search leaves good arms for edges and skin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.evidence.image.hands import HandMaps, hand_score
+from flowing_puppet_ros.evidence.image.likelihood import Scene
+from flowing_puppet_ros.image.pose.evidence import Found, Window
+from flowing_puppet_ros.image.thesis_loop.flow_moments import FlowMoments
+from flowing_puppet_ros.image.thesis_loop.upper_body import UpperBody
+from flowing_puppet_ros.image.tracking.propagation import membership
+from flowing_puppet_ros.settings import Settings, setting
+
+type Floats = NDArray[np.float64]
+
+TERMS = ("contour", "colour", "hands", "detector")
+SCORED = tuple(f"{side}_{name}" for name in ("shoulder", "elbow", "wrist") for side in ("right", "left"))
+
+
+@dataclass(frozen=True, slots=True)
+class EnergySettings(Settings):
+    """Weights of the terms of Eq. 35, and how far the flow carries a puppet for its evidence there.
+
+    The weights come from `flowing-puppet learn flowing`, see weights/flowing_weights.md; the detector's is set by hand.
+    """
+
+    prior_weight: float = setting(0.15, "weight of the body model's prior", low=0.0, high=100.0)
+    contour_weight: float = setting(1.0, "weight of the contours", low=0.0, high=100.0)
+    colour_weight: float = setting(0.6, "weight of skin and torso colour", low=0.0, high=100.0)
+    hand_weight: float = setting(1.0, "weight of the hand detectors", low=0.0, high=100.0)
+    score_weight: float = setting(3.0, "weight of the detector's score of each arm joint", low=0.0, high=100.0)
+    forward: bool = setting(True, "use the evidence at the puppet that the flow carries forward")
+    backward: bool = setting(True, "use the evidence at the puppet that the flow carries backward")
+    steps: int = setting(1, "images that the flow carries a puppet for its evidence", low=1, high=10)
+
+    @property
+    def weights(self) -> Floats:
+        """(4,) of TERMS."""
+        return np.array([self.contour_weight, self.colour_weight, self.hand_weight, self.score_weight])
+
+
+@dataclass(slots=True, eq=False)
+class FrameEvidence:
+    """What speaks for and against puppets of one person in one image.
+
+    `window` the pixels around them, `hands` the maps, `found` the detection or the given keypoints, `before` and
+    `after` the flow to the neighbouring images; None where there is none.
+    """
+
+    window: Window | None
+    hands: HandMaps | None
+    found: Found | None
+    before: FlowMoments | None = None
+    after: FlowMoments | None = None
+
+    def terms(self, body: UpperBody, joints: Floats, scale: Floats, contours: Sequence[Floats]) -> Floats:
+        """Log likelihoods (P,4) of TERMS for joints (P,J,2) px and contours (P,K_i,2) of every part of the model."""
+        terms = np.zeros((len(joints), len(TERMS)))
+        scene = None if self.window is None else self.window.scene
+        if self.window is not None and isinstance(scene, Scene):
+            size = scale * self.window.factor
+            for part in body.parts:
+                contour, colour = scene.contour_and_colour(part, self.window.inside(contours[part]), size)
+                terms[:, 0] += contour
+                terms[:, 1] += colour
+        names = body.model.joint_names
+        if self.hands is not None:
+            for side in ("right", "left"):
+                wrist, elbow = (joints[:, names.index(f"{side}_{name}")] for name in ("wrist", "elbow"))
+                terms[:, 2] += hand_score(self.hands, wrist, elbow, float(np.median(scale)))
+        if self.found is not None:
+            for name in SCORED:
+                terms[:, 3] += self.found.joint_score(name, joints[:, names.index(name)])
+        return terms
+
+
+def carried(body: UpperBody, flow: FlowMoments, joints: Floats, contours: Sequence[Floats]) -> Floats:
+    """Joints (P,J,2) px where the flow takes those of puppets: the flowing puppets of thesis section 2.
+
+    A joint moves as the mean of its parts' motions, by the weight of their pixels.
+    """
+    motions, weights = zip(*(flow.affine(contours[part]) for part in body.parts), strict=True)
+    member = membership(body.model)[list(body.parts)]
+    moved = np.stack([joints @ np.swapaxes(m[:, :, :2], 1, 2) + m[:, None, :, 2] for m in motions])
+    share = (np.stack(weights)[:, :, None] + 1e-6) * member[:, None, :]
+    total = share.sum(axis=0)
+    mean = (share[..., None] * moved).sum(axis=0) / np.maximum(total, 1e-12)[..., None]
+    # Legs are not searched: they move with the torso.
+    return np.where((total > 0)[..., None], mean, moved[0])
+
+
+class FlowingEnergy:
+    """Energies of puppets in the images of a clip; `frames` are those of one person, one after the other."""
+
+    def __init__(self, body: UpperBody, frames: Sequence[FrameEvidence], settings: EnergySettings) -> None:
+        """The flow leads from each of the frames to the next."""
+        self.body, self.frames, self.settings = body, frames, settings
+
+    def at(self, frame: int, vectors: Floats, legs: Floats) -> Floats:
+        """Energies (P,) of Eq. 35 of vectors (P,D) in one frame; `legs` (J,2) as `UpperBody.joints` takes them."""
+        joints, scale = self.body.joints(vectors, legs)
+        prior, own, elsewhere = self.terms(frame, joints, scale)
+        weights = self.settings.weights
+        return np.asarray(self.settings.prior_weight * prior - (own + elsewhere) @ weights, dtype=np.float64)
+
+    def terms(self, frame: int, joints: Floats, scale: Floats) -> tuple[Floats, Floats, Floats]:
+        """Prior energy (P,), evidence (P,4) in the frame, and the sum (P,4) of that in its neighbours."""
+        contours, prior = self.body.model.puppets_from_joints(joints, scale, self.body.view, self.body.edges)
+        own = self.frames[frame].terms(self.body, joints, scale, contours)
+        elsewhere = np.zeros_like(own)
+        for step, wanted in ((1, self.settings.forward), (-1, self.settings.backward)):
+            if wanted:
+                elsewhere += self._carried_terms(frame, step, joints, scale, contours)
+        return prior, own, elsewhere
+
+    def _carried_terms(
+        self, frame: int, step: int, joints: Floats, scale: Floats, contours: Sequence[Floats]
+    ) -> Floats:
+        terms = np.zeros((len(joints), len(TERMS)))
+        for _ in range(self.settings.steps):
+            flow = self.flow(frame, step)
+            if flow is None:
+                break
+            joints = carried(self.body, flow, joints, contours)
+            contours, _ = self.body.model.puppets_from_joints(joints, scale, self.body.view, [])
+            frame += step
+            terms += self.frames[frame].terms(self.body, joints, scale, contours)
+        return terms
+
+    def flow(self, frame: int, step: int) -> FlowMoments | None:
+        """The flow from a frame to its neighbour; None at the clip's ends and where it is unknown."""
+        if not 0 <= frame + step < len(self.frames):
+            return None
+        return self.frames[frame].after if step > 0 else self.frames[frame].before

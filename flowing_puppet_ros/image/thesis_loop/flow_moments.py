@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The affine motions of the parts of many puppets at once, by sums over the regions of their contours.
+
+The same motion as `flow.affine` fits to one puppet's visible pixels, without its iterations: the least squares of a
+region need twelve sums, which prefix sums along the rows give for any contour. What the iterations do there is done
+once for all puppets here: a pixel weighs less where the flow does not return, and where it moves as the background.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.flow.affine import (
+    BACKGROUND_SHARE,
+    CORRELATED_PIXELS,
+    DEFORMATION,
+    LEAST_FOR_TRANSLATION,
+    fit_regions,
+    round_trip_weight,
+)
+from flowing_puppet_ros.flow.estimate import FlowPair
+from flowing_puppet_ros.image.tracking.propagation import Grid
+
+type Floats = NDArray[np.float64]
+
+SUMS = 12
+"""Sums over weights w: w times 1, x, y, xx, xy, yy, then w times u, v, ux, uy, vx, vy."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FlowMoments:
+    """Sums of one flow field around a person: `along` (h,w+1,12) from pixel `corner` (x, y) of the flow's grid on."""
+
+    along: Floats
+    corner: Floats
+    grid: Grid
+
+    @classmethod
+    def of(cls, flow: FlowPair, grid: Grid, low: Floats, high: Floats) -> Self:
+        """Of the flow (there, back) on the working grid, within image pixels `low` to `high` (2,)."""
+        first = np.clip(np.floor(grid.reduced(low)), 0, np.array(grid.work) - 1).astype(int)
+        last = np.clip(np.ceil(grid.reduced(high)), first + 1, grid.work).astype(int)
+        there, back = (np.ascontiguousarray(field, np.float32) for field in flow)
+        background = fit_regions(np.zeros(there.shape[:2], np.uint16), 1, there, back).affine[0]
+        return cls(_prepare(there, back, background, *first, *last), first.astype(np.float64), grid)
+
+    def affine(self, contours: Floats) -> tuple[Floats, Floats]:
+        """Motions (P,2,3) of regions with contours (P,K,2), in image pixels, and the weight (P,) of their pixels.
+
+        Regions that weigh next to nothing stay where they are.
+        """
+        local = np.ascontiguousarray(self.grid.reduced(contours) - self.corner, np.float64)
+        sums = np.zeros((len(contours), SUMS))
+        _gather(self.along, local, sums)
+        weight = np.maximum(sums[:, 0], 1e-9)
+        mean = sums[:, 1:3] / weight[:, None]
+        spread = np.empty((len(contours), 2, 2))
+        spread[:, 0, 0] = sums[:, 3] - weight * mean[:, 0] ** 2
+        spread[:, 1, 1] = sums[:, 5] - weight * mean[:, 1] ** 2
+        spread[:, 0, 1] = spread[:, 1, 0] = sums[:, 4] - weight * mean[:, 0] * mean[:, 1]
+        flow = sums[:, 6:8] / weight[:, None]
+        cross = sums[:, 8:12].reshape(-1, 2, 2) - weight[:, None, None] * flow[:, :, None] * mean[:, None, :]
+        stiff = CORRELATED_PIXELS / DEFORMATION**2 * np.eye(2)
+        linear = np.linalg.solve(spread + stiff, np.swapaxes(cross, 1, 2)).swapaxes(1, 2)
+        known = weight >= LEAST_FOR_TRANSLATION
+        linear[~known], flow[~known] = 0.0, 0.0
+        return self._enlarged(linear, flow, mean), np.where(known, weight, 0.0)
+
+    def _enlarged(self, linear: Floats, flow: Floats, mean: Floats) -> Floats:
+        """Motions of the grid around `mean`, relative to the corner, as motions of the image."""
+        center = self.grid.enlarged(mean + self.corner)
+        ratio = self.grid.factor
+        turned = linear * ratio[None, None, :] / ratio[None, :, None] + np.eye(2)
+        shift = flow / ratio + center - np.einsum("pij,pj->pi", turned, center)
+        return np.concatenate([turned, shift[:, :, None]], axis=2)
+
+
+@njit(cache=True, nogil=True)
+def _prepare(
+    there: NDArray[np.float32], back: NDArray[np.float32], background: Floats, left: int, top: int, right: int,
+    bottom: int,
+) -> Floats:  # fmt: skip
+    along = np.zeros((bottom - top, right - left + 1, 12))
+    a = background
+    for y in range(bottom - top):
+        for x in range(right - left):
+            for k in range(12):
+                along[y, x + 1, k] = along[y, x, k]
+            u, v = float(there[y + top, x + left, 0]), float(there[y + top, x + left, 1])
+            if not (np.isfinite(u) and np.isfinite(v)):
+                continue
+            at_x, at_y = x + left, y + top
+            misfit_x = a[0, 0] * at_x + a[0, 1] * at_y + a[0, 2] - at_x - u
+            misfit_y = a[1, 0] * at_x + a[1, 1] * at_y + a[1, 2] - at_y - v
+            square = misfit_x * misfit_x + misfit_y * misfit_y
+            w = round_trip_weight(at_x, at_y, u, v, back) * (BACKGROUND_SHARE + square) / (1.0 + square)
+            sums = along[y, x + 1]
+            sums[0] += w
+            sums[1] += w * x
+            sums[2] += w * y
+            sums[3] += w * x * x
+            sums[4] += w * x * y
+            sums[5] += w * y * y
+            sums[6] += w * u
+            sums[7] += w * v
+            sums[8] += w * u * x
+            sums[9] += w * u * y
+            sums[10] += w * v * x
+            sums[11] += w * v * y
+    return along
+
+
+@njit(cache=True, nogil=True)
+def _gather(along: Floats, contours: Floats, sums: Floats) -> None:
+    """Green's theorem by rows, see `evidence.image.region`."""
+    height, width = along.shape[0], along.shape[1] - 1
+    for p in range(contours.shape[0]):
+        area = 0.0
+        last = contours.shape[1] - 1
+        for k in range(contours.shape[1]):
+            x0, y0, x1, y1 = contours[p, last, 0], contours[p, last, 1], contours[p, k, 0], contours[p, k, 1]
+            last = k
+            if not np.isfinite(x0 + y0 + x1 + y1):
+                sums[p] = 0.0
+                break
+            sign = 1.0 if y1 > y0 else -1.0
+            low, high = min(y0, y1), max(y0, y1)
+            first, end = int(np.ceil(min(max(low, 0.0), height))), int(np.ceil(min(max(high, 0.0), height)))
+            for row in range(first, end):
+                crossing = x0 + (row - y0) / (y1 - y0) * (x1 - x0)
+                left = int(np.ceil(min(max(crossing, 0.0), width)))
+                area += sign * left
+                for m in range(12):
+                    sums[p, m] += sign * along[row, left, m]
+        if area < 0.0:
+            for m in range(12):
+                sums[p, m] = -sums[p, m]

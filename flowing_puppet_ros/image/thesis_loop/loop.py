@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The loop of flowing puppets as the thesis has it: particle swarms in every image, propagated along the flow.
+
+Thesis, video chapter, "Inference" and Fig. 8. The best particles of an image are carried into its neighbours, each
+image is searched by itself, and both take turns. It is the reference that the default is measured against.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
+from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FlowingEnergy, FrameEvidence, carried
+from flowing_puppet_ros.image.thesis_loop.upper_body import PARTS, UpperBody
+from flowing_puppet_ros.image.thesis_loop.wrist_proposals import WristMoves
+from flowing_puppet_ros.inference.swarm import Swarm, resampled, search
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.ds.shape import View
+from flowing_puppet_ros.settings import Settings, setting
+
+type Floats = NDArray[np.float64]
+
+STAGES: tuple[tuple[str, ...], ...] = (PARTS[:4], PARTS)
+"""What moves in each stage of the hierarchical search: torso, head and right arm, then all."""
+
+NOISE = {"angle": 0.15, "length": 0.01, "shape": 0.3, "center": 0.0, "scale": 0.03}
+"""Standard deviations of the first particles around the detector's poses (thesis: "adding noise")."""
+
+MODES = 10  # poses of the detector to start from
+NEAR = 0.1  # m within which particles agree on a joint
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSettings(Settings):
+    """How long the particles are searched for; the thesis has P = 40, M = 5, R = 8 and three seeds."""
+
+    particles: int = setting(40, "particles an image, P", low=2, high=1000)
+    carried: int = setting(5, "best particles that are carried into the neighbouring images, M", low=0, high=100)
+    rounds: int = setting(8, "rounds of search and propagation, R", low=1, high=100)
+    seeds: int = setting(3, "runs, of which that of least energy is taken", low=1, high=100)
+    iterations: int = setting(3, "steps of the swarm in each stage of a round", low=1, high=1000)
+    jump: float = setting(0.5, "probability that a particle draws a wrist instead of moving", low=0.0, high=1.0)
+    temperature: float = setting(2.0, "energy difference at which a particle is drawn 1/e as often", low=0.01, high=1e3)
+    seed: int = setting(0, "seed of all random draws", low=0, high=1_000_000)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Start:
+    """Where the search begins in one image: `joints` (J,2) px as tracked, and `scale` px/m."""
+
+    joints: Floats
+    scale: float
+
+
+@dataclass(slots=True, eq=False)
+class _Image:
+    """One image in a run: bounds, legs, the wrist move, and the particles (P,D) with their energies (P,)."""
+
+    swarm: Swarm
+    legs: Floats
+    jump: WristMoves | None
+    start: Floats
+
+
+class ThesisLoop:
+    """Runs the loop over consecutive images of one person."""
+
+    def __init__(self, model: DeformableStructures, view: View, settings: LoopSettings, energy: EnergySettings) -> None:
+        """`view` is the side of the person that the camera sees."""
+        self.body = UpperBody(model, view)
+        self.settings, self.energy_settings = settings, energy
+
+    def run(self, starts: Sequence[Start], frames: Sequence[FrameEvidence]) -> tuple[Floats, Floats, Floats]:
+        """Joints (T,J,2) px, how much the particles agree on each (T,J) in [0, 1], and the energy (T,).
+
+        Of several seeds, those of the run of least total energy.
+        """
+        energy = FlowingEnergy(self.body, frames, self.energy_settings)
+        best: tuple[float, list[_Image]] | None = None
+        for number in range(self.settings.seeds):
+            rng = np.random.default_rng([self.settings.seed, number])
+            images = [self._begin(t, start, energy, rng) for t, start in enumerate(starts)]
+            self._propagate(images, energy)
+            for _ in range(self.settings.rounds):
+                for t, image in enumerate(images):
+                    self._search(t, image, energy, rng)
+                self._propagate(images, energy)
+            total = sum(float(image.swarm.energy.min()) for image in images)
+            if best is None or total < best[0]:
+                best = total, images
+        assert best is not None
+        return self._answer(best[1])
+
+    def _begin(self, t: int, start: Start, energy: FlowingEnergy, rng: np.random.Generator) -> _Image:
+        """First particles: the detector's poses with noise, half of them with a wrist drawn from the hand maps."""
+        poses = self._poses(start, energy.frames[t])
+        vectors = self.body.vectors(poses, np.full(len(poses), start.scale))
+        box, legs = self.body.box(vectors[0]), self.body.legs_of(start.joints)
+        hands = energy.frames[t].hands
+        neck = start.joints[self.body.model.joint_names.index("neck")]
+        jump = None
+        if hands is not None and self.energy_settings.hand_weight > 0:
+            jump = WristMoves.of(self.body, box, legs, hands, neck, start.scale)
+        particles = vectors[np.arange(self.settings.particles) % len(vectors)]
+        noise = np.concatenate(
+            [np.full(part.stop - part.start, NOISE[name]) for name, part in self.body.slices().items()]
+        )
+        fresh = slice(min(len(vectors), len(particles) // 2), None)
+        particles[fresh] += noise * rng.standard_normal(particles[fresh].shape)
+        if jump is not None:
+            drawn = slice((fresh.start + len(particles)) // 2, None)
+            particles[drawn] = jump(particles[drawn], rng)
+        particles = box.inside(particles)
+        return _Image(Swarm.of(particles, energy.at(t, particles, legs)), legs, jump, vectors[0])
+
+    def _poses(self, start: Start, evidence: FrameEvidence) -> Floats:
+        """Tracked joints first, then the detector's poses, (K,J,2) px; what a pose lacks is as tracked."""
+        poses = [start.joints]
+        for keypoints, _ in evidence.found.modes(MODES) if evidence.found is not None else ():
+            joints, _ = joints_from_keypoints(self.body.model, keypoints)
+            poses.append(np.where(np.isfinite(joints), joints, start.joints))
+        return np.array(poses)
+
+    def _search(self, t: int, image: _Image, energy: FlowingEnergy, rng: np.random.Generator) -> None:
+        """Both stages of the swarm, then particles drawn by their energy; the best one stays."""
+        box = self.body.box(image.start)
+        judge = partial(energy.at, t, legs=image.legs)
+        for parts in STAGES:
+            search(
+                image.swarm, judge, box, self.settings.iterations, rng, self.body.free(parts), image.jump,
+                self.settings.jump,
+            )  # fmt: skip
+        swarm = image.swarm
+        best = int(swarm.best_energy.argmin())
+        drawn = resampled(swarm, self.settings.temperature, rng)
+        worst = int(drawn.energy.argmax())
+        drawn.particles[worst], drawn.energy[worst] = swarm.best[best], swarm.best_energy[best]
+        image.swarm = Swarm.of(drawn.particles, drawn.energy)
+
+    def _propagate(self, images: Sequence[_Image], energy: FlowingEnergy) -> None:
+        """Carry the best particles of each image forward through the clip, then backward; keep the best of all."""
+        count = len(images)
+        if self.settings.carried == 0:
+            return
+        for step, order in ((1, range(count - 1)), (-1, range(count - 1, 0, -1))):
+            for t in order:
+                self._carry(t, step, images, energy)
+
+    def _carry(self, t: int, step: int, images: Sequence[_Image], energy: FlowingEnergy) -> None:
+        flow = energy.flow(t, step)
+        if flow is None:
+            return
+        here, there = images[t], images[t + step]
+        chosen = here.swarm.particles[np.argsort(here.swarm.energy, kind="stable")[: self.settings.carried]]
+        joints, scale = self.body.joints(chosen, here.legs)
+        contours, _ = self.body.model.puppets_from_joints(joints, scale, self.body.view, [])
+        moved = self.body.vectors(carried(self.body, flow, joints, contours), scale)
+        moved = self.body.box(there.start).inside(moved)
+        particles = np.concatenate([there.swarm.particles, moved])
+        energies = np.concatenate([there.swarm.energy, energy.at(t + step, moved, there.legs)])
+        kept = np.argsort(energies, kind="stable")[: self.settings.particles]
+        there.swarm = Swarm.of(particles[kept], energies[kept])
+
+    def _answer(self, images: Sequence[_Image]) -> tuple[Floats, Floats, Floats]:
+        joints, agreed, energies = [], [], []
+        for image in images:
+            swarm = image.swarm
+            best = int(swarm.energy.argmin())
+            places, scale = self.body.joints(swarm.particles, image.legs)
+            weight = np.exp((swarm.energy[best] - swarm.energy) / self.settings.temperature)
+            near = np.linalg.norm(places - places[best], axis=2) < NEAR * scale[best]
+            joints.append(places[best])
+            agreed.append(np.minimum((weight[:, None] * near).sum(axis=0) / weight.sum(), 1.0))
+            energies.append(float(swarm.energy[best]))
+        return np.array(joints), np.array(agreed), np.array(energies)

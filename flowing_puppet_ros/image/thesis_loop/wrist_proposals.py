@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The data-driven move of the swarm: wrists drawn from the hand maps, arms laid to them (thesis, "Inference")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.evidence.image.hands import HandMaps
+from flowing_puppet_ros.image.thesis_loop.upper_body import PARTS, UpperBody
+from flowing_puppet_ros.inference.swarm import Box
+
+type Floats = NDArray[np.float64]
+
+GRID = 0.04  # m between the places at which hands are looked for
+REACH = 0.85  # m from the neck
+SIDES = ("right", "left")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WristMoves:
+    """Places (K,2) px where hands may be, and for each map the sums (K,) of their probabilities up to each place."""
+
+    body: UpperBody
+    box: Box
+    legs: Floats
+    places: Floats
+    sums: tuple[Floats, ...]
+
+    @classmethod
+    def of(cls, body: UpperBody, box: Box, legs: Floats, maps: HandMaps, neck: Floats, scale: float) -> Self:
+        """Look for hands around a person with the neck at (2,) px; a map's probability is that of its log odds."""
+        axis = np.arange(-REACH, REACH + GRID, GRID) * scale
+        offsets = np.stack(np.meshgrid(axis, axis), axis=2).reshape(-1, 2)
+        places = neck + offsets[np.hypot(offsets[:, 0], offsets[:, 1]) <= REACH * scale]
+        sums = []
+        for kind in maps.fields:
+            odds, _ = maps.best_orientation(kind, places)
+            sums.append(np.cumsum(1 / (1 + np.exp(-np.clip(odds, -30, 30)))))
+        return cls(body, box, legs, places, tuple(sums))
+
+    def __call__(self, vectors: Floats, rng: np.random.Generator) -> Floats:
+        """Vectors (P,D) with one wrist each at a place drawn from one of the maps, chosen at random."""
+        moved = vectors.copy()
+        which = rng.integers(0, len(self.sums), len(vectors))
+        side, bend = rng.integers(0, 2, len(vectors)), rng.integers(0, 2, len(vectors))
+        drawn = rng.random(len(vectors))
+        joints, scale = self.body.joints(vectors, self.legs)
+        for k, name in enumerate(SIDES):
+            rows = np.flatnonzero(side == k)
+            if len(rows) == 0:
+                continue
+            chosen = [np.searchsorted(self.sums[which[r]], drawn[r] * self.sums[which[r]][-1]) for r in rows]
+            wrist = self.places[np.minimum(chosen, len(self.places) - 1)]
+            moved[rows] = self._laid(
+                moved[rows], joints[rows], scale[rows], name, wrist, np.where(bend[rows] == 1, 1.0, -1.0)
+            )
+        return moved
+
+    def _laid(self, vectors: Floats, joints: Floats, scale: Floats, side: str, wrist: Floats, bend: Floats) -> Floats:
+        """Vectors (P,D) whose arm reaches for wrists (P,2) px, the elbow on the side `bend` (P,) if it may be there."""
+        names = self.body.model.joint_names
+        sign = np.array([1.0 if self.body.view == "front" else -1.0, 1.0])
+        shoulder, target = joints[:, names.index(f"{side}_shoulder")] * sign, wrist * sign
+        upper, lower = PARTS.index(f"{side}_upper_arm"), PARTS.index(f"{side}_lower_arm")
+        first, second = (vectors[:, len(PARTS) + k] * scale for k in (upper, lower))
+        line = target - shoulder
+        far = np.maximum(np.hypot(line[:, 0], line[:, 1]), 1e-6)
+        # Arms that are too short for the wrist grow together, as far as their bounds allow.
+        longest = self.box.high[len(PARTS) + upper] * scale, self.box.high[len(PARTS) + lower] * scale
+        growth = np.maximum(1.0, far / (first + second))
+        first, second = np.minimum(first * growth, longest[0]), np.minimum(second * growth, longest[1])
+        cosine = np.clip((first**2 + far**2 - second**2) / (2 * first * far), -1.0, 1.0)
+        middle, opening = np.arctan2(line[:, 1], line[:, 0]), np.arccos(cosine)
+        turned = self._near_bounds(middle + bend * opening - vectors[:, 0], upper)
+        allowed = (turned >= self.box.low[upper]) & (turned <= self.box.high[upper])
+        angle = middle + np.where(allowed, bend, -bend) * opening
+        elbow = shoulder + first[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+        rest = target - elbow
+        length = np.hypot(rest[:, 0], rest[:, 1])
+        vectors[:, len(PARTS) + upper], vectors[:, len(PARTS) + lower] = first / scale, length / scale
+        vectors[:, upper] = self._near_bounds(angle - vectors[:, 0], upper)
+        vectors[:, lower] = self._near_bounds(np.arctan2(rest[:, 1], rest[:, 0]) - angle, lower)
+        return vectors
+
+    def _near_bounds(self, angle: Floats, part: int) -> Floats:
+        middle = 0.5 * (self.box.low[part] + self.box.high[part])
+        return np.asarray((angle - middle + np.pi) % (2 * np.pi) - np.pi + middle)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints over time, smoothed along the optical flow: what moves is followed, and only what the flow denies is removed.
+
+For every joint the places x_t minimise
+
+    sum_t c_t rho(x_t - p_t; a) + lambda sum_t w_t rho(x_{t+1} - x_t - f_t; b)
+
+with the detected places p_t of confidence c_t, the flow f_t there, its forward-backward agreement w_t and Huber's rho
+of widths a and b: a tridiagonal system a joint, reweighted some times. Smoothing without the flow buys calm with error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+
+from flowing_puppet_ros.flow.estimate import FlowPair
+from flowing_puppet_ros.image.tracking.propagation import Grid
+from flowing_puppet_ros.settings import Settings, setting
+
+type Floats = NDArray[np.float64]
+
+REWEIGHTINGS = 6
+DISAGREEMENT = 2.0  # px on the flow's grid; a flow that returns this far off counts half
+_HELD = 1e-6  # weight of the start of a joint that nothing else holds in place
+
+
+@dataclass(frozen=True)
+class SmoothingSettings(Settings):
+    """How joints are smoothed over time."""
+
+    flow_weight: float = setting(10.0, "weight of the flow against the detections", low=0.0, high=1000.0)
+    detection_width: float = setting(0.016, "distance at which a detection begins to count less", unit="m",
+                                     low=0.001, high=1.0)  # fmt: skip
+    flow_width: float = setting(0.005, "distance at which the flow begins to count less", unit="m",
+                                low=0.0005, high=1.0)  # fmt: skip
+
+
+def joint_motion(flow: FlowPair, grid: Grid, before: Floats, after: Floats) -> tuple[Floats, Floats]:
+    """Motion (J, 2) px of joints at `before` (J, 2) in one image and `after` in the next, and its trust (J,) in [0, 1].
+
+    The mean of the forward flow at the one place and the reversed backward flow at the other; 0 trust where a place or
+    its flow is unknown. `flow` is on the working grid of `grid`.
+    """
+    forth, back = (sampled(field, grid.reduced(at)) for field, at in zip(flow, (before, after), strict=True))
+    motion = 0.5 * (forth - back)
+    known = np.isfinite(motion).all(axis=1)
+    gap = np.where(known, ((forth + back) ** 2).sum(axis=1), np.inf)
+    return np.where(known[:, None], motion, 0.0) / grid.factor, 1 / (1 + gap / DISAGREEMENT**2)
+
+
+def smoothed(
+    places: Floats, confidence: Floats, motion: Floats, trust: Floats, start: Floats, scale: float,
+    settings: SmoothingSettings,
+) -> Floats:  # fmt: skip
+    """Smooth joints over T images.
+
+    Args:
+        places: (T, J, 2) px, detected; NaN where unknown.
+        confidence: (T, J) of the detections.
+        motion: (T-1, J, 2) px from image to image.
+        trust: (T-1, J) in [0, 1].
+        start: (T, J, 2) px where joints are that neither detections nor flow hold.
+        scale: px/m, turns the settings' widths into pixels.
+        settings: weights and widths.
+    """
+    seen = np.isfinite(places).all(axis=2)
+    target = np.where(seen[..., None], places, start)
+    hold = np.where(seen, np.clip(confidence, 0.0, 1.0), 0.0)
+    tie = settings.flow_weight * trust
+    near, along = np.ones_like(hold), np.ones_like(tie)
+    joints = target
+    for _ in range(REWEIGHTINGS):
+        joints = np.stack(
+            [_chain(target[:, j], hold[:, j] * near[:, j] + _HELD, motion[:, j], tie[:, j] * along[:, j])
+             for j in range(places.shape[1])], axis=1,
+        )  # fmt: skip
+        near = _huber(np.linalg.norm(joints - target, axis=2), settings.detection_width * scale)
+        along = _huber(np.linalg.norm(np.diff(joints, axis=0) - motion, axis=2), settings.flow_width * scale)
+    return joints
+
+
+def _chain(target: Floats, hold: Floats, motion: Floats, tie: Floats) -> Floats:
+    """Places (T, 2) of one joint: minimum of hold |x - target|^2 + tie |x' - x - motion|^2."""
+    bands = np.zeros((2, len(hold)))
+    bands[1] = hold
+    bands[1, :-1] += tie
+    bands[1, 1:] += tie
+    bands[0, 1:] = -tie
+    right = hold[:, None] * target
+    right[1:] += tie[:, None] * motion
+    right[:-1] -= tie[:, None] * motion
+    return np.asarray(solveh_banded(bands, right), dtype=np.float64)
+
+
+def _huber(distance: Floats, width: float) -> Floats:
+    return np.minimum(1.0, width / np.maximum(distance, 1e-9))
+
+
+def sampled(field: NDArray[np.float32], points: Floats) -> Floats:
+    """Flow (J, 2) at points (J, 2) of its grid, between pixels; NaN outside the grid."""
+    height, width = field.shape[:2]
+    inside = ((points >= -0.5) & (points <= np.array([width, height]) - 0.5)).all(axis=1)
+    at = np.where(inside[:, None], points, 0.0).astype(np.float32)
+    found = [
+        cv2.remap(np.ascontiguousarray(field[:, :, k]), at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR,
+                  borderMode=cv2.BORDER_REPLICATE)[0]
+        for k in (0, 1)
+    ]  # fmt: skip
+    return np.where(inside[:, None], np.stack(found, axis=1), np.nan)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a detector has to look in the next image of a stream: all over it, or only where the known people stand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.image.detector.detection import Place
+from flowing_puppet_ros.image.video.tracklets import ClipPeople
+
+SURE_LOOKS = 5  # searches that must have found a person before only their place is looked at
+MEMORY = 20  # searches that are remembered
+
+
+@dataclass(slots=True, eq=False)
+class Watch:
+    """Remembers what searches of whole images found; `searches` tells from all of them who is there."""
+
+    searches: ClipPeople
+    _known: dict[str, tuple[float, float, int]] = field(default_factory=dict)
+
+    def search(self, number: int, candidates: Sequence[Place]) -> list[Place]:
+        """Take the candidates of image `number`, and tell from all searches up to now where people are in it."""
+        self.searches.add(number, candidates)
+        self.searches.keep(MEMORY)
+        return [place for path in self.searches.paths() if (place := path.at(number)) is not None]
+
+    def learn(self, found: Mapping[str, Place]) -> None:
+        """Remember how large the people of a search are, by id, and how surely; forget whom it did not find.
+
+        They are carried by the flow until another search finds them or the tracker gives them up.
+        """
+        looks = {identity: self._known[identity][2] + 1 if identity in self._known else 1 for identity in found}
+        self._known = {identity: (place.scale, place.log_odds, looks[identity]) for identity, place in found.items()}
+
+    def meet(self, found: Mapping[str, Place]) -> None:
+        """Remember people who are new here as if a search had found them."""
+        for identity, place in found.items():
+            self._known.setdefault(identity, (place.scale, place.log_odds, 1))
+
+    def known(self, people: Iterable[str]) -> bool:
+        """Whether one of these people is known."""
+        return any(identity in self._known for identity in people)
+
+    def sure(self, people: Iterable[str]) -> bool:
+        """Whether some of these people are known, and each of them from enough searches."""
+        looks = [self._known[identity][2] for identity in people if identity in self._known]
+        return min(looks, default=0) >= SURE_LOOKS
+
+    def places(self, joint_names: Sequence[str], people: Mapping[str, NDArray[np.float64]]) -> dict[str, Place]:
+        """Where the known ones of these people are, whose joints (J, 2) px are given by id."""
+        neck, face = (joint_names.index(name) for name in ("neck", "face"))
+        return {
+            identity: Place(joints[neck], joints[face], *self._known[identity][:2])
+            for identity, joints in people.items()
+            if identity in self._known
+        }

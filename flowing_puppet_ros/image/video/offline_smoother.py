@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole clip at once: the tracker runs through it, then every person's joints are smoothed along the flow.
+
+Where a detector offers several hypotheses of the arms, the path that the flow agrees with is taken first.
+
+The images are seen once; what is kept of an image is some hundred numbers a person, however large the image is.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.image.arms.evidence import ENDS, Sight
+from flowing_puppet_ros.image.arms.hypotheses import ArmHistory
+from flowing_puppet_ros.image.arms.viterbi import PathSettings
+from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings, joint_motion, smoothed
+from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet, TrackResult
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+
+type Floats = NDArray[np.float64]
+
+DETECTOR_TRUST = 1 / 8
+"""Weight of a joint of our detector against one of given keypoints: it errs more, and the flow must hold against it."""
+
+
+@dataclass(slots=True, eq=False)
+class _Moment:
+    """A person in one image: the tracked `puppet` without its outlines, and its motion from the image before."""
+
+    image: int
+    puppet: TrackedPuppet
+    body_energy: float
+    motion: Floats
+    trust: Floats
+
+
+@dataclass(slots=True, eq=False)
+class Clip:
+    """Collects the tracker's results of consecutive images and gives the smoothed people of each."""
+
+    model: DeformableStructures
+    settings: SmoothingSettings
+    path: PathSettings = field(default_factory=PathSettings)
+    images: int = 0
+    _tracks: dict[str, list[_Moment]] = field(default_factory=lambda: defaultdict(list))
+    _arms: dict[str, ArmHistory] = field(default_factory=dict)
+
+    def add(self, result: TrackResult, sights: Mapping[str, Sight] | None = None) -> None:
+        """Take the result of the next image, and the `sights` of all its people where a detector has hypotheses."""
+        for puppet in result.puppets:
+            track = self._tracks[puppet.id]
+            count = len(puppet.joints)
+            motion, trust = np.zeros((count, 2)), np.zeros(count)
+            if result.flow is not None and track and track[-1].image == self.images - 1:
+                before, after = _place(track[-1].puppet), _place(puppet)
+                motion, trust = joint_motion(result.flow, result.grid, before, after)
+            if sights is not None:
+                history = self._arms.setdefault(puppet.id, ArmHistory(self.path))
+                history.add(sights[puppet.id], result.flow if track else None, result.grid)
+            energy = self.model.energy(puppet.shape)
+            bare = replace(puppet, contours=(), shape=replace(puppet.shape, contours=()))
+            track.append(_Moment(self.images, bare, energy, motion, trust))
+        self.images += 1
+
+    def people(self) -> Iterator[list[TrackedPuppet]]:
+        """The people of each image, in the order of the images."""
+        people = {identity: self._smoothed(identity, track) for identity, track in self._tracks.items()}
+        at = dict.fromkeys(self._tracks, 0)
+        for image in range(self.images):
+            found = []
+            for identity, track in self._tracks.items():
+                k = at[identity]
+                if k < len(track) and track[k].image == image:
+                    joints, right = people[identity]
+                    found.append(self._puppet(track[k], joints[k], right[k]))
+                    at[identity] = k + 1
+            yield found
+
+    def _smoothed(self, identity: str, track: list[_Moment]) -> tuple[Floats, Floats]:
+        """Joints (T, J, 2) of one person, whose images are consecutive, and how probably (T, J) each is right.
+
+        NaN where the tracker knows it best.
+        """
+        start = np.array([moment.puppet.joints for moment in track])
+        scale = float(np.median([moment.puppet.scale for moment in track]))
+        unknown = np.full((start.shape[1], 3), np.nan)
+        detected = np.array([unknown if m.puppet.detected is None else m.puppet.detected for m in track])
+        motion, trust = np.array([m.motion for m in track[1:]]), np.array([m.trust for m in track[1:]])
+        right = np.full(detected.shape[:2], np.nan)
+        if identity in self._arms:
+            self._resolve_arms(self._arms[identity], detected, motion, right, scale)
+            detected[..., 2] *= DETECTOR_TRUST
+        confidence = np.where(np.isfinite(detected).all(axis=2), detected[..., 2], 0.0)
+        if len(track) < 2 or not (confidence > 0).any():
+            return start, right
+        places = np.where(confidence[..., None] > 0, detected[..., :2], np.nan)
+        joints = smoothed(places, confidence, motion, trust, start, scale, self.settings)
+        # The body model has placed what nobody ever saw; along the flow alone it would drift.
+        never = ~(confidence > 0).any(axis=0)
+        joints[:, never] = start[:, never]
+        return joints, right
+
+    def _resolve_arms(self, arms: ArmHistory, detected: Floats, motion: Floats, right: Floats, scale: float) -> None:
+        """Put the arms of the best path into the detected joints (T, J, 3), their motion (T-1, J, 2) and `right`."""
+        for side, arm in arms.resolved(scale * self.model.shoulder_width).items():
+            for k, name in enumerate(ENDS):
+                joint = self.model.joint_names.index(f"{side}_{name}")
+                detected[:, joint, :2] = arm.places[:, k]
+                detected[:, joint, 2] = arm.sure
+                right[:, joint] = arm.right[:, k]
+                if len(motion):
+                    motion[:, joint] = arm.motion[:-1, k]
+
+    def _puppet(self, moment: _Moment, joints: Floats, right: Floats) -> TrackedPuppet:
+        puppet = moment.puppet
+        confidence = np.where(np.isfinite(right), right * puppet.visible, puppet.confidence)
+        shape = self.model.puppet_from_joints(joints, puppet.scale, puppet.view)
+        energy = puppet.energy - moment.body_energy + self.model.energy(shape)
+        return replace(
+            puppet, joints=joints, confidence=confidence, contours=shape.contours, shape=shape, energy=energy
+        )
+
+
+def _place(puppet: TrackedPuppet) -> Floats:
+    """Where the flow is asked: at the detected joints, else at the tracked ones."""
+    if puppet.detected is None:
+        return puppet.joints
+    return np.where(np.isfinite(puppet.detected[:, :2]), puppet.detected[:, :2], puppet.joints)

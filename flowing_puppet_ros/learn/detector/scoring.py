@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Learn to choose among poses: scores by a conditional logit, their scale and how probable they are by regression."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+from sklearn.linear_model import LogisticRegression
+from sklearn.preprocessing import StandardScaler
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.detector.detection import FoundPose
+from flowing_puppet_ros.image.detector.scoring import Ranking, agreed_scale, best_places, lengths
+from flowing_puppet_ros.learn.detector.data import Example
+
+type Array = np.ndarray[Any, Any]
+
+FOUND_NECK, FOUND_SCALE = 0.5, 1.25  # units of S and ratio: a pose this close to the person has found them
+SCALE_DEVIATION = 0.15  # of the logarithm: how much the choice among poses at the right place minds their scale
+LEAST_TARGET = 0.05
+RIDGE, SCALE_RIDGE = 3.0, 1.0
+
+
+def learn_ranking(found: Sequence[tuple[Example, list[FoundPose]]]) -> tuple[Ranking, float]:
+    """The ranking of the poses found on each example's image, and the share of people whom the best ones find.
+
+    InputError when hardly any or nearly all poses are right: then there is nothing to tell.
+    """
+    found = [(example, poses) for example, poses in found if poses]
+    weight = _conditional_logit(found)
+    ranking = Ranking(weight, np.zeros(4), np.zeros(2))
+    rows, corrections, picked = [], [], []
+    for example, poses in found:
+        scores = ranking.scores(poses)
+        for order, index in enumerate(best_places(poses, scores)):
+            scale = agreed_scale(poses, scores, index)
+            picked.append((example, poses[index], scale, float(scores[index])))
+            if order == 0 and _at_place(example, poses[index]):
+                rows.append(lengths(poses[index], scale))
+                corrections.append(np.log(example.scale / scale))
+    if not rows:
+        raise InputError("no annotated person of the held-out images was found; annotate more images")
+    design = np.array(rows)
+    normal = design.T @ design + np.diag([SCALE_RIDGE] * 3 + [1e-6])
+    ranking = Ranking(weight, np.linalg.solve(normal, design.T @ np.array(corrections)), np.zeros(2))
+    right = np.array(
+        [_right(example, pose, ranking.corrected_scale(pose, scale)) for example, pose, scale, _ in picked]
+    )
+    values = np.array([score for *_, score in picked])
+    slope, offset = logistic(values[:, None], right)
+    first = {id(example): correct for (example, *_), correct in reversed(list(zip(picked, right, strict=True)))}
+    return Ranking(weight, ranking.scale, np.array([slope[0], offset])), float(np.mean(list(first.values())))
+
+
+def logistic(features: Array, right: Array, ridge: float = 1.0) -> tuple[Array, float]:
+    """Return weights (D,) and bias of the log-odds that samples `features` (N, D) are `right` (N,).
+
+    The ridge acts on weights of standardised features; the mean prediction equals the share that is right.
+    """
+    scaler = StandardScaler().fit(features)
+    fitted = LogisticRegression(C=1 / ridge, tol=1e-8, max_iter=1000).fit(scaler.transform(features), right)
+    weight: Array = fitted.coef_[0] / scaler.scale_
+    return weight, float(fitted.intercept_[0] - weight @ scaler.mean_)
+
+
+def _at_place(example: Example, pose: FoundPose) -> bool:
+    distance = float(np.linalg.norm(pose.points[0] - example.joint("neck")))
+    return distance < FOUND_NECK * example.scale
+
+
+def _right(example: Example, pose: FoundPose, scale: float) -> bool:
+    return _at_place(example, pose) and 1 / FOUND_SCALE < scale / example.scale < FOUND_SCALE
+
+
+def _conditional_logit(found: Sequence[tuple[Example, list[FoundPose]]]) -> Array:
+    """Weights (MEASURES,) under which softmax over an image's poses agrees best with how well they fit the person."""
+    measures = [np.stack([pose.measures for pose in poses]) for _, poses in found]
+    every = np.concatenate(measures)
+    mean, deviation = every.mean(axis=0), np.maximum(every.std(axis=0), 1e-9)
+    images = []
+    for (example, poses), values in zip(found, measures, strict=True):
+        misfit = np.log([pose.scale / example.scale for pose in poses]) / SCALE_DEVIATION
+        target = np.array([_at_place(example, pose) for pose in poses]) * np.exp(-0.5 * misfit**2)
+        if target.sum() > LEAST_TARGET:
+            images.append(((values - mean) / deviation, target / target.sum()))
+
+    def loss(weight: Array) -> tuple[float, Array]:
+        value, gradient = RIDGE * float(weight @ weight), 2 * RIDGE * weight
+        for x, target in images:
+            score = x @ weight
+            share = np.exp(score - score.max())
+            share /= share.sum()
+            value -= float(target @ np.log(share + 1e-12))
+            gradient = gradient - x.T @ (target - share)
+        return value, gradient
+
+    weight: Array = minimize(loss, np.zeros(every.shape[1]), jac=True).x
+    return weight / deviation

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit the 2D Deformable Structures puppet to projected bodies: part shapes, pairwise Gaussians, joint statistics."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from flowing_puppet_ros.learn.ds.samples import PartSamples, TrainingSet
+from flowing_puppet_ros.model.ds.joints import PART_JOINTS
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.ds.shape import PairLayout, PartShape, rotate
+from flowing_puppet_ros.model.gaussian import Gaussian
+
+Array = np.ndarray[Any, Any]
+
+COMPONENTS = 10
+NEGLIGIBLE = 1e-6  # metres: components with less deviation are rounding noise and get coefficients of about 0
+# Standard deviations added to the pairwise variables: lengths depend exactly on shapes, which cannot be inverted.
+SHAPE_FLOOR, ANGLE_FLOOR, METRE_FLOOR = 0.03, 0.03, 0.003
+
+LENGTH_PAIRS = (
+    *(("neck", "belly"), ("neck", "face"), ("face", "belly"), ("right_shoulder", "left_shoulder")),
+    ("right_hip", "left_hip"),
+    *((f"{side}_{a}", f"{side}_{b}") for side in ("right", "left") for a, b in (("shoulder", "hip"), ("hip", "knee"))),
+    *((f"{side}_{a}", f"{side}_{b}") for side in ("right", "left") for a, b in (("knee", "ankle"), ("elbow", "wrist"))),
+    *((f"{side}_shoulder", f"{side}_elbow") for side in ("right", "left")),
+    *(("neck", f"{side}_{joint}") for side in ("right", "left") for joint in ("shoulder", "hip")),
+)
+"""Joints whose distance tells the scale of a person."""
+
+
+def fit(gender: str, training: TrainingSet, components: int = COMPONENTS) -> DeformableStructures:
+    """Fit the part shapes (Eq. 6), the pairwise Gaussians (Eq. 10) and the statistics of the joints."""
+    fitted = [fit_part(part, name, components) for part, name in zip(training.parts, training.tree.names, strict=True)]
+    shapes = tuple(shape for shape, _ in fitted)
+    coefficients = [z for _, z in fitted]
+    pairwise = tuple(fit_pair(training, shapes, coefficients, *edge) for edge in training.tree.edges)
+    return DeformableStructures(gender, training.tree, shapes, pairwise, *joint_statistics(training))
+
+
+def joint_statistics(training: TrainingSet) -> tuple[Gaussian, Array, Array]:
+    """What tells the place of hidden joints, and the scale of a person.
+
+    Returns the Gaussian of all joints around their mid-torso, the pairs of joints (P,2) whose distance tells the scale,
+    and mean and deviation of the logarithms of those distances (P,2), metres.
+    """
+    middle = training.joints[:, :2].mean(axis=1, keepdims=True)
+    prior = Gaussian.from_samples((training.joints - middle).reshape(len(training.joints), -1), ridge=1e-6)
+    pairs = np.array([[training.joint_names.index(name) for name in pair] for pair in LENGTH_PAIRS])
+    log_length = np.log(np.linalg.norm(training.joints[:, pairs[:, 0]] - training.joints[:, pairs[:, 1]], axis=2))
+    spread = np.maximum(log_length.std(axis=0), 0.02)
+    return prior, pairs, np.stack([log_length.mean(axis=0), spread], axis=1)
+
+
+def fit_part(part: PartSamples, name: str, components: int) -> tuple[PartShape, Array]:
+    """Principal components (Eq. 6) of one part's points; returns the shape and the samples' coefficients (n,Z)."""
+    flat = part.points.reshape(len(part.points), -1)
+    mean = flat.mean(axis=0)
+    _, values, axes = np.linalg.svd(flat - mean, full_matrices=False)
+    deviation = np.maximum(values[:components] / np.sqrt(len(flat) - 1), NEGLIGIBLE)
+    coefficients = (flat - mean) @ axes[:components].T / deviation
+    basis = (axes[:components].T * deviation).reshape(*part.points.shape[1:], components)
+    return PartShape(mean.reshape(-1, 2), basis, len(PART_JOINTS[name])), coefficients
+
+
+def fit_pair(
+    training: TrainingSet, shapes: tuple[PartShape, ...], coefficients: list[Array], parent: int, child: int
+) -> Gaussian:
+    """Gaussian over [z_j, sin, cos, q_ji, t_j, z_i, t_i]; q_ji is what the truncated shapes leave open at the joint."""
+    above, below = training.parts[parent], training.parts[child]
+    angle = below.angle - above.angle
+    sine, cosine = np.sin(angle), np.cos(angle)
+    shared = PART_JOINTS[training.tree.names[parent]].index(PART_JOINTS[training.tree.names[child]][0])
+    center = rotate(below.center - above.center, -np.sin(above.angle), np.cos(above.angle))
+    joint = _joint(shapes[child], coefficients[child], 0)
+    gap = center + rotate(joint, sine, cosine) - _joint(shapes[parent], coefficients[parent], shared)
+    columns = [coefficients[child], sine, cosine, gap, below.length, coefficients[parent], above.length]
+    layout = PairLayout(coefficients[child].shape[1])
+    floor = np.full(2 * layout.size + 6, SHAPE_FLOOR)
+    floor[layout.angle] = ANGLE_FLOOR
+    floor[layout.gap + layout.child_length + layout.parent_length] = METRE_FLOOR
+    pair = Gaussian.from_samples(np.column_stack(columns))
+    return Gaussian(pair.mean, pair.covariance + np.diag(floor**2))
+
+
+def _joint(shape: PartShape, coefficients: Array, index: int) -> Array:
+    """Joint point `index` (n,2) of a part for coefficients (n,Z)."""
+    row = len(shape.mean) - shape.joint_count + index
+    return np.asarray(shape.mean[row] + coefficients @ shape.basis[row].T)

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How well a body's rendered silhouette agrees with the seen one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.multiview.distance_transform import signed_distance
+from flowing_puppet_ros.multiview.rim_term import Outline, distances_outside
+
+Floats = NDArray[np.float64]
+
+
+def rendered(camera: Camera, vertices: Floats, faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """The pixels (h,w) of `camera` whose centres the mesh, vertices (V,3) in metres and faces (F,3), covers.
+
+    Faces with a corner that no lens shows are left out.
+    """
+    width, height = camera.size
+    mask = np.zeros((height, width), np.bool_)
+    pixels, _ = camera.project(vertices)
+    _fill(mask, np.ascontiguousarray(pixels), faces)
+    return mask
+
+
+@njit(cache=True)
+def _fill(mask, pixels, faces):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set the pixels of `mask` inside or on any triangle; each row is one run between the triangle's edges."""
+    height, width = mask.shape
+    for face in range(len(faces)):
+        a, b, c = pixels[faces[face, 0]], pixels[faces[face, 1]], pixels[faces[face, 2]]
+        low, high = min(a[1], b[1], c[1]), max(a[1], b[1], c[1])
+        if not np.isfinite(a[0] + a[1] + b[0] + b[1] + c[0] + c[1]):
+            continue
+        for y in range(max(0, int(np.ceil(low))), min(height - 1, int(np.floor(high))) + 1):
+            left, right = np.inf, -np.inf
+            for p, q in ((a, b), (b, c), (c, a)):
+                if (p[1] <= y <= q[1]) or (q[1] <= y <= p[1]):
+                    if p[1] == q[1]:
+                        left, right = min(left, p[0], q[0]), max(right, p[0], q[0])
+                    else:
+                        x = p[0] + (y - p[1]) / (q[1] - p[1]) * (q[0] - p[0])
+                        left, right = min(left, x), max(right, x)
+            for x in range(int(np.ceil(max(left, 0.0))), int(np.floor(min(right, width - 1.0))) + 1):
+                mask[y, x] = True
+
+
+def overlap(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
+    """Intersection over union of two masks (h,w), 0 to 1; 0 when both are empty."""
+    union = np.count_nonzero(first | second)
+    return np.count_nonzero(first & second) / union if union else 0.0
+
+
+def outline_gap(drawn: NDArray[np.bool_], outline: Outline, depth: float) -> tuple[float, float]:
+    """Mean distance and mean squared distance between the outlines of a rendered mask (h,w) and a seen one, both ways.
+
+    In metres at `depth` metres from the camera. NaN when either outline is nowhere in the image.
+    """
+    signed = signed_distance(drawn.astype(np.uint8))
+    edge = drawn & (signed > -0.7)
+    edge[0] = edge[-1] = edge[:, 0] = edge[:, -1] = False
+    if not edge.any() or not len(outline.points):
+        return np.nan, np.nan
+    # A pixel on the edge lies half a pixel inside the outline.
+    there = np.abs(outline.distance[edge] + 0.5)
+    column, row = np.clip(np.rint(outline.points).astype(int), 0, np.array(drawn.shape[::-1]) - 1).T
+    back = np.abs(signed[row, column])
+    metres = depth / outline.camera.focal
+    return (
+        float(there.mean() + back.mean()) / 2 * metres,
+        float((there**2).mean() + (back**2).mean()) / 2 * metres**2,
+    )
+
+
+def shares_inside(vertices: Floats, outlines: Sequence[Outline], sigma: float) -> Floats:
+    """How much of each vertex (V,) lies inside the silhouettes, 0 to 1: the mean over the views that show it.
+
+    Outside it is the Geman-McClure weight of the distance at `sigma` metres; 0 where no view shows the vertex.
+    """
+    total, views = np.zeros(len(vertices)), np.zeros(len(vertices))
+    for outline in outlines:
+        seen, distance, _ = distances_outside(vertices, outline)
+        total[seen] += (sigma**2 / (sigma**2 + np.maximum(distance, 0) ** 2)) ** 2
+        views[seen] += 1
+    return total / np.maximum(views, 1)

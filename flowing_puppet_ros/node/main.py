@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The programs that start the nodes: one function each, which runs its node until it is interrupted.
+
+`python -m flowing_puppet_ros.node.main NAME` starts the node NAME where its program is not installed.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from flowing_puppet_ros.node.runner import run
+
+_COMPONENT_NODE = "flowing_puppet_ros.node.component_node"
+
+
+def optical_flow(arguments: list[str] | None = None) -> int:
+    """Images in, dense forward and backward optical flow out."""
+    return run("optical_flow", optical_flow.__doc__, _COMPONENT_NODE, arguments)
+
+
+def puppet_tracker(arguments: list[str] | None = None) -> int:
+    """Images and detections in, flowing puppets out."""
+    return run("puppet_tracker", puppet_tracker.__doc__, _COMPONENT_NODE, arguments)
+
+
+def visual_hull(arguments: list[str] | None = None) -> int:
+    """Images, part labels and puppets of calibrated cameras in; silhouettes, joints and visual hull out."""
+    return run("visual_hull", visual_hull.__doc__, _COMPONENT_NODE, arguments)
+
+
+def body_fitter(arguments: list[str] | None = None) -> int:
+    """Point clouds or silhouettes in, fitted bodies out; the action fit_body fits one cloud on request."""
+    return run("body_fitter", body_fitter.__doc__, "flowing_puppet_ros.node.body_fitter_node", arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(globals()[sys.argv[1]](sys.argv[2:]))

@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images in, dense optical flow out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.draw.flow_colour import flow_scale, flow_to_rgb
+from flowing_puppet_ros.flow.estimate import FlowSettings, OpticalFlow
+from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
+from flowing_puppet_ros.stream.components import warm_up
+from flowing_puppet_ros.stream.messages.geometry import stamp_ns
+from flowing_puppet_ros.stream.messages.images import decode_image, make_image
+from flowing_puppet_ros.stream.messages.message_types import IMAGE, MessageFactory
+
+
+class OpticalFlowComponent(Component):
+    """Flow between each image and the next.
+
+    `flow/forward` carries the header of the earlier image, `flow/backward` that of the later: always that of the image
+    whose pixels move. A stamp that goes back or an image of another size starts anew.
+    """
+
+    settings_type = FlowSettings
+    inputs = (Port("image", IMAGE, "sensor", transport=COMPRESSED),)
+    outputs = (
+        Port("flow/forward", IMAGE),
+        Port("flow/backward", IMAGE),
+        Port("flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
+    )
+
+    def __init__(self, settings: FlowSettings, factory: MessageFactory) -> None:
+        """Make the flow estimator."""
+        super().__init__(settings, factory)
+        self._settings = settings
+        self._flow = OpticalFlow(settings)
+        self._previous: tuple[Any, int, NDArray[np.uint8]] | None = None
+
+    def warm_up(self) -> None:
+        """Compute the flow of made-up images, and colour it, with a component of its own."""
+        other = type(self)(self._settings, self.factory)
+        other.wants("flow/preview", True)
+        for image in warm_up.images(self.factory):
+            other.handle("image", image)
+
+    def reset(self) -> None:
+        """Forget the previous image."""
+        self._previous = None
+
+    def _process(self, port: str, message: Any) -> Output:
+        image, stamp = decode_image(message), stamp_ns(message)
+        previous, self._previous = self._previous, (message.header, stamp, image)
+        if previous is None:
+            return []
+        header, before, earlier = previous
+        if stamp <= before or earlier.shape != image.shape:
+            self._warn("the stamps went back or the image size changed: the flow starts anew")
+            self.counters["restarts"] += 1
+            return []
+        forward, backward = self._flow(earlier, image)
+        self.counters["flows"] += 1
+        outputs = [
+            ("flow/forward", make_image(self.factory, header, forward, "32FC2")),
+            ("flow/backward", make_image(self.factory, message.header, backward, "32FC2")),
+        ]
+        if "flow/preview" in self._wanted:
+            outputs.append(("flow/preview", flow_picture(self.factory, header, [forward])))
+        return outputs
+
+
+def flow_picture(factory: MessageFactory, header: Any, flows: list[NDArray[np.float32]], side: int = 640) -> Any:
+    """Return an rgb8 Image of flow fields (H,W,2) side by side in the colours of the first one's range."""
+    scale = flow_scale(flows[0])
+    factor = min(1.0, side / max(flows[0].shape[:2]))
+    pictures = []
+    for flow in flows:
+        picture = flow_to_rgb(flow, scale)
+        if factor < 1:
+            picture = np.asarray(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+        pictures.append(picture)
+    return make_image(factory, header, np.hstack(pictures), "rgb8")

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images and detections in, flowing puppets out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.draw.overlay import DrawnPuppet, draw_puppets
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, OpticalFlow
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.tracking.track import TrackerSettings
+from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
+from flowing_puppet_ros.image.video.live_tracker import Lookout, LookoutSettings
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
+from flowing_puppet_ros.stream.components import warm_up
+from flowing_puppet_ros.stream.components.optical_flow import flow_picture
+from flowing_puppet_ros.stream.components.ros4hri import Humans, HumansSettings, image_humans
+from flowing_puppet_ros.stream.messages.geometry import header_ns, stamp_ns
+from flowing_puppet_ros.stream.messages.images import decode_flow, decode_image, make_image
+from flowing_puppet_ros.stream.messages.message_types import IMAGE, PUPPETS, MessageFactory
+from flowing_puppet_ros.stream.messages.puppets import keypoints_of, make_puppets
+from flowing_puppet_ros.stream.stamp_buffer import Line, Shelf
+from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
+
+_OF_A_NEW_TRACKER = {"model", "parts", "max_side", "seed", "humans", "humans_namespace"}
+
+
+@dataclass(frozen=True)
+class PuppetTrackerSettings(TrackerSettings, FlowSettings, LookoutSettings, HumansSettings):
+    """Settings of the tracker, its flow and its detector, and of what it waits for, draws and publishes."""
+
+    model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
+    parts: int = setting(14, "parts of the puppet: 10, or 14 with hands and feet", low=10, high=14)
+    wait: int = setting(1, "newer images that may come before an image goes on without its detection", low=0, high=50)
+    max_side: int = setting(400, "longest image side the flow is computed at", unit="px", low=32, high=8192)
+    overlay_side: int = setting(960, "longest side of the overlay", unit="px", low=64, high=8192)
+
+
+class PuppetTrackerComponent(Component):
+    """Tracks the people of one camera.
+
+    An image waits for the detection and the flow of its stamp when somebody publishes them, but not longer than
+    `wait` newer images. Flow that is not published is computed here, and then shown on `flow/preview`. While nobody
+    publishes detections the package's own detector looks for people.
+    """
+
+    settings_type = PuppetTrackerSettings
+    adoptable = frozenset(info.name for info in PuppetTrackerSettings.describe()) - _OF_A_NEW_TRACKER
+    inputs = (
+        Port("image", IMAGE, "sensor", transport=COMPRESSED),
+        Port("flow/forward", IMAGE, optional=True),
+        Port("flow/backward", IMAGE, optional=True),
+        Port("detections", PUPPETS, "sensor", optional=True),
+    )
+    outputs: tuple[Port, ...] = (
+        Port("puppets", PUPPETS),
+        Port("part_labels", IMAGE, lazy=True),
+        Port("overlay", IMAGE, lazy=True, transport=COMPRESSED),
+        Port("flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
+        Port("puppet_flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
+    )
+
+    def __init__(self, settings: PuppetTrackerSettings, factory: MessageFactory) -> None:
+        """Load the body model."""
+        super().__init__(settings, factory)
+        self._settings = settings
+        self._model = DeformableStructures.load(settings.model, settings.parts)
+        self._tracker = FlowingPuppetTracker(self._model, settings, settings)
+        self._lookout = Lookout(settings, self._tracker, self.counters)
+        self._line = Line()
+        self._shelves = {port.name: Shelf() for port in self.inputs if port.optional}
+        self._header: Any = None
+        self._humans = Humans(settings, factory, "skeleton2d", "roi", "cropped")
+        self.outputs = (*type(self).outputs, *self._humans.ports)
+
+    def warm_up(self) -> None:
+        """Track somebody made up with a component of its own, and load the detector."""
+        other = type(self)(self._settings, self.factory)
+        other.expects("detections", True)
+        for port in other.outputs:
+            if port.lazy:
+                other.wants(port.name, True)
+        messages = warm_up.tracking(self.factory, self._model)
+        for port_name, message in messages:
+            other.handle(port_name, message)
+        self._lookout.warm_up(decode_image(messages[-1][1]), warm_up.puppet(self._model))
+
+    def reset(self) -> None:
+        """Forget the people and everything that waits."""
+        self._tracker.reset()
+        self._lookout.reset()
+        self._line.clear()
+        for shelf in self._shelves.values():
+            shelf.clear()
+        self._header = None
+
+    def adopt(self, settings: Settings) -> None:
+        """Go on tracking the same people with other settings."""
+        assert isinstance(settings, PuppetTrackerSettings)
+        if settings.preset != self._settings.preset:
+            self._tracker.optical_flow = OpticalFlow(settings)
+        self.settings = self._settings = self._tracker.settings = settings
+        self._lookout.adopt(settings)
+
+    def flush(self) -> Output:
+        """Process the images that still wait."""
+        return self._release(final=True)
+
+    def _process(self, port: str, message: Any) -> Output:
+        stamp = stamp_ns(message)
+        if port == "image":
+            self._take(stamp, message)
+        elif port != "flow/forward" and self._line.too_late(stamp):
+            self.counters[f"late {port}"] += 1
+        else:
+            self._shelves[port].put(stamp, message)
+        return self._release(final=False)
+
+    def _take(self, stamp: int, message: Any) -> None:
+        """Put an image in line; one that comes a little too late is left out, one from long before is a restart."""
+        last = self._line.waiting[-1][0] if self._line.waiting else self._line.left
+        if last is not None and 0 < last - stamp < BACKWARD_JUMP_NS:
+            self.counters["disordered images"] += 1
+            self._warn(f"an image is {(last - stamp) * 1e-6:.0f} ms older than the one before: it is left out")
+        else:
+            self._line.waiting.append((stamp, message))
+
+    def _release(self, final: bool) -> Output:
+        outputs: Output = []
+        while self._line.waiting:
+            stamp, message = self._line.waiting[0]
+            crowded = len(self._line.waiting) > self._settings.wait
+            if not (final or crowded or self._ready(stamp)):
+                break
+            self._line.pop()
+            try:
+                outputs += self._step(stamp, message)
+            except InputError as error:
+                self._unusable(error)
+        return outputs
+
+    def _ready(self, stamp: int) -> bool:
+        """Whether everything that is expected for the image of `stamp` is there."""
+        needs = [("detections", stamp)]
+        if self._header is not None:
+            needs += [("flow/backward", stamp), ("flow/forward", header_ns(self._header))]
+        return all(self._shelves[port].get(at) is not None for port, at in needs if port in self._expected)
+
+    def _step(self, stamp: int, message: Any) -> Output:
+        image, flow = decode_image(message), self._flow(stamp)
+        people = self._detected(stamp)
+        if people is None and "detections" not in self._expected and self._settings.detect:
+            result = self._lookout.step(image, stamp, flow, self.background)
+        else:
+            self._lookout.reset()
+            result = self._tracker.step(image, stamp, people, flow)
+        for warning in result.warnings:
+            self._warn(warning)
+        earlier, self._header = self._header, message.header
+        self._forget(stamp)
+        self.counters["images"] += 1
+        self.counters["puppets"] += len(result.puppets)
+        return self._publish(message.header, earlier, image, result)
+
+    def _detected(self, stamp: int) -> list[Keypoints] | None:
+        """The people that somebody else found in the image of this stamp, None when nobody told."""
+        detections = self._shelves["detections"].get(stamp)
+        if detections is None:
+            if "detections" in self._expected:
+                self.counters["images without detection"] += 1
+            return None
+        self.counters["paired detections"] += 1
+        return keypoints_of(detections)
+
+    def _forget(self, stamp: int) -> None:
+        """Drop what was for images up to this one; what no image has used is counted."""
+        unpaired = self._shelves["detections"].forget_until(stamp - 1)
+        self.counters["unpaired detections"] += unpaired
+        self._shelves["detections"].forget_until(stamp)
+        self._shelves["flow/backward"].forget_until(stamp)
+        self._shelves["flow/forward"].forget_until(stamp - 1)
+
+    def _flow(self, stamp: int) -> FlowPair | None:
+        if self._header is None or not {"flow/forward", "flow/backward"} <= self._expected:
+            return None
+        forward = self._shelves["flow/forward"].get(header_ns(self._header))
+        backward = self._shelves["flow/backward"].get(stamp)
+        if forward is None or backward is None:
+            self.counters["images without flow"] += 1
+            self._warn("an image came without the flow that others had: it is computed here")
+            return None
+        self.counters["paired flows"] += 1
+        try:
+            return decode_flow(forward), decode_flow(backward)
+        except InputError as error:  # the image is good: its flow is computed here
+            self._unusable(error)
+            return None
+
+    def _publish(self, header: Any, earlier: Any, image: NDArray[np.uint8], result: TrackResult) -> Output:
+        puppets = make_puppets(self.factory, header, self._model, result.puppets)
+        outputs: Output = [("puppets", puppets)]
+        if self._humans.on:
+            made = image_humans(self.factory, header, image, puppets.puppets)
+            outputs += self._humans.publish(header, list(made), made)
+        if "part_labels" in self._wanted:
+            labels = result.labels(image.shape[:2])
+            outputs.append(("part_labels", make_image(self.factory, header, labels, "mono8")))
+        if "overlay" in self._wanted:
+            outputs.append(("overlay", self._overlay(header, image, puppets)))
+        if result.flow is not None and earlier is not None:
+            forward = result.flow[0]
+            if "flow/preview" in self._wanted and "flow/forward" not in self._expected:
+                outputs.append(("flow/preview", flow_picture(self.factory, earlier, [forward])))
+            moved = result.puppet_flow() if "puppet_flow/preview" in self._wanted else None
+            if moved is not None:
+                picture = flow_picture(self.factory, earlier, [forward, moved.field])
+                outputs.append(("puppet_flow/preview", picture))
+        return outputs
+
+    def _overlay(self, header: Any, image: NDArray[np.uint8], puppets: Any) -> Any:
+        factor = min(1.0, self._settings.overlay_side / max(image.shape[:2]))
+        drawn = [DrawnPuppet.from_message(puppet).placed(factor) for puppet in puppets.puppets]
+        if factor < 1:
+            image = np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+        return make_image(self.factory, header, draw_puppets(image, drawn), "rgb8")

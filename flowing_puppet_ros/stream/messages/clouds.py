@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PointCloud2 of any field layout, byte order and padding to and from arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.stream.messages.message_types import MessageFactory, message_bytes
+
+# sensor_msgs/PointField datatype -> numpy
+_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_FLOAT32 = 7
+_FARTHEST = 1000.0
+"""Metres from the median point; no sensor of people reaches beyond, drivers mark unknown points with such numbers."""
+_NORMALS = ("normal_x", "normal_y", "normal_z")
+
+
+def decode_cloud(message: Any) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """Return the finite points (N,3) in metres and, when the cloud has normal_x/y/z, their normals (N,3).
+
+    An organised cloud is flattened and points with a NaN, infinite or absurd coordinate are left out, whatever
+    `is_dense` says. A normal that is not finite becomes zero. InputError when there are no x, y, z fields or the data
+    do not fit the sizes the message names.
+    """
+    types = {field.name: field for field in message.fields}
+    missing = [name for name in "xyz" if name not in types]
+    if missing:
+        raise InputError(f"a point cloud with the fields {', '.join(types) or 'none'} has no {missing[0]}")
+    records = _records(message, types)
+    points = np.stack([records[name].astype(float) for name in "xyz"], axis=1)
+    good = np.isfinite(points).all(axis=1)
+    if good.any():
+        good[good] = np.abs(points[good] - np.median(points[good], axis=0)).max(axis=1) < _FARTHEST
+    if not all(name in types for name in _NORMALS):
+        return points[good], None
+    normals = np.stack([records[name].astype(float) for name in _NORMALS], axis=1)[good]
+    return points[good], np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
+
+
+def _records(message: Any, fields: dict[str, Any]) -> NDArray[Any]:
+    """View the cloud as a flat structured array of the fields we know how to read."""
+    order = ">" if message.is_bigendian else "<"
+    known = {name: field for name, field in fields.items() if name in ("x", "y", "z", *_NORMALS)}
+    for name, field in known.items():
+        if field.datatype not in _TYPES:
+            raise InputError(f"the cloud field {name} has the unknown datatype {field.datatype}")
+    width, height, step, row = (int(message.width), int(message.height), int(message.point_step), int(message.row_step))
+    formats = [order + _TYPES[field.datatype] for field in known.values()]
+    offsets = [int(field.offset) for field in known.values()]
+    ends = [offset + np.dtype(form).itemsize for offset, form in zip(offsets, formats, strict=True)]
+    data = message_bytes(message.data)
+    row = row if height > 1 else width * step
+    if step < max(ends) or row < width * step or len(data) < row * (height - 1) + width * step:
+        raise InputError(
+            f"a cloud of {width}x{height} points has point_step {step}, row_step {row} and {len(data)} bytes"
+        )
+    record = np.dtype({"names": list(known), "formats": formats, "offsets": offsets, "itemsize": step})
+    if width * height == 0:
+        return np.empty(0, record)
+    rows = np.lib.stride_tricks.as_strided(data, (height, width * step), (row, 1), writeable=False)
+    return np.ascontiguousarray(rows).reshape(-1).view(record)
+
+
+def make_cloud(factory: MessageFactory, header: Any, points: NDArray[Any], normals: NDArray[Any] | None = None) -> Any:
+    """Return a dense, unorganised float32 PointCloud2 of points (N,3) in metres and their normals (N,3)."""
+    columns = [np.asarray(points, np.float32).reshape(-1, 3)]
+    names = ["x", "y", "z"]
+    if normals is not None:
+        columns.append(np.asarray(normals, np.float32).reshape(-1, 3))
+        names += _NORMALS
+    table = np.ascontiguousarray(np.hstack(columns), "<f4")
+    fields = [
+        factory.make("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=_FLOAT32, count=1)
+        for k, name in enumerate(names)
+    ]
+    return factory.make(
+        "sensor_msgs/msg/PointCloud2",
+        header=header,
+        height=1,
+        width=len(table),
+        fields=fields,
+        is_bigendian=False,
+        point_step=4 * len(names),
+        row_step=4 * len(names) * len(table),
+        data=table.reshape(-1).view(np.uint8),
+        is_dense=True,
+    )

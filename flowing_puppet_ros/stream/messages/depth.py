@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth images and their camera_info to the point clouds that a body is fitted to."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.images import decode_depth
+from flowing_puppet_ros.stream.messages.message_types import MessageFactory
+
+MOST_POINTS = 80_000
+"""Points taken of a depth image: every n-th pixel of every n-th row, n as small as that allows."""
+
+
+def depth_points(depth: NDArray[np.float32], info: Any) -> NDArray[np.float32]:
+    """Return the points (N,3) in metres of a depth image (H,W), metres, NaN unknown, in the camera's optical frame.
+
+    The image is rectified, as REP-118 images are: pixel (u, v) at depth z lies at ((u - cx) z / fx, (v - cy) z / fy, z)
+    with the projection matrix `p` of the CameraInfo, or its `k` where `p` is not given. x right, y down, z forward
+    (REP-103). InputError when the camera is not calibrated or calibrated for another image size.
+    """
+    height, width = depth.shape
+    if (int(info.width), int(info.height)) != (width, height):
+        raise InputError(f"the depth image is {width}x{height}, its camera_info says {info.width}x{info.height}")
+    fx, fy, cx, cy = _pinhole(info)
+    step = max(1, math.ceil(math.sqrt(width * height / MOST_POINTS)))
+    rows, columns = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
+    z = depth[np.ix_(rows, columns)]
+    right = ((columns - cx) / fx).astype(np.float32)[None, :] * z
+    down = ((rows - cy) / fy).astype(np.float32)[:, None] * z
+    return np.stack([right, down, z], axis=2)[np.isfinite(z)]
+
+
+def _pinhole(info: Any) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy in pixels, of the projection matrix or else the camera matrix."""
+    k, p = np.asarray(info.k, float).reshape(-1), np.asarray(info.p, float).reshape(-1)
+    values = (p[0], p[5], p[2], p[6]) if p[0] or p[5] else (k[0], k[4], k[2], k[5])
+    fx, fy, cx, cy = (float(value) for value in values)
+    if not (fx or fy):
+        raise InputError("the camera_info is uncalibrated (k and p are all zero); publish a calibrated camera_info")
+    if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx <= 0 or fy <= 0:
+        raise InputError(f"the camera_info has the focal lengths {fx:g} and {fy:g}, which is no pinhole camera's")
+    return fx, fy, cx, cy
+
+
+def depth_cloud(factory: MessageFactory, image: Any, info: Any) -> Any:
+    """Return the PointCloud2 message of a depth Image and its CameraInfo (None: there is none, an InputError)."""
+    if info is None:
+        raise InputError("no camera_info came yet: a depth image cannot be used without it; publish or remap it")
+    return make_cloud(factory, image.header, depth_points(decode_depth(image), info))

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images to and from ROS messages: raw, compressed, label and flow images (REP-118 and sensor_msgs/image_encodings)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.stream.messages.compressed_depth import LARGEST_PIXELS, is_compressed_depth, unpack_depth
+from flowing_puppet_ros.stream.messages.message_types import MessageFactory, message_bytes
+
+JPEG_QUALITY = 85
+
+FARTHEST_FLOW = 1e5
+"""Pixels; no flow leads farther than images are wide."""
+
+# encoding -> (channels, bytes a channel, OpenCV conversion to RGB)
+_RAW: dict[str, tuple[int, int, int | None]] = {
+    "rgb8": (3, 1, None),
+    "bgr8": (3, 1, cv2.COLOR_BGR2RGB),
+    "8uc3": (3, 1, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, 1, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, 1, cv2.COLOR_BGRA2RGB),
+    "8uc4": (4, 1, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, 1, cv2.COLOR_GRAY2RGB),
+    "8uc1": (1, 1, cv2.COLOR_GRAY2RGB),
+    "rgb16": (3, 2, None),
+    "bgr16": (3, 2, cv2.COLOR_BGR2RGB),
+    "rgba16": (4, 2, cv2.COLOR_RGBA2RGB),
+    "bgra16": (4, 2, cv2.COLOR_BGRA2RGB),
+    "mono16": (1, 2, cv2.COLOR_GRAY2RGB),
+    "yuv422": (2, 1, cv2.COLOR_YUV2RGB_UYVY),
+    "uyvy": (2, 1, cv2.COLOR_YUV2RGB_UYVY),
+    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2RGB_YUY2),
+    "yuyv": (2, 1, cv2.COLOR_YUV2RGB_YUY2),
+    **{
+        f"bayer_{pattern.lower()}{8 * size}": (1, size, getattr(cv2, f"COLOR_Bayer{pattern}2RGB"))
+        for pattern in ("RGGB", "BGGR", "GBRG", "GRBG")
+        for size in (1, 2)
+    },
+}
+# encoding -> (type of a pixel, metres a unit); mono16 is how some drivers name millimetres (REP-118 has both others)
+_DEPTH = {"16uc1": ("u2", 0.001), "mono16": ("u2", 0.001), "32fc1": ("f4", 1.0)}
+
+
+def decode_image(message: Any) -> NDArray[np.uint8]:
+    """Return the (H,W,3) RGB image of an Image or a CompressedImage; InputError in one sentence when it has none."""
+    if hasattr(message, "format"):
+        return _decode_compressed(message)
+    encoding = message.encoding.lower()
+    if encoding not in _RAW:
+        raise InputError(f"the image encoding {message.encoding!r} is not one of {', '.join(_RAW)}")
+    channels, size, conversion = _RAW[encoding]
+    pixels = _rows(message, channels, np.dtype("u1" if size == 1 else ">u2" if message.is_bigendian else "<u2"))
+    if size == 2:
+        pixels = (pixels >> 8).astype(np.uint8)
+    if conversion is None:
+        # Kernels are compiled for arrays that may be written, as all other conversions return.
+        return np.array(pixels)
+    try:
+        return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
+    except cv2.error as error:  # packed formats need an even width, Bayer patterns two rows
+        raise InputError(
+            f"an image of {message.width}x{message.height} is no whole {message.encoding} image"
+        ) from error
+
+
+def _decode_compressed(message: Any) -> NDArray[np.uint8]:
+    data = message_bytes(message.data)
+    if is_compressed_depth(message.format):
+        raise InputError(f"the compressed image format {message.format!r} is a depth image, not a picture")
+    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    try:
+        image = cv2.imdecode(data, flags) if len(data) else None
+    except cv2.error:  # a header that names more pixels than OpenCV takes
+        image = None
+    if image is None:
+        raise InputError(f"a compressed image of format {message.format!r} and {len(data)} bytes cannot be decoded")
+    return np.asarray(image, np.uint8)
+
+
+def _rows(message: Any, channels: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return the pixels (H,W) or (H,W,channels) of a raw Image without the padding of its rows."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    if height * width > LARGEST_PIXELS:
+        raise InputError(f"an image of {width}x{height} is larger than {LARGEST_PIXELS // 1_000_000} million pixels")
+    data = message_bytes(message.data)
+    needed = width * channels * dtype.itemsize
+    if height < 1 or width < 1 or step < needed or len(data) < step * (height - 1) + needed:
+        raise InputError(f"an image of {width}x{height} {message.encoding} has step {step} and {len(data)} bytes")
+    rows = np.lib.stride_tricks.as_strided(data, (height, needed), (step, 1), writeable=False)
+    pixels = np.ascontiguousarray(rows).view(dtype)
+    return pixels if channels == 1 else pixels.reshape(height, width, channels)
+
+
+def decode_labels(message: Any) -> NDArray[np.uint8]:
+    """Return the (H,W) labels of a mono8 Image."""
+    if message.encoding.lower() not in ("mono8", "8uc1"):
+        raise InputError(f"part labels come as mono8, not as {message.encoding!r}")
+    return np.asarray(_rows(message, 1, np.dtype("u1")))
+
+
+def decode_flow(message: Any) -> NDArray[np.float32]:
+    """Return the (H,W,2) flow of a 32FC2 Image: pixels, +x right, +y down, NaN where unknown or absurd."""
+    if message.encoding.upper() != "32FC2":
+        raise InputError(f"optical flow comes as 32FC2, not as {message.encoding!r}")
+    pixels = _rows(message, 2, np.dtype(">f4" if message.is_bigendian else "<f4"))
+    pixels = pixels.astype(np.float32, copy=False)
+    sane = np.abs(pixels) < FARTHEST_FLOW
+    return pixels if sane.all() else np.where(sane.all(axis=2, keepdims=True), pixels, np.float32(np.nan))
+
+
+def is_depth(encoding: str) -> bool:
+    """Whether `decode_depth` reads images of this encoding; mono16 may be a picture as well."""
+    return encoding.lower() in _DEPTH
+
+
+def decode_depth(message: Any) -> NDArray[np.float32]:
+    """Return the (H,W) depth of a depth Image in metres along the optical axis (REP-118), NaN where unknown.
+
+    16UC1 is in millimetres and 0 is unknown, 32FC1 is in metres; what is not positive or not finite is unknown. Takes
+    the CompressedImage of the transport `compressedDepth` too.
+    """
+    if hasattr(message, "format"):
+        raw: NDArray[Any] = unpack_depth(message)
+        unit = 0.001 if raw.dtype == np.uint16 else 1.0
+    else:
+        encoding = message.encoding.lower()
+        if encoding not in _DEPTH:
+            raise InputError(f"depth comes as 16UC1 (mm) or 32FC1 (m), not as {message.encoding!r}")
+        form, unit = _DEPTH[encoding]
+        raw = _rows(message, 1, np.dtype((">" if message.is_bigendian else "<") + form))
+    depth = raw.astype(np.float32) * np.float32(unit)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
+
+
+def make_image(factory: MessageFactory, header: Any, pixels: NDArray[Any], encoding: str) -> Any:
+    """Return an Image of (H,W) or (H,W,C) pixels whose type fits `encoding`."""
+    little = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+    return factory.make(
+        "sensor_msgs/msg/Image",
+        header=header,
+        height=pixels.shape[0],
+        width=pixels.shape[1],
+        encoding=encoding,
+        is_bigendian=0,
+        step=little.nbytes // pixels.shape[0],
+        data=little.reshape(-1).view(np.uint8),
+    )
+
+
+def compress(factory: MessageFactory, message: Any) -> Any:
+    """Return the CompressedImage (JPEG) of an rgb8 Image."""
+    rgb = decode_image(message)
+    return factory.make(
+        "sensor_msgs/msg/CompressedImage", header=message.header, format="rgb8; jpeg compressed bgr8", data=jpeg(rgb)
+    )
+
+
+def jpeg(rgb: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> NDArray[np.uint8]:
+    """Return the bytes of the JPEG file of an (H,W,3) RGB image."""
+    done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    if not done:
+        raise InputError(f"an image of shape {rgb.shape} cannot be written as JPEG")
+    return np.asarray(data, np.uint8).reshape(-1)

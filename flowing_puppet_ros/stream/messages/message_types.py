@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The types of the messages that come in and go out, and what makes messages of any flavour."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+TRANSFORMS = "tf2_msgs/msg/TFMessage"
+PUPPETS = "flowing_puppet_msgs/msg/PuppetArray"
+BODIES = "flowing_puppet_msgs/msg/BodyArray"
+SILHOUETTES = "flowing_puppet_msgs/msg/SilhouetteSet"
+
+
+class MessageFactory(Protocol):
+    """Makes ROS messages of one kind (rclpy's or the bag library's)."""
+
+    def make(self, type_name: str, **values: Any) -> Any:
+        """Make a message of type `package/msg/Name`; arrays of numbers come as ndarray, other arrays as lists."""
+        ...
+
+
+def message_bytes(data: Any) -> NDArray[np.uint8]:
+    """View the uint8[] field of any message flavour as an array, without a copy."""
+    return data.view(np.uint8) if isinstance(data, np.ndarray) else np.frombuffer(memoryview(data), np.uint8)

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keypoints, tracked puppets and bodies to and from the messages of flowing_puppet_msgs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
+from flowing_puppet_ros.stream.messages.message_types import BODIES, PUPPETS, MessageFactory
+
+if TYPE_CHECKING:
+    from flowing_puppet_ros.body.fit.fitter import BodyFit
+    from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
+    from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+    from flowing_puppet_ros.model.sp import StitchedPuppet
+
+_MESSAGES = "flowing_puppet_msgs/msg/"
+
+type Joint = tuple[float, float, float, float]
+"""x, y, z in metres and confidence, 0 to 1."""
+
+
+def keypoints_of(message: Any) -> list[Keypoints]:
+    """Return the people of a PuppetArray as keypoints (pixels; NaN where unknown)."""
+    return [
+        Keypoints(
+            tuple(joint.name for joint in puppet.joints),
+            np.array([(joint.x, joint.y) for joint in puppet.joints], float).reshape(-1, 2),
+            np.array([joint.confidence for joint in puppet.joints], float),
+        )
+        for puppet in message.puppets
+    ]
+
+
+def make_puppets(
+    factory: MessageFactory, header: Any, model: DeformableStructures, puppets: Sequence[TrackedPuppet]
+) -> Any:
+    """Return the PuppetArray of the tracked puppets of one image."""
+    return factory.make(PUPPETS, header=header, puppets=[_make_puppet(factory, model, puppet) for puppet in puppets])
+
+
+def _make_puppet(factory: MessageFactory, model: DeformableStructures, puppet: TrackedPuppet) -> Any:
+    joints = [
+        factory.make(_MESSAGES + "PuppetJoint", name=name, x=x, y=y, confidence=confidence)
+        for name, (x, y), confidence in zip(model.joint_names, puppet.joints, puppet.confidence, strict=True)
+    ]
+    parts = [
+        factory.make(
+            _MESSAGES + "PuppetPart",
+            name=name,
+            label=index + 1,
+            depth=puppet.depth[index],
+            confidence=puppet.confidence[list(model.part_joints[index])].mean(),
+            contour=puppet.contours[index],
+        )
+        for index, name in enumerate(model.tree.names)
+    ]
+    return factory.make(
+        _MESSAGES + "Puppet",
+        id=puppet.id,
+        model=puppet.model,
+        view=puppet.view,
+        scale=puppet.scale,
+        energy=puppet.energy,
+        confidence=puppet.confidence.mean(),
+        joints=joints,
+        parts=parts,
+    )
+
+
+def make_joints(
+    factory: MessageFactory, names: Sequence[str], joints: NDArray[Any], confidence: NDArray[Any]
+) -> list[Any]:
+    """Return the BodyJoints of joints (J,3) in metres with confidence (J,); those that are NaN are left out."""
+    return [
+        factory.make(_MESSAGES + "BodyJoint", name=name, position=make_point(factory, xyz), confidence=c)
+        for name, xyz, c in zip(names, joints, confidence, strict=True)
+        if np.isfinite(xyz).all()
+    ]
+
+
+def joints_of(body: Any) -> dict[str, Joint]:
+    """Return name -> (x, y, z, confidence) of a Body's joints."""
+    return {
+        joint.name: (joint.position.x, joint.position.y, joint.position.z, joint.confidence) for joint in body.joints
+    }
+
+
+def make_body(factory: MessageFactory, identity: str, model: StitchedPuppet, fit: BodyFit) -> Any:
+    """Return the Body message of a fit in the frame of the points that it was fitted to."""
+    state = fit.state
+    parts = []
+    for index, name in enumerate(model.tree.names):
+        used = model.pose_basis[index].shape[-1]
+        parts.append(
+            factory.make(
+                _MESSAGES + "BodyPart",
+                name=name,
+                pose=make_pose(factory, state.center[index], state.rotation[index]),
+                shape_coefficients=state.shape[index],
+                pose_coefficients=state.pose[index, :used],
+                confidence=fit.part_confidence[index],
+            )
+        )
+    certain = np.full(len(fit.joints), fit.confidence)
+    return factory.make(
+        _MESSAGES + "Body",
+        id=identity,
+        model=model.name,
+        energy=fit.energy,
+        confidence=fit.confidence,
+        joints=make_joints(factory, model.joint_names, fit.joints, certain),
+        parts=parts,
+    )
+
+
+def make_bodies(factory: MessageFactory, header: Any, bodies: list[Any]) -> Any:
+    """Return a BodyArray."""
+    return factory.make(BODIES, header=header, bodies=bodies)

@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bodies as what viewers and programs read: triangle markers, part poses, the topology of the mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
+from flowing_puppet_ros.stream.messages.message_types import MessageFactory
+
+if TYPE_CHECKING:
+    from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+
+_MARKER = "visualization_msgs/msg/Marker"
+_TRIANGLE_LIST, _ADD, _DELETE = 11, 0, 2
+_NAMESPACE = "bodies"
+_LIFETIME_S = 5
+_SKIN = (0.85, 0.68, 0.55)
+
+
+def make_mesh_marker(
+    factory: MessageFactory, header: Any, number: int, faces: NDArray[Any], vertices: NDArray[Any]
+) -> Any:
+    """Return a TRIANGLE_LIST marker of a body mesh: faces (F,3), vertices (V,3) in metres in the header's frame."""
+    points = [make_point(factory, vertex) for vertex in vertices]
+    red, green, blue = _SKIN
+    return factory.make(
+        _MARKER,
+        header=header,
+        ns=_NAMESPACE,
+        id=number,
+        type=_TRIANGLE_LIST,
+        action=_ADD,
+        pose=make_pose(factory, np.zeros(3), np.eye(3)),
+        scale=factory.make("geometry_msgs/msg/Vector3", x=1.0, y=1.0, z=1.0),
+        color=factory.make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
+        lifetime=factory.make("builtin_interfaces/msg/Duration", sec=_LIFETIME_S, nanosec=0),
+        points=[points[index] for index in np.asarray(faces).ravel()],
+    )
+
+
+def make_deletions(factory: MessageFactory, header: Any, numbers: Sequence[int]) -> list[Any]:
+    """Return the markers that take the bodies of these numbers from the viewer."""
+    pose = make_pose(factory, np.zeros(3), np.eye(3))
+    return [
+        factory.make(_MARKER, header=header, ns=_NAMESPACE, id=number, action=_DELETE, pose=pose) for number in numbers
+    ]
+
+
+def make_part_poses(factory: MessageFactory, header: Any, states: Sequence[BodyState]) -> Any:
+    """Return a PoseArray of the parts' centres and rotations: 16 a body, bodies one after the other."""
+    poses = [
+        make_pose(factory, center, rotation)
+        for state in states
+        for center, rotation in zip(state.center, state.rotation, strict=True)
+    ]
+    return factory.make("geometry_msgs/msg/PoseArray", header=header, poses=poses)
+
+
+def make_topology(factory: MessageFactory, model: StitchedPuppet) -> Any:
+    """Return the shape_msgs/Mesh of the model at rest; its triangles hold for the vertices of every fit."""
+    triangles = [
+        factory.make("shape_msgs/msg/MeshTriangle", vertex_indices=np.asarray(face, np.uint32)) for face in model.faces
+    ]
+    vertices = [make_point(factory, vertex) for vertex in model.vertices(model.rest_state())]
+    return factory.make("shape_msgs/msg/Mesh", triangles=triangles, vertices=vertices)
+
+
+def preview_faces(model: StitchedPuppet, triangles: int) -> NDArray[np.int64]:
+    """Return faces (F',3) over the model's own vertices, about `triangles` of them; all of the model's when 0.
+
+    Quadric edge collapses (Garland and Heckbert 1997) of the body at rest, every vertex that is left moved to the
+    nearest of the model's, so that the coarse mesh is posed and shaped as the fine one is.
+    """
+    if not 0 < triangles < len(model.faces):
+        return np.asarray(model.faces, np.int64)
+    import open3d as o3d
+    from scipy.spatial import cKDTree
+
+    vertices = model.vertices(model.rest_state())
+    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(model.faces))
+    coarse = mesh.simplify_quadric_decimation(triangles)
+    faces = cKDTree(vertices).query(np.asarray(coarse.vertices))[1][np.asarray(coarse.triangles)]
+    a, b, c = faces.T
+    return np.asarray(faces[(a != b) & (b != c) & (c != a)], np.int64)

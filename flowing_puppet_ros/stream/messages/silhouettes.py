@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Silhouettes of one person in calibrated cameras to and from messages, and the bodies that are fitted to them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.stream.messages.geometry import make_pose, rotation_matrix
+from flowing_puppet_ros.stream.messages.images import decode_labels, make_image
+from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, SILHOUETTES, MessageFactory
+
+Masks = Mapping[str, NDArray[np.uint8]]
+
+
+def make_silhouettes(
+    factory: MessageFactory, header: Any, person: Any, cameras: Mapping[str, Camera], masks: Masks, headers: Any
+) -> Any:
+    """Return the SilhouetteSet of a person (a Body of joints) whose masks (h,w) the cameras of these names cut out.
+
+    `header` has the instant and the common frame, `headers` (camera name -> header) those of the images.
+    """
+    silhouettes = [
+        factory.make(
+            "flowing_puppet_msgs/msg/Silhouette",
+            camera=name,
+            info=_make_info(factory, headers[name], cameras[name].resized(mask.shape[::-1])),
+            pose=make_pose(factory, cameras[name].centre, cameras[name].rotation.T),
+            mask=make_image(factory, headers[name], mask, "mono8"),
+        )
+        for name, mask in masks.items()
+    ]
+    return factory.make(SILHOUETTES, header=header, person=person, silhouettes=silhouettes)
+
+
+def _make_info(factory: MessageFactory, header: Any, camera: Camera) -> Any:
+    return factory.make(
+        CAMERA_INFO,
+        header=header,
+        height=camera.size[1],
+        width=camera.size[0],
+        distortion_model="plumb_bob",
+        d=camera.distortion,
+        k=camera.matrix,
+        r=np.eye(3),
+        p=np.hstack([camera.matrix, np.zeros((3, 1))]),
+    )
+
+
+def views_of(message: Any) -> list[tuple[Camera, NDArray[np.uint8]]]:
+    """Return the cameras and masks (h,w) of a SilhouetteSet; InputError names the camera that cannot be used."""
+    views = []
+    for each in message.silhouettes:
+        info, place, turn = each.info, each.pose.position, each.pose.orientation
+        try:
+            rotation = rotation_matrix((turn.x, turn.y, turn.z, turn.w)).T
+            translation = -rotation @ np.array([place.x, place.y, place.z])
+            camera = Camera.from_info(
+                info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model
+            )
+            mask = decode_labels(each.mask)
+        except InputError as error:
+            raise InputError(f"{each.camera}: {error}") from error
+        if mask.shape[::-1] != camera.size:
+            raise InputError(
+                f"{each.camera}: the mask is {mask.shape[1]} x {mask.shape[0]}, its camera_info says"
+                f" {camera.size[0]} x {camera.size[1]}"
+            )
+        views.append((camera, mask))
+    return views

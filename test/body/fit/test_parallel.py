@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work on threads: in order, alike on any number of them, and never on more than the process may use."""
+
+import threading
+
+import numba
+import numpy as np
+import pytest
+from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
+from threadpoolctl import threadpool_limits
+
+from flowing_puppet_ros.body.fit import hypotheses
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.parallel import ordered, usable
+
+
+def test_results_keep_the_order_of_the_items() -> None:
+    names = set()
+
+    def work(item: int) -> int:
+        names.add(threading.current_thread().name)
+        return item * item
+
+    assert ordered(work, range(50), 1) == ordered(work, range(50), 3) == [item * item for item in range(50)]
+    assert threading.main_thread().name in names and len(names) > 1
+
+
+def test_a_worker_that_may_use_one_core_uses_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
+    assert usable(8) == 1
+    monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 4)
+    assert [usable(1), usable(3), usable(8)] == [1, 3, 4]
+
+
+def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, normals = cloud_of(joints_of(), 2500)
+    # So few particles misplace limbs, which are then sought anew.
+    small = FitterSettings(
+        particles=8, iterations=8, local_particles=6, local_iterations=3, refine_iterations=4, restarts=0, limb_rounds=1
+    )
+    fits = []
+    for threads, seed in ((1, 5), (2, 5), (2, 6)):
+        monkeypatch.setattr(hypotheses, "usable", lambda _, count=threads: count)
+        with threadpool_limits(limits=threads):
+            fits.append(BodyFitter(StitchedPuppet.load("neutral"), small).fit(points, normals, seed=seed))
+    for name in ("vertices", "joints", "part_confidence"):
+        assert np.array_equal(getattr(fits[0], name), getattr(fits[1], name))
+    for name in ("energy", "confidence", "reliable", "two_way_distance"):
+        assert getattr(fits[0], name) == getattr(fits[1], name)
+    assert not np.array_equal(fits[0].vertices, fits[2].vertices)

@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint Gauss-Newton over all parts: what else may draw the surface."""
+
+import numpy as np
+
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, Quadratic, two_way_distance
+from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
+from flowing_puppet_ros.body.refine.gauss_newton import LOOSE, Refiner, RefineWeights
+from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+
+def test_a_further_term_draws_the_body_where_it_says() -> None:
+    model = StitchedPuppet.load("neutral")
+    start = model.rest_state()
+    move = np.array([0.3, -0.2, 0.1])
+    goal, count = model.vertices(start) + move, len(model.part_of_vertex)
+    widths = []
+
+    def springs(vertices: np.ndarray, sigma: float) -> Quadratic:
+        widths.append(sigma)
+        return Quadratic(np.tile(np.eye(3) / count, (count, 1, 1)), (vertices - goal) / count)
+
+    weights = RefineWeights(sigma_start=0.2, sigma_end=0.05, iterations=5)
+    body = Refiner(model).run(start, None, JointTargets.none(model), weights, [springs])
+    miss = np.linalg.norm(model.vertices(body) - goal, axis=1)
+    assert miss.max() < 0.01
+    assert miss.mean() < 0.003
+    np.testing.assert_allclose(widths, 0.2 * 0.25 ** (np.arange(5) / 4))
+
+
+def test_without_evidence_the_shape_is_the_expected_one() -> None:
+    model = StitchedPuppet.load("neutral")
+    expected = np.linspace(-1.5, 1.5, model.shape_count)
+    weights = RefineWeights(iterations=6, shape_center=expected)
+    body = Refiner(model).run(model.rest_state(), None, JointTargets.none(model), weights)
+    np.testing.assert_allclose(body.shape, np.tile(expected, (len(model.tree), 1)), atol=0.2)
+
+
+def test_loose_parts_follow_a_foreign_surface_more_closely() -> None:
+    model = StitchedPuppet.load("neutral")
+    start = model.sample(np.random.default_rng(5), pose_scale=0.5)
+    vertices = model.vertices(start)
+    waves = 0.015 * np.sin(vertices @ [9.0, 7.0, 15.0])[:, None]
+    truth = vertices + waves * vertex_normals(vertices, model.faces)
+    cloud = Cloud.of(truth, vertex_normals(truth, model.faces))
+    refiner, none = Refiner(model), JointTargets.none(model)
+    firm = refiner.run(start, cloud, none, RefineWeights(sigma_start=0.05, sigma_end=0.05, iterations=6))
+    loose = refiner.run(firm, cloud, none, LOOSE)
+    apart = [two_way_distance(model.vertices(body), model.faces, cloud) for body in (start, firm, loose)]
+    assert apart[2] < apart[1] - 0.0001 < apart[0]

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Searches of some of the parts, their modes, and limbs hung on bodies."""
+
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
+from flowing_puppet_ros.body.search.dpmp import Search, SearchWeights
+from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.search.limb_search import LimbSearch, limb_groups
+from flowing_puppet_ros.body.search.part_points import PartPoints
+from flowing_puppet_ros.body.search.particles import Particles, particles_of
+from flowing_puppet_ros.body.search.proposals import Proposer
+from flowing_puppet_ros.body.search.schedule import limb_stages
+from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
+from flowing_puppet_ros.model import rotation as so3
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+
+
+@pytest.fixture(scope="module")
+def search(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> Search:
+    return Search(model, points, SearchWeights(lm_steps=2))
+
+
+@pytest.fixture(scope="module")
+def body(model: StitchedPuppet) -> BodyState:
+    return model.sample(np.random.default_rng(1), pose_scale=0.3)
+
+
+@pytest.fixture(scope="module")
+def grid(model: StitchedPuppet, body: BodyState) -> CloudGrid:
+    vertices = model.vertices(body)
+    return CloudGrid.build(vertices, vertex_normals(vertices, model.faces))
+
+
+def relative(model: StitchedPuppet, group: list[Particles], part: int) -> np.ndarray:
+    above = group[model.tree.parents[part]].rotation
+    return np.asarray(np.swapaxes(above, 1, 2) @ group[part].rotation)
+
+
+def test_parts_with_one_particle_stay_and_every_mode_holds_its_own_particle(
+    model: StitchedPuppet, points: tuple[PartPoints, ...], search: Search, body: BodyState, grid: CloudGrid
+) -> None:
+    start, leg = particles_of(model, [body]), limb_groups(model.tree)[0]
+    proposer, rng = Proposer(model, points), np.random.default_rng(2)
+    for part in leg:
+        above = start[model.tree.parents[part]]
+        parents = above.take(np.arange(12) % len(above))
+        start[part] = Particles.join([start[part], proposer.hang(part, parents, start[part].shape[0], rng)])
+    none, stages = JointTargets.none(model), limb_stages(model.tree)
+    found = search.run(start, grid, none, stages, 2, rng, keep=5)
+    others = np.setdiff1d(np.arange(16), leg)
+    np.testing.assert_array_equal(found.state.center[others], body.center[others])
+    np.testing.assert_array_equal(found.state.pose[others], body.pose[others])
+    assert [len(group.particles) for group in found.judged] == [5 if part in leg else 1 for part in range(16)]
+    foot = leg[-1]
+    modes = search.modes(found, foot)
+    np.testing.assert_array_equal([mode.center[foot] for mode in modes], found.judged[foot].particles.center)
+    assert any(np.array_equal(mode.center, found.state.center) for mode in modes)
+    # No body of other particles above the foot has less energy than the mode with that foot.
+    for mode in modes[:2]:
+        least = search.energy(mode, grid)
+        for thigh in range(5):
+            other = mode.center.copy(), mode.rotation.copy(), mode.pose.copy(), mode.shape.copy()
+            for values, own in zip(other, astuple(found.judged[leg[0]].particles, thigh), strict=True):
+                values[leg[0]][: len(own)] = own
+            assert search.energy(BodyState(*other), grid) >= least - 1e-9
+
+
+def astuple(particles: Particles, index: int) -> tuple[np.ndarray, ...]:
+    return particles.center[index], particles.rotation[index], particles.pose[index], particles.shape[index]
+
+
+def test_hung_parts_turn_within_their_limits_about_their_interfaces(
+    model: StitchedPuppet, points: tuple[PartPoints, ...], body: BodyState
+) -> None:
+    group, part = particles_of(model, [body] * 200), model.tree.index("left_lower_arm")
+    above = model.tree.parents[part]
+    group[part] = Proposer(model, points).hang(part, group[above], body.shape[part], np.random.default_rng(0))
+    turns = so3.log(relative(model, group, part))
+    low, high = model.limit_low[part - 1], model.limit_high[part - 1]
+    inside = (turns >= low - 1e-9) & (turns <= high + 1e-9)
+    # A rotation by more than half a turn has a shorter vector the other way round.
+    assert inside[np.linalg.norm(turns, axis=1) < 3.1].all(axis=1).mean() > 0.95
+    assert np.ptp(turns, axis=0).max() > 0.7 * (high - low).max()
+    weight = model.interfaces[part - 1].weight
+    ends = [np.average(points[p].interfaces[part - 1].world(group[p]), axis=1, weights=weight) for p in (above, part)]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
+
+
+def test_usual_limbs_have_the_mean_of_their_gaussians(
+    model: StitchedPuppet, points: tuple[PartPoints, ...], search: Search, body: BodyState
+) -> None:
+    arm = limb_groups(model.tree)[3]
+    usual = LimbSearch(model, search, Proposer(model, points)).usual(body, arm)
+    group, meshes = particles_of(model, [usual]), model.parts(usual)
+    for part in arm:
+        above, mean, interface = model.tree.parents[part], model.pairwise[part - 1].mean, model.interfaces[part - 1]
+        np.testing.assert_allclose(so3.log(relative(model, group, part))[0], mean[:3], atol=1e-9)
+        np.testing.assert_allclose(group[part].pose[0], mean[3 + model.pose_count(above) :])
+        ends = meshes[above][interface.parent_index], meshes[part][interface.child_index]
+        np.testing.assert_allclose(ends[0].mean(axis=0), ends[1].mean(axis=0), atol=1e-9)
+    others = np.setdiff1d(np.arange(16), arm)
+    np.testing.assert_array_equal(usual.center[others], body.center[others])
+    assert not np.array_equal(usual.center[arm[1]], body.center[arm[1]])

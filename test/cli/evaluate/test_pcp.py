@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`flowing-puppet evaluate pcp`: poses against the truth, every method on a folder, and what it refuses."""
+
+import csv
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.cli import main
+from flowing_puppet_ros.evaluate.image.pcp_methods import DETECTOR, METHODS
+from flowing_puppet_ros.image.formats.stickmen import sticks_of, write_sticks
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+
+MODEL = DeformableStructures.load()
+JOINTS = MODEL.likely().joints * 70 + [110, 60]
+
+
+def poses_file(path: Path, shift: float) -> Path:
+    """A poses.json of two images whose second person is off by `shift` pixels and has a solution that is not."""
+    right = JOINTS.tolist()
+    frames = []
+    for index, moved in enumerate((JOINTS, JOINTS + np.array([shift, 0.0]))):
+        joints = np.column_stack([moved, np.ones(len(moved))]).tolist()
+        puppet = {"joints": joints, "solutions": [{"joints": moved.tolist()}, {"joints": right}]}
+        frames.append({"index": index, "path": f"folder/im{index}.png", "puppets": [puppet]})
+    path.write_text(json.dumps({"joint_names": MODEL.joint_names, "frames": frames}))
+    return path
+
+
+@pytest.mark.parametrize("form", ["sticks.txt", "keypoints.json", "annotations.json"])
+def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
+    poses, truth = poses_file(tmp_path / "poses.json", 14.0), tmp_path / form
+    people = [np.column_stack([JOINTS, np.ones(len(JOINTS))]).tolist()]
+    if form == "sticks.txt":
+        write_sticks(truth, {k: [sticks_of(MODEL.joint_names, JOINTS)] for k in (0, 1)})
+    elif form == "keypoints.json":
+        truth.write_text(json.dumps({"joint_names": MODEL.joint_names, "frames": {"0": people, "1": people}}))
+    else:
+        images = {f"im{k}.png": [{"joints": people[0]}] for k in (0, 1)}
+        truth.write_text(json.dumps({"joint_names": MODEL.joint_names, "images": images}))
+    assert main(["evaluate", "pcp", str(poses), "--truth", str(truth), "--json", "--pixels", "10"]) == 0
+    figures = json.loads(capsys.readouterr().out)["poses"]
+    assert figures["people"] == 2 and figures["found"] == 100
+    assert figures["strict lower arms"] == 50 and figures["strict torso"] == 100
+    assert figures["wrists within 10 px"] == 50 and figures["wrists of the best solution"] == 100
+
+
+def test_one_command_measures_every_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for number in (1, 2):
+        assert cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((90, 100, 3), 60 * number, np.uint8))
+    write_sticks(tmp_path / "sticks.txt", {k: [sticks_of(MODEL.joint_names, JOINTS / 3)] for k in (1, 2)})
+    out = tmp_path / "figures"
+    flags = ["--truth", str(tmp_path / "sticks.txt"), "--out", str(out), "--particles", "8", "--iterations", "1"]
+    assert main(["evaluate", "pcp", str(tmp_path), *flags]) == 0
+    header, *lines = capsys.readouterr().out.splitlines()
+    assert all(method in header for method in (DETECTOR, *METHODS))
+    assert any(line.startswith("strict lower arms") for line in lines)
+    figures = json.loads((out / "pcp.json").read_text())["figures"]
+    assert list(figures) == [DETECTOR, *METHODS]
+    assert all(row["people"] == 2 for row in figures.values())
+    with (out / "pcp.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == ["figure", *figures]
+    (found,) = (row for row in rows if row["figure"] == "found")
+    assert float(found[DETECTOR]) == figures[DETECTOR]["found"]
+    assert {path.name for path in out.glob("*.png")} == {"pcp-strict.png", "pcp-loose.png"}
+
+
+@pytest.mark.parametrize("case", ["no truth", "no poses", "broken", "strangers", "pixels", "nobody", "no image"])
+def test_unusable_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
+    truth = tmp_path / "sticks.txt"
+    write_sticks(truth, {k: [sticks_of(MODEL.joint_names, JOINTS)] for k in (0, 1)})
+    source, flags = poses_file(tmp_path / "poses.json", 0.0), ["--truth", str(truth)]
+    if case == "no truth":
+        flags = []
+    if case == "no poses":
+        source = tmp_path / "none.json"
+    if case == "broken":
+        source.write_text('{"frames": [{}], "joint_names": []}')
+    if case == "strangers":
+        write_sticks(truth, {77: [sticks_of(MODEL.joint_names, JOINTS)]})
+    if case == "pixels":
+        flags += ["--pixels", "0"]
+    if case == "nobody":
+        truth.write_text("")
+    if case == "no image":
+        source = tmp_path
+    assert main(["evaluate", "pcp", str(source), *flags]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("flowing-puppet evaluate: ") and told.count("\n") == 1

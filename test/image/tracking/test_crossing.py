@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two people who cross, and one who is hidden for ten images, keep their ids."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from drawn_people import NAMES, CapsuleModel, detection, draw, pose, tracker  # type: ignore[import-not-found]
+
+from flowing_puppet_ros.image.tracking.appearance import clothes_of
+from flowing_puppet_ros.image.tracking.association import associate
+from flowing_puppet_ros.image.tracking.track import Person, TrackerSettings
+
+Place = tuple[float, float]
+
+
+def whose(result: object, truth: dict[str, np.ndarray]) -> dict[str, str]:
+    """Name -> id of the puppet nearest to each person's joints."""
+    puppets = result.puppets  # type: ignore[attr-defined]
+    found = {}
+    for name, joints in truth.items():
+        near = min(puppets, key=lambda puppet: float(np.linalg.norm(puppet.joints - joints, axis=1).mean()))
+        found[name] = near.id
+    return found
+
+
+def test_people_who_cross_keep_their_ids() -> None:
+    follower = tracker()
+    ids = {}
+    for time in range(21):
+        left, right = pose(0, (60 + 10 * time, 118)), pose(0, (260 - 10 * time, 122))
+        result = follower.step(draw(left, right), time, [detection(left), detection(right)])
+        if time == 0:
+            ids = whose(result, {"left": left, "right": right})
+    assert len(set(ids.values())) == 2
+    assert whose(result, {"left": left, "right": right}) == ids
+
+
+def test_who_is_hidden_for_ten_images_keeps_the_id() -> None:
+    follower = tracker()
+    ids = {}
+    for time in range(22):
+        still, passing = pose(0, (160, 118)), pose(0, (10 + 14 * time, 120))
+        hidden = 6 <= time < 16
+        seen = [detection(passing)] if hidden else [detection(still), detection(passing)]
+        result = follower.step(draw(still, passing), time, seen)
+        if time == 0:
+            ids = whose(result, {"still": still, "passing": passing})
+    assert whose(result, {"still": still, "passing": passing}) == ids
+    assert len(result.puppets) == 2
+
+
+RED, BLUE = (1.0, 0.35, 0.3), (0.3, 0.4, 1.0)
+
+
+@pytest.mark.parametrize("behind", ["left", "right"])
+@pytest.mark.parametrize("meeting", ["cross", "turn back"])
+def test_people_in_different_clothes_keep_their_ids_where_one_hides_the_other(meeting: str, behind: str) -> None:
+    """The detector sees one of two for as long as they overlap; the flow of the nearer one drags the other along."""
+    follower = tracker()
+    shirts = {"left": RED, "right": BLUE}
+    order = [behind, "right" if behind == "left" else "left"]
+    ids: dict[str, str] = {}
+    for time in range(25):
+        way = 8.0 * (time if meeting == "cross" else min(time, 24 - time))
+        places = {"left": (64 + way, 118), "right": (256 - way, 121)}
+        people = {name: pose(0, place) for name, place in places.items()}
+        image = draw(*(people[name] for name in order), shirts=[shirts[name] for name in order])
+        hidden = abs(places["left"][0] - places["right"][0]) < 70
+        seen = [detection(people[name]) for name in (order[1:] if hidden else order)]
+        result = follower.step(image, time, seen)
+        if time == 3:
+            ids = whose(result, people)
+    assert len(set(ids.values())) == 2
+    assert whose(result, people) == ids
+    assert len(result.puppets) == 2
+
+
+def test_of_two_who_stand_as_near_the_clothes_tell_whose_the_detection_is() -> None:
+    """Joints alone would give the detections to the others, by a few millimetres."""
+    image = draw(pose(0, (90, 118)), pose(0, (230, 118)), shirts=[RED, BLUE])
+    red, blue = clothes_of(NAMES, image, [pose(0, (90, 118)), pose(0, (230, 118))])
+    assert red is not None and blue is not None
+    model, joints = CapsuleModel(), pose(0)
+    people = [Person.start(name, model, joints, np.ones(len(joints)), TrackerSettings()) for name in ("red", "blue")]  # type: ignore[arg-type]
+    people[1].mean += 0.5
+    found = [(people[1].mean + 0.2, np.ones(len(joints))), (joints - 0.2, np.ones(len(joints)))]
+    assert associate(people, found, 0.5)[0] == {0: 1, 1: 0}
+    for person, clothes in zip(people, (red, blue), strict=True):
+        person.wear(clothes.colours)
+    assert associate(people, found, 0.5, [red, blue])[0] == {0: 0, 1: 1}
+    assert associate(people, found, 0.5, [blue, red])[0] == {0: 1, 1: 0}

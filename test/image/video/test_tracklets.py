@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Places of people joined over a clip."""
+
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.image.detector.detection import Place
+from flowing_puppet_ros.image.video.tracklets import ClipPeople
+
+
+def place(x: float, y: float = 50.0, scale: float = 40.0, log_odds: float = 1.0) -> Place:
+    return Place(np.array([x, y]), np.array([x, y - 0.5 * scale]), scale, log_odds)
+
+
+def people(looks: list[list[Place]], step: int = 1, least: float = 0.3, most: int = 8) -> ClipPeople:
+    clip = ClipPeople(least, most, step)
+    for number, places in enumerate(looks):
+        clip.add(number * step, places)
+    return clip
+
+
+def test_the_place_that_is_always_there_beats_surer_ones_that_jump() -> None:
+    rng = np.random.default_rng(0)
+    elsewhere = rng.uniform(150, 900, (20, 2))
+    looks = [[place(100 + k, log_odds=0.0), place(x, y, log_odds=1.5)] for k, (x, y) in enumerate(elsewhere)]
+    first = people(looks).paths()[0]
+    assert [first.places[k].neck[0] for k in range(20)] == pytest.approx([100 + k for k in range(20)])
+
+
+def test_the_size_is_what_most_looks_say() -> None:
+    looks = [[place(100, scale=25.0 if k % 4 == 0 else 40.0)] for k in range(21)]
+    path = people(looks).paths()[0]
+    assert {round(one.scale, 6) for one in path.places.values()} == {40.0}
+    face = path.places[0].face - path.places[0].neck
+    assert face == pytest.approx([0.0, -20.0])
+
+
+def test_a_missed_look_is_filled_in_and_places_between_looks_are_means() -> None:
+    looks = [[place(100.0 + 10 * k)] if k != 3 else [] for k in range(7)]
+    path = people(looks, step=2).paths()[0]
+    found = path.at(6)
+    assert found is not None and found.neck == pytest.approx([130.0, 50.0])
+    odd = path.at(3)
+    assert odd is not None and odd.neck == pytest.approx([115.0, 50.0])
+
+
+def test_before_and_after_the_path_the_person_must_show_to_be_believed() -> None:
+    looks: list[list[Place]] = [*[[] for _ in range(20)], *[[place(100)] for _ in range(4)], *[[] for _ in range(20)]]
+    path = people(looks, step=3).paths()[0]
+    for image in (58, 60, 69, 71):
+        found = path.at(image)
+        assert found is not None and found.least == -np.inf
+    for image in (57, 72, 15, 114):
+        supposed = path.at(image)
+        assert supposed is not None and supposed.neck[0] == 100.0 and supposed.least < supposed.score
+    assert path.at(14) is None and path.at(115) is None
+
+
+def test_two_people_are_two_paths_and_the_surer_comes_first() -> None:
+    looks = [[place(100, log_odds=0.5), place(103, log_odds=0.2), place(300, log_odds=2.0)] for _ in range(5)]
+    paths = people(looks).paths()
+    assert [path.places[0].neck[0] for path in paths] == [300.0, 100.0]
+    assert len(people(looks, most=1).paths()) == 1
+
+
+def test_an_unsure_second_person_is_none_but_an_unsure_first_one_is_told() -> None:
+    looks = [[place(100, log_odds=-2.0), place(300, log_odds=-2.5)] for _ in range(5)]
+    paths = people(looks).paths()
+    assert [path.places[0].neck[0] for path in paths] == [100.0]
+    assert -2.0 < paths[0].places[0].log_odds < 0.0
+
+
+def test_a_path_does_not_jump() -> None:
+    looks = [[place(100)]] * 5 + [[place(400)]] * 5
+    paths = people(looks).paths()
+    assert len(paths) == 2 and {max(path.places) for path in paths} == {4, 9}
+
+
+@pytest.mark.parametrize(
+    "looks", [[], [[]], [[], []], [[place(1, log_odds=-9.0)]], [[place(1, log_odds=-3.5 + 1e-3)]] * 2]
+)
+def test_nobody(looks: list[list[Place]]) -> None:
+    assert people(looks).paths() == []

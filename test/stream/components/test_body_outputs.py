@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is published of bodies: stamps and frames, meshes that go with their people, transforms by id."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.bag.typestore import BagMessageFactory
+from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyOutputSettings
+from flowing_puppet_ros.stream.messages.clouds import decode_cloud
+from flowing_puppet_ros.stream.messages.geometry import make_header, rotation_matrix
+from flowing_puppet_ros.stream.messages.ros4hri_skeleton import MOVING
+
+FACTORY = BagMessageFactory()
+ALL = {"body_meshes", "body_vertices"}
+TENTH = 100_000_000
+
+
+@pytest.fixture(scope="module")
+def model() -> StitchedPuppet:
+    return StitchedPuppet.load()
+
+
+def body(model: StitchedPuppet, place: tuple[float, float, float]) -> BodyFit:
+    state = model.rest_state()
+    state = replace(state, center=state.center + np.array(place))
+    vertices = model.vertices(state)
+    return BodyFit(state, vertices, model.joints(vertices), 1.0, np.ones(16), 0.9, True, 0.01)
+
+
+def header(tenths: int) -> Any:
+    return make_header(FACTORY, 10**9 + tenths * TENTH, "lidar")
+
+
+def outputs(model: StitchedPuppet, **settings: Any) -> BodyOutputs:
+    return BodyOutputs(BodyOutputSettings(**settings), FACTORY, model)
+
+
+def markers(made: list[tuple[str, Any]]) -> list[tuple[int, int]]:
+    return [(marker.id, marker.action) for name, message in made if name == "body_meshes" for marker in message.markers]
+
+
+def test_everything_has_the_stamp_and_frame_of_the_cloud(model: StitchedPuppet) -> None:
+    made = outputs(model).make(header(3), [("b1", body(model, (2, 0, 1)))], wanted=ALL)
+    found = dict(made)
+    assert [name for name, _ in made].count("body_topology") == 1
+    for name in ("bodies", "part_poses", "body_vertices"):
+        assert found[name].header == header(3)
+    assert found["body_meshes"].markers[0].header == header(3)
+    assert {frame.header.stamp.nanosec for frame in found["/tf"].transforms} == {3 * TENTH}
+    again = outputs(model)
+    again.make(header(0), [("b1", body(model, (2, 0, 1)))])
+    assert "body_topology" not in dict(again.make(header(1), [("b1", body(model, (2, 0, 1)))]))
+
+
+def test_meshes_come_at_their_rate_and_go_at_once(model: StitchedPuppet) -> None:
+    shown, one, two = outputs(model, mesh_rate=5.0), ("b1", body(model, (2, 0, 1))), ("b2", body(model, (2, 1, 1)))
+    assert markers(shown.make(header(0), [one, two], wanted=ALL)) == [(1, 0), (2, 0)]
+    assert markers(shown.make(header(1), [one, two], wanted=ALL)) == []
+    assert markers(shown.make(header(2), [one], held=["b2"], wanted=ALL)) == [(1, 0)], "who is hidden is not lost"
+    assert markers(shown.make(header(3), [one], wanted=ALL)) == [(2, 2)]
+    assert markers(shown.make(header(4), [one, two], wanted=ALL)) == [(1, 0), (3, 0)], "no number is used again"
+    assert markers(shown.make(header(0), [one, two], wanted=ALL)) == [(1, 0), (3, 0)], "a recording starts again"
+    assert markers(shown.make(header(5), [], wanted=ALL)) == [(1, 2), (3, 2)]
+    every = outputs(model, mesh_rate=0.0)
+    assert all(markers(every.make(header(k), [one], wanted=ALL)) for k in range(3))
+
+
+def test_the_preview_is_the_body_with_fewer_triangles(model: StitchedPuppet) -> None:
+    volumes = []
+    for triangles in (0, 2000, 1000):
+        made = dict(
+            outputs(model, mesh_triangles=triangles).make(header(0), [("b1", body(model, (2, 0, 1)))], wanted=ALL)
+        )
+        (marker,) = made["body_meshes"].markers
+        corners = np.array([(p.x, p.y, p.z) for p in marker.points]).reshape(-1, 3, 3)
+        assert len(corners) == len(model.faces) if triangles == 0 else len(corners) <= triangles
+        volumes.append(np.linalg.det(corners - [2, 0, 1]).sum() / 6)
+    np.testing.assert_allclose(volumes, volumes[0], rtol=0.05)
+
+
+def test_vertices_are_one_row_a_body_and_poses_one_block(model: StitchedPuppet) -> None:
+    one, two = body(model, (2, 0, 1)), body(model, (2, 1, 1))
+    made = dict(outputs(model).make(header(0), [("b1", one), ("b2", two)], wanted=ALL))
+    cloud = made["body_vertices"]
+    assert (cloud.height, cloud.width) == (2, len(model.part_of_vertex))
+    points, _ = decode_cloud(cloud)
+    np.testing.assert_allclose(points[cloud.width :], two.vertices, atol=1e-5)
+    assert len(made["part_poses"].poses) == 32
+
+
+def test_frames_are_named_by_id_and_hang_on_the_sensor(model: StitchedPuppet) -> None:
+    fit = body(model, (2, 0, 1))
+    for humans in (False, True):
+        frames = dict(outputs(model, humans=humans).make(header(0), [("7", fit)]))["/tf"].transforms
+        names = [frame.child_frame_id for frame in frames]
+        assert names[0] == "body_p7" and frames[0].header.frame_id == "lidar"
+        assert len(set(names)) == len(names)
+        assert {frame.header.frame_id for frame in frames[1:]} == {"body_p7"}
+        assert {f"{name}_p7" for name in model.tree.names} <= set(names)
+        assert ("l_wrist_p7" in names) == humans
+        q, p = frames[0].transform.rotation, frames[0].transform.translation
+        turn, origin = rotation_matrix((q.x, q.y, q.z, q.w)), np.array([p.x, p.y, p.z])
+        np.testing.assert_allclose(origin, (fit.joints[5] + fit.joints[6]) / 2)
+        hand = next(frame for frame in frames if frame.child_frame_id == "left_hand_p7").transform.translation
+        there = origin + turn @ np.array([hand.x, hand.y, hand.z])
+        np.testing.assert_allclose(there, fit.state.center[model.tree.index("left_hand")], atol=1e-6)
+    few = dict(outputs(model, part_frames=False).make(header(0), [("b1", fit)]))["/tf"].transforms
+    assert [frame.child_frame_id for frame in few] == ["body_b1"]
+
+
+def test_people_by_rep_155(model: StitchedPuppet) -> None:
+    shown, one = outputs(model, humans=True), ("b1", body(model, (2, 0, 1)))
+    found = dict(shown.make(header(0), [one]))
+    states = found["/humans/bodies/b1/joint_states"]
+    assert states.name == [f"{name}_b1" for name in MOVING] and len(states.position) == 20
+    assert np.isfinite(states.position).all()
+    assert found["/humans/bodies/tracked"].ids == ["b1"]
+    assert 'name="body_b1"' in found["/humans/bodies/b1/urdf"].data
+    again = dict(shown.make(header(1), [one]))
+    assert "/humans/bodies/b1/urdf" not in again, "it is latched"
+    hidden = dict(shown.make(header(2), [], held=["b1"]))
+    assert hidden["/humans/bodies/tracked"].ids == ["b1"]
+    gone = dict(shown.make(header(3), []))
+    assert gone["/humans/bodies/b1/urdf"] is None and gone["/humans/bodies/b1/joint_states"] is None
+    assert gone["/humans/bodies/tracked"].ids == []

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""People by REP-155: ids, skeletons, regions, crops, joint states and URDF, and topics that end with their person."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.bag.reader import open_bag
+from flowing_puppet_ros.bag.typestore import BagMessageFactory, definition_files
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.stream.component import Port
+from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
+from flowing_puppet_ros.stream.components.ros4hri import (
+    SKELETON,
+    Humans,
+    HumansSettings,
+    box_around,
+    make_skeleton2d,
+    token,
+)
+from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
+from flowing_puppet_ros.stream.messages.images import decode_image
+from flowing_puppet_ros.stream.messages.ros4hri_skeleton import JOINTS, MOVING, Skeleton, urdf
+
+FACTORY = BagMessageFactory()
+HEADER = make_header(FACTORY, 1_500_000_000, "camera_optical_frame")
+GOLDEN = Path(__file__).resolve().parents[3] / "bags" / "golden" / "golden.mcap"
+
+
+def test_a_persons_port_knows_its_topics() -> None:
+    port = Port("/humans/bodies/{id}/roi", "hri_msgs/msg/NormalizedRegionOfInterest2D")
+    assert port.per_person and not Port("roi", port.type).per_person
+    assert port.of("a1") == "/humans/bodies/a1/roi"
+    assert port.covers("/humans/bodies/a1/roi")
+    for other in ("/humans/bodies//roi", "/humans/bodies/a/b/roi", "/humans/bodies/a1/cropped", "/humans/bodies/roi"):
+        assert not port.covers(other)
+
+
+def test_the_skeleton_has_the_order_of_the_constants() -> None:
+    (definition,) = (path for path in definition_files("hri_msgs") if path.stem == "Skeleton2D")
+    constants = {}
+    for line in definition.read_text().splitlines():
+        words = line.split("#")[0].split()
+        if len(words) == 4 and words[2] == "=":
+            constants[words[1].lower()] = int(words[3])
+    assert constants == {name: index for index, name in enumerate(SKELETON)}
+
+
+def test_joints_are_normalised_clipped_and_unknown_ones_have_no_confidence() -> None:
+    joints = {
+        "neck": (99.5, 49.5, 0.8),
+        "left_wrist": (250.0, 20.0, 0.9),
+        "nose": (np.nan, 3.0, 0.5),
+        "belly": (1, 2, 1),
+    }
+    message = make_skeleton2d(FACTORY, HEADER, joints, (200, 100))
+    neck, wrist = message.skeleton[1], message.skeleton[7]
+    assert (neck.x, neck.y) == (0.5, 0.5) and neck.c == pytest.approx(0.8)
+    assert wrist.x == 1.0 and 0 < wrist.c < 0.1
+    others = [point for index, point in enumerate(message.skeleton) if index not in (1, 7)]
+    assert len(others) == 16 and all((point.x, point.y, point.c) == (0, 0, 0) for point in others)
+    assert message.header == HEADER
+
+
+def test_boxes_are_inside_the_image() -> None:
+    assert box_around(np.array([[2.2, 3.0], [7.0, 4.6]]), (20, 20)) == (2, 3, 8, 6)
+    assert box_around(np.array([[-9.0, 3.0], [90.0, 4.6]]), (20, 20)) == (0, 3, 20, 6)
+    assert box_around(np.array([[-9.0, 3.0], [-3.0, 4.6]]), (20, 20)) is None
+
+
+@pytest.mark.parametrize(
+    ("identity", "name"), [("a1", "a1"), ("7", "p7"), ("Jo-hn/3", "Jo_hn_3"), ("ä", "p_"), ("", "p")]
+)
+def test_ids_fit_into_names_of_topics(identity: str, name: str) -> None:
+    assert token(identity) == name
+
+
+def test_topics_end_with_their_person() -> None:
+    humans = Humans(HumansSettings(humans=True, humans_namespace="/crowd/"), FACTORY, "urdf")
+    text = FACTORY.make("std_msgs/msg/String", data="x")
+    first = humans.publish(HEADER, ["a1", "a2"], {"a1": {"urdf": text}})
+    assert [(name, getattr(message, "ids", "-")) for name, message in first] == [
+        ("/crowd/bodies/tracked", ["a1", "a2"]),
+        ("/crowd/bodies/a1/urdf", "-"),
+    ]
+    assert [name for name, _ in humans.publish(HEADER, ["a1"], {})] == ["/crowd/bodies/tracked"]
+    assert humans.publish(HEADER, [], {})[0] == ("/crowd/bodies/a1/urdf", None)
+    ((name, empty),) = humans.publish(HEADER, [], {})
+    assert name == "/crowd/bodies/tracked" and empty.ids == []
+    assert Humans(HumansSettings(), FACTORY, "urdf").ports == ()
+
+
+@pytest.fixture(scope="module")
+def recorded() -> tuple[list[Any], dict[int, Any]]:
+    images, detections = [], {}
+    with open_bag(GOLDEN) as bag:
+        for record in bag.messages(["/cam1/image/compressed", "/cam1/detections"]):
+            if record.topic.endswith("detections"):
+                detections[stamp_ns(record.message)] = record.message
+            else:
+                images.append(record.message)
+    return images, detections
+
+
+def test_the_puppets_of_an_image_are_humans(recorded: tuple[list[Any], dict[int, Any]]) -> None:
+    images, detections = recorded
+    component = PuppetTrackerComponent(PuppetTrackerSettings(humans=True), FACTORY)
+    component.expects("detections", True)
+    component.handle("detections", detections[stamp_ns(images[0])])
+    made = dict(component.handle("image", images[0]))
+    (puppet,) = made["puppets"].puppets
+    root = f"/humans/bodies/{puppet.id}"
+    assert made["/humans/bodies/tracked"].ids == [puppet.id]
+    roi, crop, skeleton = (made[f"{root}/{leaf}"] for leaf in ("roi", "cropped", "skeleton2d"))
+    assert all(message.header == images[0].header for message in (roi, crop, skeleton, made["/humans/bodies/tracked"]))
+    image = decode_image(images[0])
+    height, width = image.shape[:2]
+    left, top = round(roi.xmin * width), round(roi.ymin * height)
+    np.testing.assert_array_equal(decode_image(crop), image[top : top + crop.height, left : left + crop.width])
+    assert crop.width == round((roi.xmax - roi.xmin) * width) and crop.height == round((roi.ymax - roi.ymin) * height)
+    wrist = next(joint for joint in puppet.joints if joint.name == "right_wrist")
+    assert skeleton.skeleton[4].x * width - 0.5 == pytest.approx(wrist.x, abs=1e-3)
+    assert skeleton.skeleton[4].c == pytest.approx(wrist.confidence)
+    assert skeleton.skeleton[16].c == 0, "a puppet has no ears"
+    component.reset()
+    after = component.handle("image", images[1]) + component.flush()
+    ended = {name for name, message in after if message is None}
+    assert ended == {f"{root}/{leaf}" for leaf in ("roi", "cropped", "skeleton2d")}
+    assert dict(after)["/humans/bodies/tracked"].ids == []
+
+
+def test_a_person_as_urdf() -> None:
+    model = StitchedPuppet.load()
+    root = ET.fromstring(urdf("b1", Skeleton(model).origins(model.rest_state().shape)))
+    links = [link.attrib["name"] for link in root.findall("link")]
+    joints = {joint.attrib["name"]: joint for joint in root.findall("joint")}
+    assert len(set(links)) == len(links) == len(joints) + 1 and links[0] == "body_b1"
+    assert {name.removesuffix("_b1") for name, joint in joints.items() if joint.attrib["type"] == "revolute"} == set(
+        MOVING
+    )
+    assert {"torso", "head", "l_wrist", "r_wrist", "l_ankle", "r_ankle"} == {j.name for j in JOINTS if j.axis is None}
+    for joint in joints.values():
+        parent, child = joint.find("parent"), joint.find("child")
+        assert parent is not None and child is not None
+        assert links.index(parent.attrib["link"]) < links.index(child.attrib["link"])

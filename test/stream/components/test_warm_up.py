@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""After the warm-up nothing is loaded or compiled any more, whatever the first messages are; and it leaves no trace."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[3]
+SCRIPT = """
+import json, sys
+from pathlib import Path
+from numba.core.dispatcher import Dispatcher
+from flowing_puppet_ros.bag.reader import open_bag
+from flowing_puppet_ros.bag.typestore import BagMessageFactory
+from flowing_puppet_ros.model import weights
+from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
+from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
+from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
+
+def state():
+    loaded = [(name, module) for name, module in sys.modules.items() if name.startswith("flowing_puppet_ros")]
+    kernels = {f"{m}.{n}": f for m, module in loaded for n, f in vars(module).items() if isinstance(f, Dispatcher)}
+    return {name: [str(one) for one in kernel.signatures] for name, kernel in kernels.items()}
+
+factory = BagMessageFactory()
+components = {}
+for name, kind, settings in (
+    ("flow", OpticalFlowComponent, {}), ("told", PuppetTrackerComponent, {}), ("cam1", PuppetTrackerComponent, {}),
+    ("cam2", PuppetTrackerComponent, {}), ("hull", VisualHullComponent, {"cameras": "cam1,cam2", "every": 1}),
+):
+    component = components[name] = kind(kind.settings_type(**settings), factory)
+    component.warm_up()
+    for port in component.outputs:
+        if port.lazy:
+            component.wants(port.name, True)
+traces = {name: dict(component.counters) for name, component in components.items()}
+before = state()
+
+def fail(*names):
+    raise AssertionError(f"weights are loaded late: {names}")
+
+weights.load = fail
+components["told"].expects("detections", True)
+for name in ("cam1", "cam2"):
+    components[name].expects("detections", True)
+with open_bag(Path("bags/golden/golden.mcap")) as bag:
+    for record in bag.messages():
+        topic, message = record.topic.removesuffix("/compressed"), record.message
+        name, _, port = topic[1:].rpartition("/")
+        if topic == "/tf_static":
+            components["hull"].handle(topic, message)
+        if name not in ("cam1", "cam2"):
+            continue
+        if port in ("image", "camera_info"):
+            components["hull"].handle(f"{name}/{port}", message)
+        if port in ("image", "detections"):
+            for made, item in components[name].handle(port, message):
+                if made in ("part_labels", "puppets"):
+                    components["hull"].handle(f"{name}/{made}", item)
+        if name == "cam1" and port == "image":
+            components["flow"].handle(port, message)
+            components["told"].expects("detections", False)  # its own detector looks
+            components["told"].handle(port, message)
+after = state()
+late = {name: kinds for name, kinds in after.items() if kinds != before.get(name)}
+done = {name: dict(component.counters) for name, component in components.items()}
+print(json.dumps({"late": late, "known": sum(map(bool, before.values())), "traces": traces, "done": done}))
+"""
+
+
+def test_the_first_messages_wait_for_nothing() -> None:
+    run = subprocess.run([sys.executable, "-c", SCRIPT], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    told = json.loads(run.stdout.splitlines()[-1])
+    assert told["late"] == {}
+    assert told["known"] > 10
+    assert not any(told["traces"].values())
+    assert told["done"]["hull"]["hulls"] > 0 and told["done"]["hull"]["silhouettes"] > 0
+    assert told["done"]["flow"]["flows"] == 7 and told["done"]["told"]["images"] == 8
