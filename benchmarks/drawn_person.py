@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-type Floats = NDArray[np.float64]
+from flowing_puppet_ros.arrays import F64, U8
 
 JOINTS = (
     *("neck", "belly", "face", "right_shoulder", "left_shoulder", "right_hip", "left_hip"),
@@ -34,7 +33,7 @@ class DrawnPerson:
         grain = rng.normal(0, 6, self._background.shape)
         self._background = np.clip(self._background + grain, 0, 255).astype(np.uint8)
 
-    def joints(self, seconds: float) -> Floats:
+    def joints(self, seconds: float) -> F64:
         """The places (11, 2) px of JOINTS at a time."""
         place = {"neck": (0.0, 0.0), "belly": (0.0, 1.0), "face": (0.0, -0.45)}
         place |= {"right_shoulder": (-0.5, 0.15), "left_shoulder": (0.5, 0.15)}
@@ -49,7 +48,7 @@ class DrawnPerson:
         neck = np.array([0.5 + 0.12 * np.sin(0.6 * seconds), 0.36 + 0.02 * np.sin(0.9 * seconds)]) * self.size
         return np.array([place[name] for name in JOINTS]) * self._scale + neck
 
-    def image(self, seconds: float) -> NDArray[np.uint8]:
+    def image(self, seconds: float) -> U8:
         """The picture (H, W, 3) RGB at a time."""
         image = self._background.copy()
         at = {name: _point(joint) for name, joint in zip(JOINTS, self.joints(seconds), strict=True)}
@@ -69,12 +68,10 @@ class DrawnPerson:
         return image
 
 
-def _point(joint: Floats) -> tuple[int, int]:
+def _point(joint: F64) -> tuple[int, int]:
     """A place in sixteenths of a pixel, as the drawing functions take it with the shift of 4."""
     return round(16 * float(joint[0])), round(16 * float(joint[1]))
 
 
-def _line(
-    image: NDArray[np.uint8], a: tuple[int, int], b: tuple[int, int], colour: tuple[int, ...], width: int
-) -> None:
+def _line(image: U8, a: tuple[int, int], b: tuple[int, int], colour: tuple[int, ...], width: int) -> None:
     cv2.line(image, a, b, colour, width, cv2.LINE_AA, 4)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.body.search.dpmp import Search
-from flowing_puppet_ros.body.search.energy import TOO_CLOSE, JointTargets, Judged
+from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch
+from flowing_puppet_ros.body.search.energy import TOO_CLOSE, JointTargets, ScoredParticles
 from flowing_puppet_ros.body.search.levenberg import CONTRADICTING_WEIGHT, DAMPING, DAMPING_FACTOR, MAX_TURN, POSE_PRIOR
 from flowing_puppet_ros.body.search.part_points import PartPoints
 from flowing_puppet_ros.body.search.particles import Particles
@@ -65,14 +65,14 @@ class PlainCloud:
         return cost, mismatch
 
 
-class PlainSearch(Search):
+class PlainSearch(BodyParticleSearch):
     """`Search` with plain moves, stitching costs and selection."""
 
-    def _improved(self, part: int, new: Particles, grid: PlainCloud, targets: JointTargets) -> Judged:  # type: ignore[override]
+    def _improved(self, part: int, new: Particles, grid: PlainCloud, targets: JointTargets) -> ScoredParticles:  # type: ignore[override]
         moved = improve(self._points[part], new, grid, targets, self._weights.lm_steps, self._weights.lm_points)
-        return Judged.judge(self._points[part], moved, grid, targets)
+        return ScoredParticles.judge(self._points[part], moved, grid, targets)
 
-    def _solve(self, judged: list[Judged], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
+    def _solve(self, judged: list[ScoredParticles], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
         nodes = [
             beta * (group.distance + self._weights.mismatch * group.mismatch) + group.pull
             for beta, group in zip(stage.data, judged, strict=True)
@@ -160,7 +160,9 @@ class _Problem:
         return cost, hessian, gradient
 
 
-def stitching_costs(weight: np.ndarray, parent: Judged, child: Judged, edge: int, strength: float) -> np.ndarray:
+def stitching_costs(
+    weight: np.ndarray, parent: ScoredParticles, child: ScoredParticles, edge: int, strength: float
+) -> np.ndarray:
     """See `energy.stitching_costs`: every pair of particles by itself."""
     share = weight / weight.sum()
     costs = np.empty((len(parent.particles), len(child.particles)))

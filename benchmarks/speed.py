@@ -20,12 +20,12 @@ from scipy.spatial import cKDTree
 from benchmarks import plain_search, streams
 from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
-from flowing_puppet_ros.body.fit.initialisation import sampled_bodies
+from flowing_puppet_ros.body.fit.initialisation import sample_bodies
 from flowing_puppet_ros.body.search import energy, levenberg
-from flowing_puppet_ros.body.search.dpmp import Search, SearchWeights
-from flowing_puppet_ros.body.search.energy import JointTargets, Judged
+from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
+from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles
 from flowing_puppet_ros.body.search.part_points import part_points
-from flowing_puppet_ros.body.search.particles import Particles, particles_of
+from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.schedule import four_stages
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.evaluate.body.synthetic_scans import surface_samples
@@ -70,7 +70,9 @@ class Bench:
         """The steps of the search against the same written plainly, on 20 particles a part."""
         grid, cloud = self._grids(5000)
         start, weights = self._start(BASE["particles"], grid), SearchWeights()
-        judged = [Judged.judge(p, group, grid, self._none) for p, group in zip(self._points, start, strict=True)]
+        judged = [
+            ScoredParticles.judge(p, group, grid, self._none) for p, group in zip(self._points, start, strict=True)
+        ]
         upper, edge = 4, 3
         parent, child = judged[self._model.tree.edges[edge][0]], judged[self._model.tree.edges[edge][1]]
         weight = self._model.interfaces[edge].weight
@@ -81,12 +83,12 @@ class Bench:
         part, group, count = self._points[upper], start[upper], weights.lm_points
         pairs: dict[str, tuple[Callable[[], object], Callable[[], object]]] = {
             "Levenberg-Marquardt moves": (
-                lambda: levenberg.improve(part, group, grid, self._none, weights.lm_steps, count),
+                lambda: levenberg.levenberg_marquardt(part, group, grid, self._none, weights.lm_steps, count),
                 lambda: plain_search.improve(part, group, cloud, self._none, weights.lm_steps, count),
             ),
             "data costs": (
-                lambda: Judged.judge(part, group, grid, self._none),
-                lambda: Judged.judge(part, group, cloud, self._none),
+                lambda: ScoredParticles.judge(part, group, grid, self._none),
+                lambda: ScoredParticles.judge(part, group, cloud, self._none),
             ),
             "stitching costs": (
                 lambda: energy.stitching_costs(weight, *ends, centers, 4.0),
@@ -103,7 +105,7 @@ class Bench:
         """A whole search against the same written plainly, which asks a cKDTree."""
         grid, cloud = self._grids(5000)
         particles, iterations = PLAIN_SIZE
-        fast = self._search_seconds(Search, grid, particles, iterations)
+        fast = self._search_seconds(BodyParticleSearch, grid, particles, iterations)
         slow = self._search_seconds(plain_search.PlainSearch, cloud, particles, iterations, repeats=1)
         return [_ratio(f"search of {particles} particles, {iterations} iterations", fast, slow)]
 
@@ -116,7 +118,7 @@ class Bench:
                 points, normals = self._cloud(size["points"])
                 built = _seconds(lambda p=points, n=normals: CloudGrid.build(p, n))  # type: ignore[misc]
                 grid = CloudGrid.build(points, normals)
-                seconds = self._search_seconds(Search, grid, size["particles"], size["iterations"])
+                seconds = self._search_seconds(BodyParticleSearch, grid, size["particles"], size["iterations"])
                 rows.append(size | {"grid_seconds": built, "search_seconds": seconds})
         return rows
 
@@ -130,7 +132,7 @@ class Bench:
                 state = replace(self._body, center=self._body.center + np.array([WALK * frame, 0.0, 0.0]))
                 points, normals, eye = self._seen(state, sides, frame)
                 started = time.process_time()
-                tracker.step(points, normals, frame * 50_000_000, eye)
+                tracker.track_or_refit(points, normals, frame * 50_000_000, eye)
                 seconds.append(time.process_time() - started)
             row = {"sides": sides, "points": len(points), "searched": tracker.counters["searched"]}
             rows.append(row | {"milliseconds_a_frame": 1000 * float(np.median(seconds[1:]))})
@@ -186,16 +188,16 @@ class Bench:
 
     def _start(self, particles: int, grid: CloudGrid) -> list[Particles]:
         rng = np.random.default_rng(self._seed)
-        return particles_of(self._model, sampled_bodies(self._model, grid.points.mean(axis=0), particles, rng))
+        return states_to_particles(self._model, sample_bodies(self._model, grid.points.mean(axis=0), particles, rng))
 
     def _search_seconds(
-        self, kind: type[Search], cloud: Any, particles: int, iterations: int, repeats: int = 2
+        self, kind: type[BodyParticleSearch], cloud: Any, particles: int, iterations: int, repeats: int = 2
     ) -> float:
         search, start = kind(self._model, self._points, SearchWeights()), self._start(particles, cloud)
         stages = four_stages(self._model.tree)
 
         def run() -> None:
-            search.run(start, cloud, self._none, stages, iterations, np.random.default_rng(self._seed))
+            search.optimise(start, cloud, self._none, stages, iterations, np.random.default_rng(self._seed))
 
         return _seconds(run, repeats)
 

@@ -2,7 +2,7 @@
 """Identifiers of people that differ between runs with different seeds."""
 
 
-def letters(seed: int) -> str:
+def letters_of_seed(seed: int) -> str:
     """The seed as letters: 0 a, 1 b, ..., 25 z, 26 aa, ...: ids of runs with different seeds differ."""
     text = ""
     seed += 1

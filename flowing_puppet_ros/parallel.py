@@ -9,12 +9,12 @@ from concurrent.futures import ThreadPoolExecutor
 from numba import config
 
 
-def usable(threads: int) -> int:
+def usable_threads(threads: int) -> int:
     """At most `threads`, the cores that this process may use, and NUMBA_NUM_THREADS, by which workers are told less."""
     return max(1, min(threads, int(config.NUMBA_NUM_THREADS)))
 
 
-def ordered[Item, Result](work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> list[Result]:
+def parallel_map[Item, Result](work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> list[Result]:
     """Return what `work` makes of each item, in the items' order; `work` must not change anything that it shares."""
     if threads == 1:
         return [work(item) for item in items]

@@ -18,7 +18,7 @@ ROOT = PACKAGE.parent
 NAME = PACKAGE.name
 MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
-FOUNDATION = {"blas", "errors", "ids", "parallel", "settings", "units"}
+FOUNDATION = {"arrays", "blas", "errors", "ids", "parallel", "settings", "units"}
 """Modules beside the rooms, which everything may import."""
 OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "rerun"}
 OPTIONAL = {"learn": "learn", "cli.batch.cluster": "cluster", "report.rerun_file": "rerun"}

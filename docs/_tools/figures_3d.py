@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
-from flowing_puppet_ros.body.fit.initialisation import sampled_bodies, turned_around
-from flowing_puppet_ros.body.refine.gauss_newton import Refiner, RefineWeights
-from flowing_puppet_ros.body.search.dpmp import Search, SearchWeights
+from flowing_puppet_ros.body.fit.initialisation import flip_heading, sample_bodies
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
+from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.part_points import part_points
-from flowing_puppet_ros.body.search.particles import particles_of, state_of
+from flowing_puppet_ros.body.search.particles import particles_to_state, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer
 from flowing_puppet_ros.body.search.schedule import WIDE, four_stages
 from flowing_puppet_ros.draw.mesh_render import Canvas, OrthographicCamera, orthographic, render
@@ -52,9 +52,9 @@ class Bodies:
         if not self.recorded.bodies:
             rng = np.random.default_rng(1)
             grid = CloudGrid.build(self.points, self.normals)
-            bodies = sampled_bodies(self.model, self.points.mean(axis=0), 30, rng)
-            start, stages = particles_of(self.model, bodies), four_stages(self.model.tree)
-            self.recorded.run(start, grid, JointTargets.none(self.model), stages, 40, rng)
+            bodies = sample_bodies(self.model, self.points.mean(axis=0), 30, rng)
+            start, stages = states_to_particles(self.model, bodies), four_stages(self.model.tree)
+            self.recorded.optimise(start, grid, JointTargets.none(self.model), stages, 40, rng)
         return self.recorded.bodies[-1]
 
     def picture(self, vertices: np.ndarray, camera: OrthographicCamera, size: tuple[int, int]) -> Picture:
@@ -73,7 +73,7 @@ class Bodies:
         return np.asarray(total / len(states)).astype(np.uint8)
 
 
-class Recorded(Search):
+class Recorded(BodyParticleSearch):
     """A search that keeps the best body and some particles of every round."""
 
     def __init__(self, *given: Any) -> None:
@@ -83,7 +83,7 @@ class Recorded(Search):
         self.particles: list[list[BodyState]] = []
 
     def _go_on(self, *given: Any) -> Any:
-        judged = super()._go_on(*given)
+        judged = super()._improve_and_select(*given)
         first = np.zeros(len(judged), dtype=np.int64)
         groups = [group.particles for group in judged]
         self.bodies.append(self._state(groups, first))
@@ -91,7 +91,7 @@ class Recorded(Search):
         return judged
 
     def _state(self, groups: Any, chosen: np.ndarray) -> BodyState:
-        return state_of(self._model, groups, chosen)
+        return particles_to_state(self._model, groups, chosen)
 
 
 def sp_samples(made: Bodies) -> Picture:
@@ -139,8 +139,8 @@ def stitching(made: Bodies) -> Picture:
     """Parts apart with the gaps between their interface points, and stitched."""
     size, rng = (330, 430), np.random.default_rng(3)
     proposer = Proposer(made.model, part_points(made.model))
-    walked = [proposer.walk(group, WIDE, rng) for group in particles_of(made.model, [made.body])]
-    apart = state_of(made.model, walked, np.zeros(len(walked), dtype=np.int64))
+    walked = [proposer.random_walk(group, WIDE, rng) for group in states_to_particles(made.model, [made.body])]
+    apart = particles_to_state(made.model, walked, np.zeros(len(walked), dtype=np.int64))
     camera = orthographic(made.truth, FRONT, size, margin=0.12)
     canvas = Canvas(camera, size)
     meshes = made.model.parts(apart)
@@ -183,7 +183,7 @@ def fit_stages(made: Bodies) -> Picture:
     canvas.points(made.points, GREY, 1.0)
     searched = made.searched()
     cloud = Cloud.of(made.points, made.normals)
-    done = Refiner(made.model).run(searched, cloud, JointTargets.none(made.model), RefineWeights())
+    done = GaussNewton(made.model).run(searched, cloud, JointTargets.none(made.model), RefineWeights())
     pictures = [caption(canvas.picture().rgb, "cloud")]
     for name, state in (("search", searched), ("finish", done)):
         vertices = made.model.vertices(state)
@@ -198,8 +198,8 @@ def hypotheses(made: Bodies) -> Picture:
     camera = orthographic(made.truth, FRONT, size, margin=0.1)
     cloud = Cloud.of(made.points, made.normals)
     pictures = []
-    for name, state in (("as found", made.searched()), ("turned around", turned_around(made.model, made.searched()))):
-        done = Refiner(made.model).run(state, cloud, JointTargets.none(made.model), RefineWeights())
+    for name, state in (("as found", made.searched()), ("turned around", flip_heading(made.model, made.searched()))):
+        done = GaussNewton(made.model).run(state, cloud, JointTargets.none(made.model), RefineWeights())
         vertices = made.model.vertices(done)
         distance = 1000 * two_way_distance(vertices, made.model.faces, cloud)
         canvas = Canvas(camera, size)

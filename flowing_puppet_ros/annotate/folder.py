@@ -10,12 +10,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import U8, Image
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.video_reader import IMAGE_SUFFIXES, natural_order
-
-type Image = NDArray[np.uint8]
 
 VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg"})
 MOST_ITEMS = 200_000
@@ -147,7 +145,7 @@ class _OpenVideo:
         self._next = 0
         self._capture = cv2.VideoCapture()
 
-    def read(self, path: Path, index: int) -> NDArray[np.uint8] | None:
+    def read(self, path: Path, index: int) -> U8 | None:
         """Frame `index` (H, W, 3) BGR; None when the video has no such frame."""
         if path != self._path or index < self._next:
             self._capture.open(str(path))

@@ -7,9 +7,9 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flowing_puppet_ros.annotate.store import Person
+from flowing_puppet_ros.arrays import U8
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
@@ -55,7 +55,7 @@ def outline(parts: int, person: Person) -> dict[str, Any]:
     return {"scale": scale, "parts": painted}
 
 
-def carried(parts: int, people: list[Person], before: NDArray[np.uint8], image: NDArray[np.uint8]) -> list[Person]:
+def carried(parts: int, people: list[Person], before: U8, image: U8) -> list[Person]:
     """The people of the image `before` (H, W, 3) where the puppet flow takes them in `image`.
 
     InputError when the images differ in size or are too small for a flow.

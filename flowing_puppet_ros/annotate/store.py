@@ -20,7 +20,7 @@ import numpy as np
 
 from flowing_puppet_ros.annotate.folder import split_key
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.image.formats.stickmen import sticks_of, write_sticks
+from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints, write_sticks
 
 FILE = "annotations.json"
 GENDERS = ("neutral", "female", "male")
@@ -96,7 +96,7 @@ class AnnotationStore:
         for key, number in zip(items, numbers, strict=True):
             people = [np.array(person["joints"], dtype=np.float64)[:, :2] for person in self.get(key)[1]]
             if people and number is not None:
-                frames[number] = [sticks_of(self.joint_names, joints) for joints in people]
+                frames[number] = [sticks_from_joints(self.joint_names, joints) for joints in people]
         write_sticks(path, frames)
 
     def _read(self) -> dict[str, list[Person]]:

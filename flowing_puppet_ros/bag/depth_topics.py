@@ -9,7 +9,7 @@ from typing import Any
 
 from flowing_puppet_ros.bag.reader import Bag
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.component import sends_depth, untransported
+from flowing_puppet_ros.stream.component import base_topic, sends_depth
 from flowing_puppet_ros.stream.messages.compressed_depth import sent_encoding
 from flowing_puppet_ros.stream.messages.images import is_depth
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
@@ -56,7 +56,7 @@ def depth_topics(
     chosen: dict[str, str] = {}
     notes = []
     for recorded in sorted(encoded, key=_rectified_first):
-        topic = untransported(recorded)
+        topic = base_topic(recorded)
         namespace = topic.rpartition("/")[0]
         info = f"{namespace}/camera_info"
         if not holds_depth(recorded, encoded[recorded]) or namespace in chosen:
@@ -80,7 +80,7 @@ def depth_topics(
 
 
 def _rectified_first(topic: str) -> tuple[int, str]:
-    name = untransported(topic).rpartition("/")[2]
+    name = base_topic(topic).rpartition("/")[2]
     return RECTIFIED_FIRST.index(name) if name in RECTIFIED_FIRST else len(RECTIFIED_FIRST), topic
 
 

@@ -11,8 +11,8 @@ from typing import Any
 from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.formats.video_reader import Frame
-from flowing_puppet_ros.stream.component import sends_depth, untransported
+from flowing_puppet_ros.image.formats.video_reader import VideoFrame
+from flowing_puppet_ros.stream.component import base_topic, sends_depth
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, IMAGE, PUPPETS
@@ -31,7 +31,7 @@ class BagFrames:
     salvage: bool
     warn: Callable[[str], None]
 
-    def __iter__(self) -> Iterator[tuple[Frame, list[Keypoints] | None]]:
+    def __iter__(self) -> Iterator[tuple[VideoFrame, list[Keypoints] | None]]:
         """Read the images in the order of the bag; a stamp without detections had no detector run on it.
 
         An image that cannot be read is warned of and left out; it counts in the index.
@@ -40,7 +40,7 @@ class BagFrames:
             for index, record in enumerate(bag.messages([self.topic])):
                 try:
                     stamp = stamp_ns(record.message)
-                    frame = Frame(index, stamp, decode_image(record.message), "")
+                    frame = VideoFrame(index, stamp, decode_image(record.message), "")
                 except InputError as error:
                     self.warn(f"frame {index}: {error}")
                     continue
@@ -92,4 +92,4 @@ def _readable(bag: Bag, topic: str, warn: Callable[[str], None]) -> Iterator[Any
 
 def _namespace(image: str) -> str:
     """The camera's namespace: /cam01 of /cam01/image_raw/compressed."""
-    return untransported(image).rpartition("/")[0]
+    return base_topic(image).rpartition("/")[0]

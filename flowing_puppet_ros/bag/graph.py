@@ -11,7 +11,7 @@ from flowing_puppet_ros.bag.depth_topics import depth_topics, holds_depth
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera as CameraModel
 from flowing_puppet_ros.settings import Settings
-from flowing_puppet_ros.stream.component import Component, Port, untransported
+from flowing_puppet_ros.stream.component import Component, Port, base_topic
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
 from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
@@ -136,7 +136,7 @@ def _nothing_usable(topics: Mapping[str, str]) -> str:
     listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
     images = sorted(name for name, kind in topics.items() if kind in (IMAGE, COMPRESSED_IMAGE))
     old = images[0] if images else "OLD"
-    new = f"{untransported(old).rpartition('/')[0]}/image" if images else "NEW"
+    new = f"{base_topic(old).rpartition('/')[0]}/image" if images else "NEW"
     return (
         f"no topic can be used: wanted are images named {', '.join(IMAGE_NAMES)}, depth images with their "
         f"camera_info, or point clouds; the topics are {listed}; --topic-map {old}:={new} renames one"
@@ -180,7 +180,7 @@ def _tracker(
     instance = Instance(f"{camera.name}/puppet_tracker", component, camera.namespace, {"image": camera.image})
     kinds = {"detections": PUPPETS, "flow/forward": IMAGE, "flow/backward": IMAGE}
     for port, kind in kinds.items():
-        component.expects(port, topics.get(instance.topic(port)) == kind)
+        component.set_expected(port, topics.get(instance.topic(port)) == kind)
     return instance
 
 
@@ -245,7 +245,7 @@ def _scene_fitter(
     if port == "depth":
         renamed["camera_info"] = f"{namespace}/camera_info"
     instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, namespace, renamed)
-    fitter.expects("initial", topics.get(instance.topic("initial")) == BODIES)
+    fitter.set_expected("initial", topics.get(instance.topic("initial")) == BODIES)
     return instance
 
 

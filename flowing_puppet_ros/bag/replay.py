@@ -105,7 +105,7 @@ class _Replay:
         for instance in self._graph.instances:
             for port in instance.component.outputs:
                 if port.lazy:
-                    instance.component.wants(port.name, True)
+                    instance.component.set_subscribed(port.name, True)
 
     def _settings(self) -> dict[str, dict[str, Any]]:
         unknown = sorted(set(self._options.settings) - set(_COMPONENTS))

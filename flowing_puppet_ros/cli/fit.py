@@ -19,7 +19,7 @@ import numpy as np
 from flowing_puppet_ros.body.fit.fitter import FitterSettings
 from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
 from flowing_puppet_ros.body.scans.scan_frame import UNITS, UP_NAMES
-from flowing_puppet_ros.body.segmentation.people import ExtractionSettings
+from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.cli.fit_file import FitOptions, files_of, fit_file
 from flowing_puppet_ros.errors import InputError, PuppetError
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="find the people among floor, walls and furniture first (in metres if --unit is auto); results are"
         " <stem>-1 and so on, the likeliest person first",
     )
-    ExtractionSettings.add_arguments(parser)
+    SegmentationSettings.add_arguments(parser)
     parser.add_argument("--rerun", type=Path, metavar="RRD", help="write the fits as a recording for the Rerun viewer")
     runner.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object per input on stdout")
@@ -70,7 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Fit every input; one that fails is reported and the others go on."""
     options = FitOptions(
-        out=runner.placed(arguments.out, arguments),
+        out=runner.resolve_path(arguments.out, arguments),
         model=arguments.model,
         up=arguments.up,
         upright=arguments.upright,
@@ -78,9 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
         view=arguments.view,
         scene=arguments.scene,
         settings=FitterSettings.from_arguments(arguments),
-        extraction=ExtractionSettings.from_arguments(arguments),
+        extraction=SegmentationSettings.from_arguments(arguments),
     )
-    sources = [runner.placed(source, arguments) for given in arguments.inputs for source in _scans(given)]
+    sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in _scans(given)]
     several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
     finished: list[dict[str, Any]] = []
     if arguments.rerun is not None:

@@ -20,15 +20,15 @@ from flowing_puppet_ros.body.fit.up_axis_search import fit_in_best_frame
 from flowing_puppet_ros.body.scans.scan import Scan, read_scan, storable, write_ply
 from flowing_puppet_ros.body.scans.scan_frame import (
     UNITS,
-    Frame,
+    ScanFrame,
     all_candidates,
     axis_of,
     guess_scale,
     seen_from_origin,
     up_candidates,
 )
-from flowing_puppet_ros.body.segmentation.people import ExtractionSettings
-from flowing_puppet_ros.body.segmentation.up_axis import people_of_scene
+from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
+from flowing_puppet_ros.body.segmentation.up_axis import segment_people_unknown_up
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -70,7 +70,7 @@ class FitOptions:
     view: str
     scene: bool
     settings: FitterSettings
-    extraction: ExtractionSettings
+    extraction: SegmentationSettings
 
 
 def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def _people(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> 
     points, normals = scan.surface(SCENE_POINTS, np.random.default_rng(fitter.settings.seed))
     ups = [axis_of(name) for name in (("z", "y", "-y") if options.up == "auto" else (options.up,))]
     sensor = None if options.view == "full" else np.zeros(3)
-    up, found = people_of_scene(points, normals, scale, ups, sensor, options.extraction)
+    up, found = segment_people_unknown_up(points, normals, scale, ups, sensor, options.extraction)
     if not found:
         raise PuppetError(
             f"{path} shows nobody among its {len(points)} points; check --up and --unit, lower --likeness, or cut the"
@@ -195,7 +195,7 @@ def _sensor(points: np.ndarray, normals: np.ndarray | None, scale: float, view: 
     return points.mean(axis=0) + 3 * float(np.ptp(points, axis=0).max()) * mean / max(float(np.linalg.norm(mean)), 1e-9)
 
 
-def _write(output: Path, model: StitchedPuppet, frame: Frame, fit: BodyFit, seconds: float) -> None:
+def _write(output: Path, model: StitchedPuppet, frame: ScanFrame, fit: BodyFit, seconds: float) -> None:
     """Write the fit in the scan's frame and unit as `output` and as a mesh beside it."""
     vertices = storable(frame.to_scan(fit.vertices))
     arrays: dict[str, Any] = {

@@ -30,7 +30,7 @@ _OF_NODES_ONLY = ("queue", "autostart", "use_sim_time")
 
 
 @dataclass(frozen=True, slots=True)
-class Told:
+class ReplayJob:
     """What each replay of several is told; the bags, and the reports if there are any, go into folders."""
 
     out: Path = field(repr=False)
@@ -94,15 +94,15 @@ def run(arguments: argparse.Namespace) -> int:
         from flowing_puppet_ros.report.rerun_file import rerun_sdk
 
         rerun_sdk()
-    sources = [runner.placed(source, arguments) for given in arguments.inputs for source in bags_of(given)]
+    sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in bags_of(given)]
     if sources == arguments.inputs and len(sources) == 1 and arguments.scheduler is None:
         return _one(sources[0], arguments, options)
     if arguments.out.suffix == ".mcap":
         raise InputError(f"--out is {arguments.out}: the results of several bags need a folder")
-    told = Told(
-        out=runner.placed(arguments.out, arguments),
-        reports=arguments.report and runner.placed(arguments.report, arguments),
-        recordings=arguments.rerun and runner.placed(arguments.rerun, arguments),
+    told = ReplayJob(
+        out=runner.resolve_path(arguments.out, arguments),
+        reports=arguments.report and runner.resolve_path(arguments.report, arguments),
+        recordings=arguments.rerun and runner.resolve_path(arguments.rerun, arguments),
         options=replace(options, progress=False),
     )
     verb = runner.Verb("replay", replay_one, files_of, lambda summary: _tell(summary, arguments.json))
@@ -122,7 +122,7 @@ def _one(source: Path, arguments: argparse.Namespace, options: ReplayOptions) ->
     return 0
 
 
-def replay_one(source: Path, told: Told) -> dict[str, Any]:
+def replay_one(source: Path, told: ReplayJob) -> dict[str, Any]:
     """Replay one bag of several into a file of its own, with its report if that is wanted, and return the summary."""
     name = runner.stem_of(source)
     target = told.out / f"{name}.mcap"

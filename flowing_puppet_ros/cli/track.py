@@ -23,22 +23,22 @@ from flowing_puppet_ros.bag.paths import is_bag
 from flowing_puppet_ros.draw.overlay_video import check_overlay, drawn_tracks, write_overlay
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowSettings
-from flowing_puppet_ros.image.arms.evidence import Eyes, Sight
+from flowing_puppet_ros.image.arms.evidence import ArmEvidence, ArmEvidenceModel
 from flowing_puppet_ros.image.arms.viterbi import PathSettings
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.tracks_json import puppet_entry, read_keypoints, write_tracks
-from flowing_puppet_ros.image.formats.video_reader import Frame, open_frames
+from flowing_puppet_ros.image.formats.video_reader import VideoFrame, open_frames
 from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
-from flowing_puppet_ros.image.video.offline_smoother import Clip
-from flowing_puppet_ros.image.video.tracking_by_detection import DetectionSettings, VideoTracker
+from flowing_puppet_ros.image.video.offline_smoother import OfflineSmoother
+from flowing_puppet_ros.image.video.tracking_by_detection import DetectingTracker, DetectionSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
-type Detected = tuple[Frame, list[Keypoints] | None]
-type Stepped = tuple[TrackResult, dict[str, Sight] | None]
-type Stepper = Callable[[Frame, list[Keypoints] | None], Stepped]
+type Detected = tuple[VideoFrame, list[Keypoints] | None]
+type Stepped = tuple[TrackResult, dict[str, ArmEvidence] | None]
+type Stepper = Callable[[VideoFrame, list[Keypoints] | None], Stepped]
 type Tracked = tuple[int, int, str, list[TrackedPuppet]]  # index, stamp, path of a frame, and its people
 
 
@@ -65,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Track through the whole input and write the tracks."""
     model = DeformableStructures.load(arguments.model, arguments.parts)
     settings = TrackerSettings.from_arguments(arguments), FlowSettings.from_arguments(arguments)
-    clip = Clip(model, SmoothingSettings.from_arguments(arguments), PathSettings.from_arguments(arguments))
+    clip = OfflineSmoother(model, SmoothingSettings.from_arguments(arguments), PathSettings.from_arguments(arguments))
     tracker = FlowingPuppetTracker(model, *settings)
     if arguments.overlay:
         check_overlay(Path(arguments.overlay))
@@ -96,16 +96,16 @@ def _stepper(arguments: argparse.Namespace, tracker: FlowingPuppetTracker, given
     if given:
         return lambda frame, detections: (tracker.step(frame.image, frame.stamp_ns, detections), None)
     settings = DetectionSettings.from_arguments(arguments)
-    video = VideoTracker(tracker, PartDetector.load(), Eyes.load(arguments.model), settings)
+    video = DetectingTracker(tracker, PartDetector.load(), ArmEvidenceModel.load(arguments.model), settings)
     if arguments.live:
         return lambda frame, _: (video.step(frame.image, frame.stamp_ns)[0], None)
     again = _open(arguments, lambda _: None)
     searched = tqdm(again.frames, "search", total=again.count or None, unit="frame", disable=None)
     paths = video.search(frame.image for frame, _ in searched)
 
-    def step(frame: Frame, detections: list[Keypoints] | None) -> Stepped:
+    def step(frame: VideoFrame, detections: list[Keypoints] | None) -> Stepped:
         result, found = video.step(frame.image, frame.stamp_ns, paths=paths)
-        return result, video.sights(frame.image, result, found)
+        return result, video.arm_evidence(frame.image, result, found)
 
     return step
 
@@ -126,7 +126,7 @@ class _Tally:
             yield entry
 
 
-def _tracked(step: Stepper, detected: Iterable[Detected]) -> Iterator[tuple[Frame, Stepped]]:
+def _tracked(step: Stepper, detected: Iterable[Detected]) -> Iterator[tuple[VideoFrame, Stepped]]:
     """Step through the frames; one that cannot be used is warned of and left out."""
     last = ""
     for frame, detections in detected:
@@ -142,12 +142,12 @@ def _tracked(step: Stepper, detected: Iterable[Detected]) -> Iterator[tuple[Fram
         yield frame, (result, sights)
 
 
-def _live(steps: Iterable[tuple[Frame, Stepped]]) -> Iterator[Tracked]:
+def _live(steps: Iterable[tuple[VideoFrame, Stepped]]) -> Iterator[Tracked]:
     for frame, (result, _) in steps:
         yield frame.index, frame.stamp_ns, frame.path, result.puppets
 
 
-def _whole(steps: Iterable[tuple[Frame, Stepped]], clip: Clip) -> Iterator[Tracked]:
+def _whole(steps: Iterable[tuple[VideoFrame, Stepped]], clip: OfflineSmoother) -> Iterator[Tracked]:
     seen = []
     for frame, (result, sights) in steps:
         clip.add(result, sights)

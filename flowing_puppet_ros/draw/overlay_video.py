@@ -11,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 
+from flowing_puppet_ros.arrays import Image
 from flowing_puppet_ros.draw.flow_colour import flow_scale, flow_to_rgb
 from flowing_puppet_ros.draw.overlay import FIXED_BITS, DrawnPuppet, draw_puppets
 from flowing_puppet_ros.errors import InputError
@@ -21,8 +22,6 @@ LONGEST_SIDE = 960  # px of a frame in the video; there are two beside each othe
 CALM = 0.1  # share of a frame in the motion that is shown at full colour, so that colours do not flicker
 
 FARTHEST = 1e6  # px; contours beyond are not drawn
-
-type Image = np.ndarray[Any, np.dtype[np.uint8]]
 
 
 def check_overlay(path: Path) -> None:

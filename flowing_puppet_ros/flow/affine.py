@@ -16,9 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from flowing_puppet_ros.flow.estimate import Flow
-
-type Floats = NDArray[np.float64]
+from flowing_puppet_ros.arrays import F64, I64, U16, Bools, Flow
 
 SAMPLES_PER_REGION = 2000
 SAMPLES_FOR_START = 200
@@ -39,20 +37,20 @@ class RegionMotions:
     region's sampled vectors that agree with the motion, `pixels` the number of visible pixels with known flow.
     """
 
-    affine: Floats
-    residual: Floats
-    support: Floats
-    pixels: NDArray[np.int64]
+    affine: F64
+    residual: F64
+    support: F64
+    pixels: I64
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Bools:
         """(R,) whether the region had enough pixels for a motion of its own."""
         return self.pixels >= LEAST_FOR_TRANSLATION
 
 
-def transform(affine: Floats, points: Floats) -> Floats:
+def transform(affine: F64, points: F64) -> F64:
     """Apply motions (..., 2, 3) to points (..., N, 2)."""
-    moved: Floats = points @ np.swapaxes(affine[..., :2], -1, -2) + affine[..., None, :, 2]
+    moved: F64 = points @ np.swapaxes(affine[..., :2], -1, -2) + affine[..., None, :, 2]
     return moved
 
 
@@ -96,9 +94,7 @@ def round_trip_weight(x: int, y: int, u: float, v: float, backward: Flow) -> flo
 
 
 @njit(cache=True, nogil=True)
-def _gather(
-    labels: NDArray[np.uint16], count: int, forward: Flow, backward: Flow
-) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
+def _gather(labels: U16, count: int, forward: Flow, backward: Flow) -> tuple[F64, I64, I64]:
     """Samples (M, 6) sorted by label, the first of each label (count + 1,), pixels of each label (count,).
 
     A sample is x, y, u, v, how well the round trip closes in (0, 1], and its weight in a fit, for now the same.
@@ -130,7 +126,7 @@ def _gather(
 
 
 @njit(cache=True, nogil=True)
-def _fit_all(samples: Floats, starts: NDArray[np.int64], affine: Floats, residual: Floats, support: Floats) -> None:
+def _fit_all(samples: F64, starts: I64, affine: F64, residual: F64, support: F64) -> None:
     """Fit the background, label 0, then discount in the other regions what moves with it and fit those."""
     residual[0], support[0] = _fit(samples[: starts[1]], affine[0])
     a = affine[0]
@@ -145,7 +141,7 @@ def _fit_all(samples: Floats, starts: NDArray[np.int64], affine: Floats, residua
 
 
 @njit(cache=True, nogil=True)
-def _fit(samples: Floats, affine: Floats) -> tuple[float, float]:
+def _fit(samples: F64, affine: F64) -> tuple[float, float]:
     """Write the robust motion of `samples` (M, 6) into `affine`; return residual and support."""
     affine[:] = 0.0
     affine[0, 0] = affine[1, 1] = 1.0
@@ -170,7 +166,7 @@ def _fit(samples: Floats, affine: Floats) -> tuple[float, float]:
 
 
 @njit(cache=True, nogil=True)
-def _weighted_median(values: Floats, weights: Floats) -> float:
+def _weighted_median(values: F64, weights: F64) -> float:
     """The smallest value below which, itself included, lies half of the weight."""
     order = np.argsort(values)
     half, below = 0.5 * np.sum(weights), 0.0
@@ -183,7 +179,7 @@ def _weighted_median(values: Floats, weights: Floats) -> float:
 
 @njit(cache=True, nogil=True)
 def _reweighted_step(
-    samples: Floats, centre_x: float, centre_y: float, radius: float, scale: float, linear: bool, motion: Floats
+    samples: F64, centre_x: float, centre_y: float, radius: float, scale: float, linear: bool, motion: F64
 ) -> None:
     """One iteration: weigh every sample by its misfit to `motion` (2, 3), then solve for a new `motion`."""
     normal, right = np.zeros((3, 3)), np.zeros((3, 2))
@@ -219,7 +215,7 @@ def _reweighted_step(
 
 @njit(cache=True, nogil=True)
 def _agreement(
-    samples: Floats, centre_x: float, centre_y: float, radius: float, scale: float, motion: Floats
+    samples: F64, centre_x: float, centre_y: float, radius: float, scale: float, motion: F64
 ) -> tuple[float, float]:
     """Residual (px, root mean square over the inliers) and support (their share, by round trip) of a motion."""
     total, inlier, squares = 0.0, 0.0, 0.0

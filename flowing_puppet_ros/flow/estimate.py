@@ -12,12 +12,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import U8, Flow
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
 
-type Flow = NDArray[np.float32]
 type FlowPair = tuple[Flow, Flow]
 
 PRESETS = {
@@ -36,7 +35,7 @@ class FlowSettings(Settings):
     max_side: int = setting(640, "longest image side the flow is computed at", unit="px", low=32, high=8192)
 
 
-def as_image(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def as_image(image: U8) -> U8:
     """Return the (H, W) or (H, W, 3) uint8 array that `image` is; InputError when it is no such image."""
     image = np.asarray(image)
     if image.ndim == 3 and image.shape[2] == 1:
@@ -75,7 +74,7 @@ class OpticalFlow:
         self._estimators = tuple(cv2.DISOpticalFlow.create(preset) for _ in range(2))
         self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="backward-flow")
 
-    def prepare(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def prepare(self, image: U8) -> U8:
         """Return `image` (RGB or grey) as the grey working image (h, w) that `between` takes."""
         image = as_image(image)
         size = working_size(image.shape, self.settings.max_side)
@@ -85,7 +84,7 @@ class OpticalFlow:
             image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         return np.ascontiguousarray(image)
 
-    def between(self, previous: NDArray[np.uint8], current: NDArray[np.uint8]) -> FlowPair:
+    def between(self, previous: U8, current: U8) -> FlowPair:
         """Flow (forward, backward) of two prepared grey images, in pixels of the working grid."""
         if previous.shape != current.shape:
             raise InputError(f"flow needs images of one size, these are {previous.shape} and {current.shape}")
@@ -94,15 +93,15 @@ class OpticalFlow:
         backward = self._pool.submit(self._estimate, 1, current, previous)
         return self._estimate(0, previous, current), backward.result()
 
-    def _estimate(self, which: int, source: NDArray[np.uint8], target: NDArray[np.uint8]) -> Flow:
+    def _estimate(self, which: int, source: U8, target: U8) -> Flow:
         flow = np.zeros((*source.shape, 2), np.float32)  # overwritten: no start is taken from it
         return np.asarray(self._estimators[which].calc(source, target, flow), dtype=np.float32)
 
-    def at_working_scale(self, previous: NDArray[np.uint8], current: NDArray[np.uint8]) -> FlowPair:
+    def at_working_scale(self, previous: U8, current: U8) -> FlowPair:
         """Flow (forward, backward) of two images, on the working grid and in its pixels."""
         return self.between(self.prepare(previous), self.prepare(current))
 
-    def __call__(self, previous: NDArray[np.uint8], current: NDArray[np.uint8]) -> FlowPair:
+    def __call__(self, previous: U8, current: U8) -> FlowPair:
         """Flow (forward, backward), each (H, W, 2) float32, on the grid and in the pixels of the two images."""
         if previous.shape[:2] != current.shape[:2]:
             raise InputError(f"flow needs images of one size, these are {previous.shape[:2]} and {current.shape[:2]}")

@@ -14,8 +14,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from flowing_puppet_ros.flow.affine import Floats, RegionMotions, fit_regions
-from flowing_puppet_ros.flow.estimate import Flow
+from flowing_puppet_ros.arrays import F64, U16, Flow
+from flowing_puppet_ros.flow.affine import RegionMotions, fit_regions
 
 
 class PuppetFlow(NamedTuple):
@@ -25,15 +25,15 @@ class PuppetFlow(NamedTuple):
     of the flow; 0 when no part is visible.
     """
 
-    affine: Floats
-    background: Floats
+    affine: F64
+    background: F64
     field: Flow
     explained: float
 
 
 def part_motions(
     labels: NDArray[np.unsignedinteger], parents: tuple[int, ...], forward: Flow, backward: Flow | None = None
-) -> tuple[RegionMotions, Floats]:
+) -> tuple[RegionMotions, F64]:
     """Motions of the parts, label = part + 1 in `labels` (H, W), and the background's motion (2, 3).
 
     `parents` (P) is the part tree (a forest for several people), -1 at roots: a hidden part moves like the mean of
@@ -59,7 +59,7 @@ def part_motions(
     return replace(parts, affine=affine), background
 
 
-def motion_field(labels: NDArray[np.unsignedinteger], affine: Floats, background: Floats) -> Flow:
+def motion_field(labels: NDArray[np.unsignedinteger], affine: F64, background: F64) -> Flow:
     """Displacements (H, W, 2) float32 of the layered motions: label k moves by affine[k - 1], 0 by `background`."""
     return _paint(np.ascontiguousarray(labels, dtype=np.uint16), np.concatenate([background[None], affine]))
 
@@ -94,7 +94,7 @@ def explained_fraction(labels: NDArray[np.unsignedinteger], field: Flow, flow: F
 
 
 @njit(cache=True, nogil=True)
-def _paint(labels: NDArray[np.uint16], motions: Floats) -> Flow:
+def _paint(labels: U16, motions: F64) -> Flow:
     height, width = labels.shape
     field = np.empty((height, width, 2), np.float32)
     for y in range(height):

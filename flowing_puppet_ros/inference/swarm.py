@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-Array = np.ndarray[Any, Any]
+from flowing_puppet_ros.arrays import Array
+
 type Energy = Callable[[Array], Array]
 type Jump = Callable[[Array, np.random.Generator], Array]
 
@@ -22,7 +22,7 @@ FIRST_STEP = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Box:
+class Bounds:
     """Bounds `low` and `high` (D,), and the share `inertia` (D,) of its velocity that is kept (w of Eq. 37)."""
 
     low: Array
@@ -48,7 +48,7 @@ class Swarm:
         """Particles (P,D) of known energies (P,) at the start of a search."""
         return cls(particles.copy(), energy.copy(), particles.copy(), energy.copy())
 
-    def moved(self, particles: Array, energy: Array) -> None:
+    def update(self, particles: Array, energy: Array) -> None:
         """Go to new places; each particle remembers its best."""
         self.particles, self.energy = particles, energy
         better = energy < self.best_energy
@@ -58,7 +58,7 @@ class Swarm:
 def search(
     swarm: Swarm,
     energy: Energy,
-    box: Box,
+    box: Bounds,
     iterations: int,
     rng: np.random.Generator,
     free: Array | None = None,
@@ -96,7 +96,7 @@ def search(
             if jumps.any():
                 proposed = box.inside(jump(swarm.particles[jumps], rng))
                 moved[jumps] = np.where(open_values, proposed, swarm.particles[jumps])
-        swarm.moved(moved, energy(moved))
+        swarm.update(moved, energy(moved))
 
 
 def resampled(swarm: Swarm, temperature: float, rng: np.random.Generator) -> Swarm:

@@ -5,11 +5,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-Array = np.ndarray[Any, Any]
+from flowing_puppet_ros.arrays import Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

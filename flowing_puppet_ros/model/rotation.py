@@ -3,11 +3,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-Array = np.ndarray[Any, Any]
+from flowing_puppet_ros.arrays import Array
 
 
 def exp(r: Array) -> Array:

@@ -9,15 +9,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.model import rotation, weights
 from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
-
-Array = np.ndarray[Any, Any]
 
 POSE_WIDTH = 12  # columns of BodyState.pose; parts with fewer coefficients leave the rest 0
 DEVIATIONS = 3.0  # samples stay within this many standard deviations of every coefficient

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, Bools, Image
 from flowing_puppet_ros.settings import Settings, setting
-
-Images = NDArray[np.uint8]
 
 # A pixel that differs by this many spreads and grey levels counts as changed; more than this share changed: new scene.
 _CHANGED_SPREADS = 6.0
@@ -62,7 +60,7 @@ class Background:
         self.variance = np.zeros((*shape, 3), np.float32)
         self._changed_frames = 0
 
-    def update(self, image: Images, bare: NDArray[np.bool_]) -> None:
+    def update(self, image: Image, bare: Bools) -> None:
         """Learn from `image` (h,w,3) uint8 where `bare` (h,w) is true; another image size starts afresh."""
         self.resize((image.shape[0], image.shape[1]))
         if not self._same_scene(image, bare):
@@ -83,19 +81,19 @@ class Background:
         )
 
     @property
-    def known(self) -> NDArray[np.bool_]:
+    def known(self) -> Bools:
         """Pixels (h,w) that were seen bare often enough."""
         return self.count >= self.settings.min_frames
 
-    def difference(self, image: Images) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def difference(self, image: Image) -> tuple[F32, F32]:
         """Largest channel difference (h,w) in grey levels, and the spread (h,w) of the background in that channel."""
         return _difference(self.mean, self.variance, np.ascontiguousarray(image))
 
-    def shadow(self, image: Images) -> NDArray[np.bool_]:
+    def shadow(self, image: Image) -> Bools:
         """Pixels (h,w) that are darker than the background by much the same factor in all channels."""
         return _shadow(self.mean, np.ascontiguousarray(image))
 
-    def _same_scene(self, image: Images, bare: NDArray[np.bool_]) -> bool:
+    def _same_scene(self, image: Image, bare: Bools) -> bool:
         judged = bare & self.known
         if not judged.any():
             return True

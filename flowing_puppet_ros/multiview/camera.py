@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
-
-Floats = NDArray[np.float64]
 
 _LENS_MODELS = ("plumb_bob", "")
 _RADIUS2 = np.linspace(0.0, 5.0, 5001) ** 2
@@ -27,11 +26,11 @@ class Camera:
     of Brown's lens model; `size` is (width, height) in pixels; `rotation` (3,3), `translation` (3,).
     """
 
-    matrix: Floats
-    distortion: Floats
+    matrix: F64
+    distortion: F64
     size: tuple[int, int]
-    rotation: Floats
-    translation: Floats
+    rotation: F64
+    translation: F64
 
     @classmethod
     def from_info(
@@ -69,7 +68,7 @@ class Camera:
         return cls(matrix, distortion, (int(width), int(height)), turn, _array(translation, "camera translation", (3,)))
 
     @property
-    def centre(self) -> Floats:
+    def centre(self) -> F64:
         """The centre of projection in the world, (3,) metres."""
         return -self.rotation.T @ self.translation
 
@@ -95,11 +94,11 @@ class Camera:
         names = ("matrix", "distortion", "size", "rotation", "translation")
         return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
-    def to_camera(self, points: ArrayLike) -> Floats:
+    def to_camera(self, points: ArrayLike) -> F64:
         """World points (..., 3) in this camera's frame, metres."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
-    def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
+    def project(self, points: ArrayLike) -> tuple[F64, F64]:
         """Pixels (..., 2) and depths (...) in metres of world points (..., 3); NaN pixels for what no lens shows.
 
         That is what lies behind, or beyond `lens_reach`.
@@ -110,16 +109,16 @@ class Camera:
         plane = np.where((plane**2).sum(axis=-1, keepdims=True) <= self.lens_reach, plane, np.nan)
         return self.to_pixels(distort(plane, self.distortion)), depth
 
-    def to_pixels(self, image_plane: Floats) -> Floats:
+    def to_pixels(self, image_plane: F64) -> F64:
         """Pixels (..., 2) of (distorted) points (..., 2) of the image plane at depth 1."""
         return image_plane @ self.matrix[:2, :2].T + self.matrix[:2, 2]
 
-    def undistort(self, pixels: ArrayLike) -> Floats:
+    def undistort(self, pixels: ArrayLike) -> F64:
         """Points (..., 2) of the undistorted image plane at depth 1; NaN where the lens model has no inverse."""
         offset = np.asarray(pixels, np.float64) - self.matrix[:2, 2]
         return _remove_distortion(offset @ np.linalg.inv(self.matrix[:2, :2]).T, self.distortion)
 
-    def rays(self, pixels: ArrayLike) -> Floats:
+    def rays(self, pixels: ArrayLike) -> F64:
         """Unit directions (..., 3) in the world of the rays through pixels (..., 2)."""
         plane = self.undistort(pixels)
         direction = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ self.rotation
@@ -139,7 +138,7 @@ class Camera:
         return replace(self, matrix=matrix, size=(int(size[0]), int(size[1])))
 
 
-def distort(plane: Floats, coefficients: Floats) -> Floats:
+def distort(plane: F64, coefficients: F64) -> F64:
     """Where the lens moves points (..., 2) of the image plane at depth 1 (Brown 1966; k1 k2 p1 p2 k3)."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = plane[..., 0], plane[..., 1]
@@ -154,7 +153,7 @@ def distort(plane: Floats, coefficients: Floats) -> Floats:
     )
 
 
-def _distortion_jacobian(plane: Floats, coefficients: Floats) -> Floats:
+def _distortion_jacobian(plane: F64, coefficients: F64) -> F64:
     """Derivatives (..., 2, 2) of `distort` by the undistorted point."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = plane[..., 0], plane[..., 1]
@@ -168,7 +167,7 @@ def _distortion_jacobian(plane: Floats, coefficients: Floats) -> Floats:
     return jacobian
 
 
-def _remove_distortion(distorted: Floats, coefficients: Floats) -> Floats:
+def _remove_distortion(distorted: F64, coefficients: F64) -> F64:
     """Invert `distort` by Newton's method, started at the distorted point; NaN where it does not converge."""
     if not coefficients.any():
         return distorted
@@ -187,7 +186,7 @@ def _remove_distortion(distorted: Floats, coefficients: Floats) -> Floats:
     return np.where(valid[..., None], plane, np.nan)
 
 
-def _array(values: ArrayLike, name: str, shape: tuple[int]) -> Floats:
+def _array(values: ArrayLike, name: str, shape: tuple[int]) -> F64:
     array = np.asarray(values, np.float64).ravel()
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(f"the {name} is {array.tolist()}; it needs {shape[0]} finite numbers")

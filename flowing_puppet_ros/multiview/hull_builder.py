@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.silhouette import Observation, Silhouette, SilhouetteEstimator, SilhouetteSettings
@@ -21,8 +21,6 @@ from flowing_puppet_ros.multiview.visual_hull import (
     visual_hull,
 )
 
-Floats = NDArray[np.float64]
-
 
 # The parts of a composed settings class must not be slotted: Python cannot merge the layouts of several slotted bases.
 @dataclass(frozen=True)
@@ -31,32 +29,32 @@ class HullBuilderSettings(HullSettings, SilhouetteSettings, TriangulationSetting
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PuppetView:
+class CameraObservation:
     """What one camera contributes to a set: its observed frame, and the joints of the puppet in it.
 
     `joints` (J,2) are pixels of the camera's full image, NaN where unknown; `confidence` (J,) is in [0,1].
     """
 
     observation: Observation
-    joints: Floats
-    confidence: Floats
+    joints: F64
+    confidence: F64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PersonSet:
+class MultiViewPerson:
     """One person in the cameras at one instant, in the world frame of the cameras' extrinsics, metres.
 
     `joints` (J,3) and `confidence` (J,), NaN and 0 where fewer than two views agree; the `silhouettes` of all cameras;
     `masks` (h,w) of those that can be used, fewer than two when `problem` says why in one sentence.
     """
 
-    joints: Floats
-    confidence: Floats
+    joints: F64
+    confidence: F64
     silhouettes: dict[str, Silhouette]
     problem: str = ""
 
     @property
-    def masks(self) -> dict[str, NDArray[np.uint8]]:
+    def masks(self) -> dict[str, U8]:
         """The masks by camera that can be used."""
         return {name: each.mask for name, each in self.silhouettes.items() if not each.problem}
 
@@ -65,8 +63,8 @@ class PersonSet:
 class Hull:
     """Surface `points` (N,3) and outward `normals` (N,3); none when `problem` says why in one sentence."""
 
-    points: Floats
-    normals: Floats
+    points: F64
+    normals: F64
     problem: str = ""
 
 
@@ -99,13 +97,13 @@ class HullBuilder:
         estimator = self._estimators.get(name)
         return float(estimator.background.known.mean()) if estimator and estimator.background.count.size else 0.0
 
-    def observe(
+    def update_background(
         self,
         name: str,
-        image: NDArray[np.uint8],
-        labels: NDArray[np.uint8],
+        image: U8,
+        labels: U8,
         scale: float,
-        person: NDArray[np.uint8] | None = None,
+        person: U8 | None = None,
     ) -> Observation:
         """Learn camera `name`'s background from a frame; see `SilhouetteEstimator.observe` for the arguments.
 
@@ -117,9 +115,9 @@ class HullBuilder:
                 f"the image of camera {name} is {image.shape[1]} x {image.shape[0]}, "
                 f"its camera_info says {camera.size[0]} x {camera.size[1]}"
             )
-        return self._estimator(name).observe(image, labels, scale, person)
+        return self._estimator(name).update_background(image, labels, scale, person)
 
-    def cut(self, views: Mapping[str, PuppetView]) -> PersonSet:
+    def segment(self, views: Mapping[str, CameraObservation]) -> MultiViewPerson:
         """Cut the silhouettes of one set and triangulate its joints.
 
         `views` maps camera names to what they saw at one instant. Raises InputError for a camera without
@@ -128,15 +126,15 @@ class HullBuilder:
         missing = sorted(set(views) - set(self.cameras))
         if missing:
             raise InputError(f"camera {missing[0]} has no calibration; is its camera_info published?")
-        silhouettes = {name: self._estimator(name).cut(view.observation) for name, view in views.items()}
+        silhouettes = {name: self._estimator(name).segment(view.observation) for name, view in views.items()}
         usable = sum(not silhouette.problem for silhouette in silhouettes.values())
         problem = ""
         if usable < MIN_VIEWS:
             reasons = "; ".join(f"{name}: {each.problem}" for name, each in silhouettes.items() if each.problem)
             problem = f"a person needs {MIN_VIEWS} usable silhouettes, got {usable} ({reasons})"
-        return PersonSet(*self._joints(views), silhouettes, problem)
+        return MultiViewPerson(*self._joints(views), silhouettes, problem)
 
-    def carve(self, person: PersonSet) -> Hull:
+    def carve(self, person: MultiViewPerson) -> Hull:
         """Carve the hull of a person; cameras with an unusable mask are left out."""
         empty = np.zeros((0, 3))
         if person.problem:
@@ -153,7 +151,7 @@ class HullBuilder:
     def _estimator(self, name: str) -> SilhouetteEstimator:
         return self._estimators.setdefault(name, SilhouetteEstimator(self.settings))
 
-    def _joints(self, views: Mapping[str, PuppetView]) -> tuple[Floats, Floats]:
+    def _joints(self, views: Mapping[str, CameraObservation]) -> tuple[F64, F64]:
         if len(views) < MIN_VIEWS:
             count = max((len(view.joints) for view in views.values()), default=0)
             return np.full((count, 3), np.nan), np.zeros(count)

@@ -14,16 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 from scipy import ndimage
 
-from flowing_puppet_ros.body.cloud.correspondence import Quadratic
+from flowing_puppet_ros.arrays import F64, I32, I64, U8, Bools
+from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.distance_transform import signed_distance
-
-Floats = NDArray[np.float64]
 
 _SMOOTHING = 1.0  # pixels; turns the outline's pixel steps into directions
 _OUTLINE_STEP = 4  # every so many outline pixels count
@@ -41,14 +39,14 @@ class Outline:
     """
 
     camera: Camera
-    mask: NDArray[np.bool_]
-    distance: Floats
-    slope: Floats
-    points: Floats
-    normals: Floats
+    mask: Bools
+    distance: F64
+    slope: F64
+    points: F64
+    normals: F64
 
     @classmethod
-    def of(cls, camera: Camera, mask: NDArray[np.uint8]) -> Outline:
+    def of(cls, camera: Camera, mask: U8) -> Outline:
         """Prepare a mask (h,w) uint8, positive on the body; InputError when it is empty or full."""
         inside = mask > 0
         if inside.all() or not inside.any():
@@ -66,21 +64,21 @@ class Outline:
         return cls(camera.resized(mask.shape[::-1]), inside, distance, slope, points, normals)
 
 
-def edges_of(faces: NDArray[np.int32]) -> NDArray[np.int64]:
+def mesh_edges(faces: I32) -> I64:
     """The edges (E,2) of a closed triangle mesh (F,3), each once."""
     corners = np.asarray(faces, np.int64)
     pairs = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
-class OutlineTerm:
+class RimTerm:
     """Draws a mesh of fixed faces to outlines; called with the vertices and the kernel's width."""
 
-    def __init__(self, outlines: Sequence[Outline], faces: NDArray[np.int32], edges: NDArray[np.int64]) -> None:
+    def __init__(self, outlines: Sequence[Outline], faces: I32, edges: I64) -> None:
         """Match with `outlines`; `faces` (F,3) are outward and `edges` (E,2) theirs."""
         self._outlines, self._faces, self._edges = outlines, faces, edges
 
-    def __call__(self, vertices: Floats, sigma: float) -> Quadratic:
+    def __call__(self, vertices: F64, sigma: float) -> VertexQuadratic:
         """Match vertices (V,3) and return what draws them; `sigma` is the Geman-McClure kernel's width in metres.
 
         In every view the vertices outside weigh 1 in all if all were, and so do the pieces of the outline; the result
@@ -100,14 +98,16 @@ class OutlineTerm:
         count = len(vertices)
         outer = weight[:, None, None] * direction[:, :, None] * direction[:, None, :]
         vector = (weight * gap)[:, None] * direction
-        return Quadratic(_sums(vertex, outer.reshape(-1, 9), count).reshape(-1, 3, 3), _sums(vertex, vector, count))
+        return VertexQuadratic(
+            _sums(vertex, outer.reshape(-1, 9), count).reshape(-1, 3, 3), _sums(vertex, vector, count)
+        )
 
 
-Term = tuple[NDArray[np.int64], Floats, Floats, Floats]
+Term = tuple[I64, F64, F64, F64]
 """Vertex (N,), direction in the world (N,3) along which it moves the residual, residual (N,) metres, weight (N,)."""
 
 
-def distances_outside(vertices: Floats, outline: Outline) -> tuple[NDArray[np.int64], Floats, Floats]:
+def distances_outside(vertices: F64, outline: Outline) -> tuple[I64, F64, F64]:
     """Which vertices (V,3) the image shows (N,), and how far they lie outside the silhouette.
 
     That is the signed distance (N,) in metres at the vertex's depth, and its direction in the image (N,2).
@@ -122,7 +122,7 @@ def distances_outside(vertices: Floats, outline: Outline) -> tuple[NDArray[np.in
     return seen, distance * depth[seen] / outline.camera.focal, slope
 
 
-def _vertices_outside(vertices: Floats, outline: Outline, sigma: float) -> Term:
+def _vertices_outside(vertices: F64, outline: Outline, sigma: float) -> Term:
     seen, distance, slope = distances_outside(vertices, outline)
     outside = distance > 0
     chosen, gap = seen[outside], distance[outside]
@@ -130,9 +130,7 @@ def _vertices_outside(vertices: Floats, outline: Outline, sigma: float) -> Term:
     return chosen, _world_direction(outline.camera, vertices[chosen], slope[outside]), gap, weight
 
 
-def _outline_to_rim(
-    vertices: Floats, normals: Floats, edges: NDArray[np.int64], outline: Outline, sigma: float
-) -> tuple[Term, Term]:
+def _outline_to_rim(vertices: F64, normals: F64, edges: I64, outline: Outline, sigma: float) -> tuple[Term, Term]:
     """Every piece of the outline with the nearest point of the rim, shared between the ends of the rim's edge.
 
     A squared weighted mean is at most the weighted mean of the squares, with the same slope: so the two ends may be
@@ -202,16 +200,16 @@ def _nearest(points, directions, rim, rim_directions, turn_cost, min_cosine):  #
     return nearest
 
 
-def _world_direction(camera: Camera, points: Floats, direction: Floats) -> Floats:
+def _world_direction(camera: Camera, points: F64, direction: F64) -> F64:
     """How world points (N,3) move, in metres, along image directions (N,2) at their own depth, as gradients (N,3)."""
     local = camera.to_camera(points)
     plane = local[:, :2] / local[:, 2:]
     return direction @ camera.rotation[:2] - (direction * plane).sum(axis=1)[:, None] * camera.rotation[2]
 
 
-def _sums(group: NDArray[np.int64], values: Floats, count: int) -> Floats:
+def _sums(group: I64, values: F64, count: int) -> F64:
     return np.stack([np.bincount(group, column, count) for column in values.T], axis=1)
 
 
-def _kernel(distance: Floats, sigma: float) -> Floats:
+def _kernel(distance: F64, sigma: float) -> F64:
     return (sigma**2 / (sigma**2 + distance**2)) ** 2

@@ -12,14 +12,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import U8, Bools
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.background import Background, BackgroundSettings
-from flowing_puppet_ros.multiview.distance_transform import distance_to
+from flowing_puppet_ros.multiview.distance_transform import distance_transform
 from flowing_puppet_ros.settings import setting
-
-Mask = NDArray[np.uint8]
 
 # Lengths on the body in metres, from a trial on real recordings.
 _SURE_CORE = 0.03  # this far inside the puppet is body
@@ -61,9 +59,9 @@ class Observation:
     `scale` in working pixels per metre on the body.
     """
 
-    image: NDArray[np.uint8]
-    puppet: NDArray[np.bool_]
-    others: NDArray[np.bool_]
+    image: U8
+    puppet: Bools
+    others: Bools
     scale: float
 
 
@@ -71,7 +69,7 @@ class Observation:
 class Silhouette:
     """A mask (h,w) uint8, 255 on the body, at working scale; `problem` is a sentence when it should not be used."""
 
-    mask: Mask
+    mask: U8
     problem: str = ""
 
 
@@ -92,12 +90,12 @@ class SilhouetteEstimator:
         self.background.reset()
         self._areas.clear()
 
-    def observe(
+    def update_background(
         self,
-        image: NDArray[np.uint8],
-        labels: NDArray[np.uint8],
+        image: U8,
+        labels: U8,
         scale: float,
-        person: NDArray[np.uint8] | None = None,
+        person: U8 | None = None,
     ) -> Observation:
         """Shrink `image` (H,W,3) RGB and the part `labels` (H,W), learn the background, return the frame to `cut`.
 
@@ -117,10 +115,10 @@ class SilhouetteEstimator:
         puppet = cv2.resize(person, size, interpolation=cv2.INTER_NEAREST) > 0
         observation = Observation(small, puppet, everybody & ~puppet, scale * factor)
         if everybody.any():
-            self.background.update(small, distance_to(everybody) > _BARE_DISTANCE * observation.scale)
+            self.background.update(small, distance_transform(everybody) > _BARE_DISTANCE * observation.scale)
         return observation
 
-    def cut(self, observation: Observation) -> Silhouette:
+    def segment(self, observation: Observation) -> Silhouette:
         """The silhouette of an observed frame; its `problem` says so when it is empty or much unlike recent ones."""
         if not observation.puppet.any():
             return Silhouette(np.zeros(observation.puppet.shape, np.uint8), "no puppet in the image")
@@ -133,7 +131,7 @@ class SilhouetteEstimator:
         mask[window] = _cleaned(body, sure[window], _SPECK * observation.scale)
         return Silhouette(mask, self._alarm(mask, observation.scale))
 
-    def _seed(self, observation: Observation) -> Mask:
+    def _seed(self, observation: Observation) -> U8:
         """GrabCut's seed (h,w): what puppet and background together say of every pixel."""
         puppet, scale = observation.puppet, observation.scale
         known = self.background.known
@@ -148,11 +146,11 @@ class SilhouetteEstimator:
         seed[known & (levels > _DOUBTFUL[0]) & (ratio > _DOUBTFUL[1])] = cv2.GC_PR_FGD
         seed[other] = cv2.GC_FGD
         seed[same] = cv2.GC_BGD
-        distance = distance_to(puppet)
+        distance = distance_transform(puppet)
         seed[distance > np.where(known, _POSSIBLE_FRINGE, _UNKNOWN_FRINGE) * scale] = cv2.GC_BGD
         # A limb that the puppet has elsewhere still hangs on the body and is no shadow.
         stray = other & ~self.background.shadow(observation.image) & (distance <= _STRAY_REACH * scale)
-        stray &= distance_to(observation.others) > _BARE_DISTANCE * scale
+        stray &= distance_transform(observation.others) > _BARE_DISTANCE * scale
         seed[_connected(stray | puppet, puppet) & stray] = cv2.GC_FGD
         # Where a misplaced part of the puppet shows the bare background, colour decides.
         core = _eroded(puppet, _SURE_CORE * scale)
@@ -160,7 +158,7 @@ class SilhouetteEstimator:
         seed[observation.others] = cv2.GC_BGD
         return seed
 
-    def _alarm(self, mask: Mask, scale: float) -> str:
+    def _alarm(self, mask: U8, scale: float) -> str:
         area = np.count_nonzero(mask) / scale**2
         usual = float(np.median(self._areas)) if len(self._areas) >= _AREA_MIN_HISTORY else area
         self._areas.append(area)
@@ -171,7 +169,7 @@ class SilhouetteEstimator:
         return ""
 
 
-def _check(image: NDArray[np.uint8], labels: NDArray[np.uint8], scale: float) -> None:
+def _check(image: U8, labels: U8, scale: float) -> None:
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
         raise InputError(f"a silhouette needs an RGB image (H, W, 3) of uint8, got {image.shape} of {image.dtype}")
     if labels.shape != image.shape[:2] or labels.dtype != np.uint8:
@@ -182,16 +180,16 @@ def _check(image: NDArray[np.uint8], labels: NDArray[np.uint8], scale: float) ->
         raise InputError(f"the puppet's scale is {scale}; it must be a positive number of pixels per metre")
 
 
-def _disc(radius: float) -> Mask:
+def _disc(radius: float) -> U8:
     reach = max(1, round(radius))
     return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
 
 
-def _eroded(mask: NDArray[np.bool_], radius: float) -> NDArray[np.bool_]:
-    return distance_to(~mask) > radius
+def _eroded(mask: Bools, radius: float) -> Bools:
+    return distance_transform(~mask) > radius
 
 
-def _crop(puppet: NDArray[np.bool_], margin: float) -> tuple[slice, slice]:
+def _crop(puppet: Bools, margin: float) -> tuple[slice, slice]:
     """Rows and columns of the puppet's box with a margin, within the image."""
     slices = []
     for axis in (1, 0):
@@ -201,7 +199,7 @@ def _crop(puppet: NDArray[np.bool_], margin: float) -> tuple[slice, slice]:
     return slices[0], slices[1]
 
 
-def _grab_cut(image: NDArray[np.uint8], seed: Mask, rounds: int) -> NDArray[np.bool_]:
+def _grab_cut(image: U8, seed: U8, rounds: int) -> Bools:
     """GrabCut with fixed randomness; a seed that leaves nothing to decide is the answer itself."""
     body = (seed == cv2.GC_FGD) | (seed == cv2.GC_PR_FGD)
     if body.all() or not body.any():
@@ -214,7 +212,7 @@ def _grab_cut(image: NDArray[np.uint8], seed: Mask, rounds: int) -> NDArray[np.b
     return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
 
 
-def _connected(mask: NDArray[np.bool_], start: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _connected(mask: Bools, start: Bools) -> Bools:
     """The components (8 neighbours) of `mask` that meet `start`."""
     count, components = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
     kept = np.zeros(count, bool)
@@ -223,7 +221,7 @@ def _connected(mask: NDArray[np.bool_], start: NDArray[np.bool_]) -> NDArray[np.
     return kept[components]
 
 
-def _cleaned(body: NDArray[np.bool_], sure: NDArray[np.bool_], speck: float) -> Mask:
+def _cleaned(body: Bools, sure: Bools, speck: float) -> U8:
     """Open away specks and threads, and keep only what meets sure body; 255 on the body."""
     opened = cv2.morphologyEx(body.astype(np.uint8), cv2.MORPH_OPEN, _disc(speck))
     return np.where(_connected(opened > 0, sure), 255, 0).astype(np.uint8)

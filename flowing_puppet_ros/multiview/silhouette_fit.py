@@ -12,21 +12,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8
 from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.body.fit.fitter import BodyFit
-from flowing_puppet_ros.body.fit.initialisation import body_from_joints, joint_targets, turned_around
-from flowing_puppet_ros.body.refine.gauss_newton import Refiner, RefineWeights
+from flowing_puppet_ros.body.fit.initialisation import body_from_joints, flip_heading, joint_targets
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.multiview.rim_term import Outline, OutlineTerm, edges_of
-from flowing_puppet_ros.multiview.silhouette_overlap import outline_gap, overlap, rendered, shares_inside
+from flowing_puppet_ros.multiview.rim_term import Outline, RimTerm, mesh_edges
+from flowing_puppet_ros.multiview.silhouette_overlap import outline_gap, render_mask, shares_inside, silhouette_iou
 from flowing_puppet_ros.settings import Settings, setting
-
-Floats = NDArray[np.float64]
 
 MIN_VIEWS = 2
 # A view whose overlap is below this share of the median view's shows somebody else, or a mask or camera is wrong.
@@ -53,11 +51,11 @@ class SilhouetteFitterSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Tried:
+class _Candidate:
     """A body and what it overlaps with: `views` are the outlines that were drawn to, `overlap` their mean, 0 to 1."""
 
     state: BodyState
-    vertices: Floats
+    vertices: F64
     views: tuple[int, ...]
     overlap: float
 
@@ -69,13 +67,13 @@ class SilhouetteFitter:
         """Prepare the Gauss-Newton for `model`."""
         self.model = model
         self.settings = settings or SilhouetteFitterSettings()
-        self._refiner = Refiner(model)
-        self._edges = edges_of(model.faces)
+        self._refiner = GaussNewton(model)
+        self._edges = mesh_edges(model.faces)
         self._weights = replace(_WEIGHTS, iterations=self.settings.outline_steps)
 
     def fit(
         self,
-        views: Sequence[tuple[Camera, NDArray[np.uint8]]],
+        views: Sequence[tuple[Camera, U8]],
         initial: Mapping[str, tuple[float, float, float, float]],
         before: BodyState | None = None,
     ) -> BodyFit:
@@ -105,7 +103,7 @@ class SilhouetteFitter:
         outlines: Sequence[Outline],
         initial: Mapping[str, tuple[float, float, float, float]],
         before: BodyState | None,
-    ) -> _Tried:
+    ) -> _Candidate:
         none = JointTargets.none(self.model)
         try:
             targets = joint_targets(self.model, initial)
@@ -119,24 +117,26 @@ class SilhouetteFitter:
         best = self._without_odd_views(outlines, self._finish(start, outlines, targets))
         if best.overlap < self.settings.least_overlap:
             seen = [outlines[view] for view in best.views]
-            others = [self._finish(turned_around(self.model, start), seen, self._other_side(targets))]
+            others = [self._finish(flip_heading(self.model, start), seen, self._other_side(targets))]
             if before is not None:
                 others.append(self._finish(before, seen, none))
             best = max(best, *(replace(other, views=best.views) for other in others), key=lambda tried: tried.overlap)
         return best
 
-    def _finish(self, start: BodyState, outlines: Sequence[Outline], targets: JointTargets) -> _Tried:
-        term = OutlineTerm(outlines, self.model.faces, self._edges)
+    def _finish(self, start: BodyState, outlines: Sequence[Outline], targets: JointTargets) -> _Candidate:
+        term = RimTerm(outlines, self.model.faces, self._edges)
         believed = targets.scaled(self.settings.outline_joints)
         state = self._refiner.run(start, None, believed, self._weights, [term])
         vertices = self.model.vertices(state)
-        return _Tried(state, vertices, tuple(range(len(outlines))), float(self._overlaps(vertices, outlines).mean()))
+        return _Candidate(
+            state, vertices, tuple(range(len(outlines))), float(self._overlaps(vertices, outlines).mean())
+        )
 
-    def _overlaps(self, vertices: Floats, outlines: Sequence[Outline]) -> Floats:
+    def _overlaps(self, vertices: F64, outlines: Sequence[Outline]) -> F64:
         faces = self.model.faces
-        return np.array([overlap(rendered(each.camera, vertices, faces), each.mask) for each in outlines])
+        return np.array([silhouette_iou(render_mask(each.camera, vertices, faces), each.mask) for each in outlines])
 
-    def _without_odd_views(self, outlines: Sequence[Outline], tried: _Tried) -> _Tried:
+    def _without_odd_views(self, outlines: Sequence[Outline], tried: _Candidate) -> _Candidate:
         """Fit once more to the views that agree, when others overlap much less than the median of them all."""
         overlaps = self._overlaps(tried.vertices, outlines)
         agree = tuple(np.flatnonzero(overlaps >= _ODD_VIEW * np.median(overlaps)).tolist())
@@ -152,11 +152,11 @@ class SilhouetteFitter:
         other = [names.index(_mirrored(name)) for name in names]
         return JointTargets(targets.points[other], targets.weight[other])
 
-    def _result(self, best: _Tried, outlines: Sequence[Outline]) -> BodyFit:
+    def _result(self, best: _Candidate, outlines: Sequence[Outline]) -> BodyFit:
         seen, faces = [outlines[view] for view in best.views], self.model.faces
         middle = best.vertices.mean(axis=0)
         gaps = [
-            outline_gap(rendered(each.camera, best.vertices, faces), each, float(each.camera.to_camera(middle)[2]))
+            outline_gap(render_mask(each.camera, best.vertices, faces), each, float(each.camera.to_camera(middle)[2]))
             for each in seen
         ]
         gap, energy = np.mean(gaps, axis=0)

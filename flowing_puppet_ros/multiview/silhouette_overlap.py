@@ -7,16 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, I32, Bools
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.distance_transform import signed_distance
 from flowing_puppet_ros.multiview.rim_term import Outline, distances_outside
 
-Floats = NDArray[np.float64]
 
-
-def rendered(camera: Camera, vertices: Floats, faces: NDArray[np.int32]) -> NDArray[np.bool_]:
+def render_mask(camera: Camera, vertices: F64, faces: I32) -> Bools:
     """The pixels (h,w) of `camera` whose centres the mesh, vertices (V,3) in metres and faces (F,3), covers.
 
     Faces with a corner that no lens shows are left out.
@@ -50,13 +48,13 @@ def _fill(mask, pixels, faces):  # type: ignore[no-untyped-def]  # pragma: no co
                 mask[y, x] = True
 
 
-def overlap(first: NDArray[np.bool_], second: NDArray[np.bool_]) -> float:
+def silhouette_iou(first: Bools, second: Bools) -> float:
     """Intersection over union of two masks (h,w), 0 to 1; 0 when both are empty."""
     union = np.count_nonzero(first | second)
     return np.count_nonzero(first & second) / union if union else 0.0
 
 
-def outline_gap(drawn: NDArray[np.bool_], outline: Outline, depth: float) -> tuple[float, float]:
+def outline_gap(drawn: Bools, outline: Outline, depth: float) -> tuple[float, float]:
     """Mean distance and mean squared distance between the outlines of a rendered mask (h,w) and a seen one, both ways.
 
     In metres at `depth` metres from the camera. NaN when either outline is nowhere in the image.
@@ -77,7 +75,7 @@ def outline_gap(drawn: NDArray[np.bool_], outline: Outline, depth: float) -> tup
     )
 
 
-def shares_inside(vertices: Floats, outlines: Sequence[Outline], sigma: float) -> Floats:
+def shares_inside(vertices: F64, outlines: Sequence[Outline], sigma: float) -> F64:
     """How much of each vertex (V,) lies inside the silhouettes, 0 to 1: the mean over the views that show it.
 
     Outside it is the Geman-McClure weight of the distance at `sigma` metres; 0 where no view shows the vertex.

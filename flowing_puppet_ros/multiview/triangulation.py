@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from flowing_puppet_ros.arrays import F64, Bools
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.settings import Settings, setting
-
-Floats = NDArray[np.float64]
 
 _REFINEMENTS = 8
 
@@ -37,7 +36,7 @@ def triangulate(
     points: ArrayLike,
     confidence: ArrayLike,
     settings: TriangulationSettings | None = None,
-) -> tuple[Floats, Floats]:
+) -> tuple[F64, F64]:
     """Place joints seen by several cameras.
 
     `points` (C,J,2) pixels, NaN where unseen; `confidence` (C,J) in [0,1]. Returns world points (J,3) in metres and
@@ -68,7 +67,7 @@ def triangulate(
     return result, np.where(placed, kept * kept / np.maximum(count * spent, 1e-12), 0.0)
 
 
-def _checked(cameras: int, points: ArrayLike, confidence: ArrayLike) -> tuple[Floats, Floats]:
+def _checked(cameras: int, points: ArrayLike, confidence: ArrayLike) -> tuple[F64, F64]:
     pixels, weights = np.asarray(points, np.float64), np.asarray(confidence, np.float64)
     if cameras < 2:
         raise InputError(f"triangulation needs at least 2 cameras, got {cameras}")
@@ -80,9 +79,7 @@ def _checked(cameras: int, points: ArrayLike, confidence: ArrayLike) -> tuple[Fl
     return pixels, np.clip(np.nan_to_num(weights), 0.0, 1.0)
 
 
-def _pair_proposals(
-    cameras: Sequence[Camera], plane: Floats, known: NDArray[np.bool_], settings: TriangulationSettings
-) -> Floats:
+def _pair_proposals(cameras: Sequence[Camera], plane: F64, known: Bools, settings: TriangulationSettings) -> F64:
     """Midpoints (pairs, J, 3) of the shortest segments between the rays of every two views; NaN where unusable."""
     ones = np.ones((*plane.shape[:-1], 1))
     rotation = np.stack([camera.rotation for camera in cameras])
@@ -104,7 +101,7 @@ def _pair_proposals(
     return np.stack(proposals)
 
 
-def _errors(cameras: Sequence[Camera], plane: Floats, points: Floats) -> tuple[Floats, Floats, Floats]:
+def _errors(cameras: Sequence[Camera], plane: F64, points: F64) -> tuple[F64, F64, F64]:
     """Distances (C,J) and residuals (C,J,2) in metres at the points' depth, image plane (C,J,2); NaN when behind."""
     local = np.stack([camera.to_camera(points) for camera in cameras])
     depth = np.where(local[..., 2:] > 0, local[..., 2:], np.nan)
@@ -113,16 +110,14 @@ def _errors(cameras: Sequence[Camera], plane: Floats, points: Floats) -> tuple[F
     return np.linalg.norm(residual, axis=-1), residual, seen
 
 
-def _cost(cameras: Sequence[Camera], plane: Floats, weights: Floats, points: Floats, agreement: float) -> Floats:
+def _cost(cameras: Sequence[Camera], plane: F64, weights: F64, points: F64, agreement: float) -> F64:
     """Truncated quadratic cost (J,) of points (J,3) over the views; infinite for a point that is NaN."""
     error = np.nan_to_num(_errors(cameras, plane, points)[0], nan=np.inf)
     cost = (weights * np.minimum((error / agreement) ** 2, 1.0)).sum(axis=0)
     return np.where(np.isfinite(points).all(axis=-1), cost, np.inf)
 
 
-def _gauss_newton_step(
-    cameras: Sequence[Camera], plane: Floats, weights: Floats, points: Floats, agreement: float
-) -> Floats:
+def _gauss_newton_step(cameras: Sequence[Camera], plane: F64, weights: F64, points: F64, agreement: float) -> F64:
     """One step (J,3) down the Geman-McClure cost of the reprojection errors, the depth of each view held."""
     error, residual, seen = _errors(cameras, plane, points)
     scale = 0.5 * agreement

@@ -13,15 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from flowing_puppet_ros.arrays import F32, F64, U8, Bools
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.distance_transform import signed_distance
 from flowing_puppet_ros.settings import Settings, setting
-
-Floats = NDArray[np.float64]
 
 MIN_VIEWS = 2
 _MAX_VOXELS = 40_000_000
@@ -44,10 +43,10 @@ class HullSettings(Settings):
 
 def visual_hull(
     cameras: Sequence[Camera],
-    masks: Sequence[NDArray[np.uint8]],
+    masks: Sequence[U8],
     bounds: ArrayLike,
     settings: HullSettings | None = None,
-) -> tuple[Floats, Floats]:
+) -> tuple[F64, F64]:
     """Carve the hull of `masks` within `bounds` and return its largest component's surface.
 
     `masks` are uint8 (h,w), positive on the body, of any size: each camera is resized to its mask. `bounds` (2,3) are
@@ -59,7 +58,7 @@ def visual_hull(
     settings = settings or HullSettings()
     corners = _checked_bounds(bounds, settings.voxel)
     views = [
-        _View.of(camera, mask)
+        _SignedSilhouette.of(camera, mask)
         for camera, mask in zip(cameras, _checked_masks(cameras, masks), strict=True)
         if mask.any()
     ]
@@ -72,7 +71,7 @@ def visual_hull(
     return _surface(field, body, corners[0], settings)
 
 
-def bounds_of_joints(joints: ArrayLike, margin: float) -> Floats | None:
+def bounds_of_joints(joints: ArrayLike, margin: float) -> F64 | None:
     """The box (2,3) with `margin` metres about `joints` (J,3); None when one is NaN or they are no one body's."""
     points = np.asarray(joints, np.float64)
     if len(points) == 0 or not np.isfinite(points).all():
@@ -82,7 +81,7 @@ def bounds_of_joints(joints: ArrayLike, margin: float) -> Floats | None:
     return np.stack([points.min(axis=0) - margin, points.max(axis=0) + margin])
 
 
-def bounds_of_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]], margin: float) -> Floats:
+def bounds_of_masks(cameras: Sequence[Camera], masks: Sequence[U8], margin: float) -> F64:
     """A cube (2,3) that holds the body when no joint is known.
 
     It is centred where the rays through the masks' middles pass closest, and spans the largest mask at that depth.
@@ -110,18 +109,18 @@ def bounds_of_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _View:
+class _SignedSilhouette:
     """A camera at its mask's size and the mask's signed distance (h,w) in pixels, positive outside."""
 
     camera: Camera
-    distance: NDArray[np.float32]
+    distance: F32
 
     @classmethod
-    def of(cls, camera: Camera, mask: NDArray[np.uint8]) -> _View:
+    def of(cls, camera: Camera, mask: U8) -> _SignedSilhouette:
         return cls(camera.resized(mask.shape[::-1]), signed_distance(mask).astype(np.float32))
 
 
-def _distance_field(views: list[_View], corners: Floats, settings: HullSettings) -> NDArray[np.float32]:
+def _distance_field(views: list[_SignedSilhouette], corners: F64, settings: HullSettings) -> F32:
     """The largest signed distance (X,Y,Z) over the cameras in metres, cut off at a few voxels; large where unseen."""
     shape = np.maximum(np.ceil((corners[1] - corners[0]) / settings.voxel).astype(int) + 1, 2)
     band = _BAND * settings.voxel + abs(settings.tolerance)
@@ -172,7 +171,7 @@ def _carve(field, seen, origin, voxel, band, distance, matrix, lens, reach, rota
                 seen[i, j, k] += 1
 
 
-def _largest_component(body: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+def _largest_component(body: Bools) -> Bools | None:
     labels, count = ndimage.label(body)
     if count == 0:
         return None
@@ -181,9 +180,7 @@ def _largest_component(body: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     return labels == int(sizes.argmax())
 
 
-def _surface(
-    field: NDArray[np.float32], body: NDArray[np.bool_], origin: Floats, settings: HullSettings
-) -> tuple[Floats, Floats]:
+def _surface(field: F32, body: Bools, origin: F64, settings: HullSettings) -> tuple[F64, F64]:
     """Points on the smoothed field's level set near the body's outer voxels, and the field's directions there."""
     box = ndimage.find_objects(body.astype(np.uint8))[0]
     low = np.array([max(0, side.start - _PADDING) for side in box])
@@ -203,7 +200,7 @@ def _surface(
     return points, normals
 
 
-def _checked_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]]) -> Sequence[NDArray[np.uint8]]:
+def _checked_masks(cameras: Sequence[Camera], masks: Sequence[U8]) -> Sequence[U8]:
     if len(cameras) != len(masks):
         raise InputError(f"a visual hull needs one mask a camera, got {len(masks)} for {len(cameras)} cameras")
     for index, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
@@ -216,7 +213,7 @@ def _checked_masks(cameras: Sequence[Camera], masks: Sequence[NDArray[np.uint8]]
     return masks
 
 
-def _checked_bounds(bounds: ArrayLike, voxel: float) -> Floats:
+def _checked_bounds(bounds: ArrayLike, voxel: float) -> F64:
     corners = np.asarray(bounds, np.float64)
     if corners.shape != (2, 3) or not np.isfinite(corners).all() or not (corners[0] < corners[1]).all():
         raise InputError(f"the bounds are {corners.tolist()}; they need a finite low and high corner")
@@ -225,6 +222,6 @@ def _checked_bounds(bounds: ArrayLike, voxel: float) -> Floats:
     return corners
 
 
-def _text(corners: Floats) -> str:
+def _text(corners: F64) -> str:
     size = corners[1] - corners[0]
     return f"the box of {size[0]:.2f} x {size[1]:.2f} x {size[2]:.2f} m"

@@ -18,7 +18,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.node.diagnostics import Condition, Diagnostics
+from flowing_puppet_ros.node.diagnostics import Diagnostics, NodeStatus
 from flowing_puppet_ros.node.factory import RosMessageFactory
 from flowing_puppet_ros.node.parameters import changed, declare, with_floats
 from flowing_puppet_ros.node.session import Session
@@ -125,7 +125,7 @@ class ComponentNode[C: Component](LifecycleNode):
 
     def _give_up(self, problem: str) -> None:
         self.problem = problem
-        self._diagnostics.complained(problem)
+        self._diagnostics.warned(problem)
         if not self._own.autostart:
             self.get_logger().error(f"the node cannot work: {problem}")
         if self.session is not None:
@@ -172,8 +172,8 @@ class ComponentNode[C: Component](LifecycleNode):
         if not different:
             return
         component, settings = self.session.component, self._settings
-        if different <= component.adoptable:
-            self.session.worker.call(lambda: component.adopt(settings))
+        if different <= component.hot_settings:
+            self.session.worker.call(lambda: component.reconfigure(settings))
         else:
             self._renew(", ".join(sorted(different)))
 
@@ -188,11 +188,11 @@ class ComponentNode[C: Component](LifecycleNode):
     def _report(self) -> None:
         now = self._steady.now()
         seconds, self._reported = (now - self._reported).nanoseconds * 1e-9, now
-        condition = Condition(self.state, self.problem)
+        condition = NodeStatus(self.state, self.problem)
         if (session := self.session) is not None:
             publishers = {topic: self.count_publishers(topic) for topic in session.topics}
             counters, dropped = dict(session.component.counters), dict(session.worker.dropped)
-            condition = Condition(self.state, self.problem, counters, dropped, publishers)
+            condition = NodeStatus(self.state, self.problem, counters, dropped, publishers)
         report = self._diagnostics.report(self.get_clock().now().to_msg(), max(seconds, 1e-3), condition)
         self._publisher.publish(report)
 

@@ -18,7 +18,7 @@ SILENCE = 5.0
 
 
 @dataclass(frozen=True, slots=True)
-class Condition:
+class NodeStatus:
     """How a node is when it reports.
 
     `state` is that of the lifecycle, `problem` why the node could not be configured, `counters` are the component's,
@@ -56,7 +56,7 @@ class Diagnostics:
         self._last_input = time.monotonic()
         self._ever = False
 
-    def waits(self) -> None:
+    def reset_silence(self) -> None:
         """Note that inputs may come from now on."""
         self._last_input, self._ever, self.people = time.monotonic(), False, None
 
@@ -70,7 +70,7 @@ class Diagnostics:
         with self._lock:
             self._passed[topic] += 1
 
-    def took(self, seconds: float) -> None:
+    def record_latency(self, seconds: float) -> None:
         """Note the age of an input, by its stamp, when its results went out."""
         with self._lock:
             self._latencies.append(seconds)
@@ -81,12 +81,12 @@ class Diagnostics:
             self._failures += 1
             self._last_error = time.monotonic(), sentence
 
-    def complained(self, sentence: str) -> None:
+    def warned(self, sentence: str) -> None:
         """Note what was wrong with an input, a parameter or the set-up."""
         with self._lock:
             self._last_error = time.monotonic(), sentence
 
-    def report(self, stamp: Any, seconds: float, now: Condition) -> Any:
+    def report(self, stamp: Any, seconds: float, now: NodeStatus) -> Any:
         """Return the DiagnosticArray of the `seconds` since the last report."""
         with self._lock:
             passed, self._passed = self._passed, Counter(dict.fromkeys(self._passed, 0))

@@ -9,7 +9,8 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+
+from flowing_puppet_ros.arrays import Array
 
 # Element type of a sequence field -> type code of the array.array that rclpy keeps it in.
 _TYPE_CODES = {
@@ -77,7 +78,7 @@ def _converted(field: str, value: Any) -> Any:
 def _sequence(code: str, value: Any) -> array.array[Any]:
     if isinstance(value, array.array) and value.typecode == code:
         return value
-    numbers: NDArray[Any] = np.ascontiguousarray(value, np.dtype(code)).reshape(-1)
+    numbers: Array = np.ascontiguousarray(value, np.dtype(code)).reshape(-1)
     made = array.array(code)
     made.frombytes(memoryview(numbers).cast("B"))
     return made

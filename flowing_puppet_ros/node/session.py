@@ -83,7 +83,7 @@ class Session[C: Component]:
 
     def activate(self) -> None:
         """Open the inputs."""
-        self._diagnostics.waits()
+        self._diagnostics.reset_silence()
         self.active = True
         for port in self.component.inputs:
             self._subscribe(port, message_type(port.type), port.name)
@@ -192,7 +192,7 @@ class Session[C: Component]:
         )
 
     def _complain(self, sentence: str) -> None:
-        self._diagnostics.complained(sentence)
+        self._diagnostics.warned(sentence)
         self._node.get_logger().warning(sentence)
 
     def _complain_once(self, sentence: str) -> None:
@@ -209,10 +209,10 @@ class Session[C: Component]:
         if not self.active:
             return
         for name, optional in self._optional.items():
-            self.component.expects(name, self._node.count_publishers(optional) > 0)
+            self.component.set_expected(name, self._node.count_publishers(optional) > 0)
         for lazy in self._lazy:
             listened = any(publisher.get_subscription_count() for publisher, _ in self._outputs.get(lazy.name, []))
-            self.component.wants(lazy.name, listened)
+            self.component.set_subscribed(lazy.name, listened)
         if hasattr(message, "header"):
             self._look_at_stamp(topic, header_ns(message.header))
         self.publish(self.component.handle(port, message))
@@ -255,7 +255,7 @@ class Session[C: Component]:
             self._diagnostics.people = len(getattr(message, _PEOPLE[port.name]))
         if hasattr(message, "header"):
             age = self._node.get_clock().now().nanoseconds - header_ns(message.header)
-            self._diagnostics.took(age * 1e-9)
+            self._diagnostics.record_latency(age * 1e-9)
 
     def _failed(self, error: Exception) -> None:
         if not self.active or not self._node.context.ok():

@@ -22,13 +22,13 @@ from flowing_puppet_ros.stream.messages.message_types import MessageFactory
 Output = list[tuple[str, Any]]
 """Names of output ports, or of a person's topic of one (`Port.of`), each with a message; None closes such a topic."""
 _ID = "{id}"
-MOST_WARNINGS = 100
+MAX_WARNINGS = 100
 """Different sentences that a component logs in its life; what can be wrong with hostile input has no end."""
 
 COMPRESSED, COMPRESSED_DEPTH = "compressed", "compressedDepth"  # transports of images
 
 
-def untransported(topic: str) -> str:
+def base_topic(topic: str) -> str:
     """Return the topic of an image that travels on `topic`: without the word of a transport, where there is one."""
     for transport in (COMPRESSED, COMPRESSED_DEPTH):
         topic = topic.removesuffix(f"/{transport}")
@@ -85,7 +85,7 @@ class Component:
     settings_type: ClassVar[type[Settings]]
     fixed: ClassVar[frozenset[str]] = frozenset()
     """Settings that stay as they were when the node was started."""
-    adoptable: ClassVar[frozenset[str]] = frozenset()
+    hot_settings: ClassVar[frozenset[str]] = frozenset()
     """Settings that `adopt` changes; a change of any other needs a new component."""
     background: Executor | None = None
     """Where a live node lets slow work run beside the messages; None: all work is done at once, as in a replay."""
@@ -121,15 +121,15 @@ class Component:
     def reset(self) -> None:
         """Forget the past: the next message starts a new recording."""
 
-    def adopt(self, settings: Settings) -> None:
+    def reconfigure(self, settings: Settings) -> None:
         """Go on with settings that differ from the present ones in `adoptable` ones only."""
         self.settings = settings
 
-    def expects(self, port: str, expected: bool) -> None:
+    def set_expected(self, port: str, expected: bool) -> None:
         """Say whether anybody publishes on an optional input, so that the component knows what to wait for."""
         self._switch(self._expected, self.inputs, port, expected)
 
-    def wants(self, port: str, wanted: bool) -> None:
+    def set_subscribed(self, port: str, wanted: bool) -> None:
         """Say whether anybody listens to a lazy output."""
         self._switch(self._wanted, self.outputs, port, wanted)
 
@@ -162,7 +162,7 @@ class Component:
     def _warn(self, sentence: str) -> None:
         """Log `sentence` once in the component's life; sentences that differ in their numbers only are the same."""
         reason = re.sub(r"[0-9.]+", "#", sentence)
-        if reason not in self._warned and len(self._warned) < MOST_WARNINGS:
+        if reason not in self._warned and len(self._warned) < MAX_WARNINGS:
             self._warned.add(reason)
             self.warnings.append(sentence)
 

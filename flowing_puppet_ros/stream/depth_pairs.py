@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
-from flowing_puppet_ros.stream.stamp_buffer import Line, Shelf
+from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 
 
 class DepthPairs:
@@ -18,8 +18,8 @@ class DepthPairs:
 
     def __init__(self) -> None:
         """Start empty."""
-        self._images = Line()
-        self._infos = Shelf()
+        self._images = PendingQueue()
+        self._infos = StampBuffer()
         self._newest: Any = None
 
     def reset(self) -> None:
@@ -48,6 +48,6 @@ class DepthPairs:
             if info is None and len(self._images.waiting) < 2 and not final:
                 break
             self._images.pop()
-            self._infos.forget_until(stamp)
+            self._infos.drop_until(stamp)
             pairs.append((image, info or self._newest))
         return pairs

@@ -9,7 +9,7 @@ from typing import Any
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 
 
-class Shelf:
+class StampBuffer:
     """Messages of one input by their stamp, the newest `depth` of them."""
 
     def __init__(self, depth: int = 60) -> None:
@@ -28,7 +28,7 @@ class Shelf:
         """Return the item of exactly this stamp, or None."""
         return self._items.get(stamp)
 
-    def forget_until(self, stamp: int) -> int:
+    def drop_until(self, stamp: int) -> int:
         """Drop the items up to and with `stamp` and return how many there were."""
         old = [key for key in self._items if key <= stamp]
         for key in old:
@@ -40,7 +40,7 @@ class Shelf:
         self._items.clear()
 
 
-class Line:
+class PendingQueue:
     """Items of the leading input in the order they came; the last one that left tells what is late."""
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class Line:
         self.left = stamp
         return stamp, item
 
-    def too_late(self, stamp: int) -> bool:
+    def is_late(self, stamp: int) -> bool:
         """Whether a partner of this stamp comes after its leading item has left (and is no restart)."""
         return self.left is not None and 0 <= self.left - stamp < BACKWARD_JUMP_NS
 

@@ -43,7 +43,7 @@ class _Queue:
         return index >= 0 and abs(self.stamps[index] - stamp) <= slop
 
 
-class Pairing:
+class TimeSynchronizer:
     """Makes sets of one item an input.
 
     The first name leads: each of its items is joined with the nearest item of every other input, if all lie within

@@ -22,7 +22,7 @@ TO_OPTICAL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 def fitter(**settings: Any) -> BodyFitterComponent:
     fast = {"local_iterations": 1, "local_particles": 6, "refine_iterations": 6, "cloud_points": 2000}
     component = BodyFitterComponent(BodyFitterSettings(**{**fast, **settings}), FACTORY)
-    component.expects("initial", True)
+    component.set_expected("initial", True)
     return component
 
 
@@ -103,8 +103,8 @@ def test_clouds_of_optical_frames_are_fitted_upright(inputs: dict[str, list[Any]
 
 def test_each_body_of_the_start_is_fitted_and_a_lost_one_is_deleted(inputs: dict[str, list[Any]]) -> None:
     component = fitter()
-    component.wants("body_meshes", True)
-    component.wants("body_vertices", True)
+    component.set_subscribed("body_meshes", True)
+    component.set_subscribed("body_vertices", True)
     hull, joints = inputs["/hull"][1], inputs["/hull/joints"][1]
     points, _ = decode_cloud(hull)
     header = make_header(FACTORY, stamp_ns(hull), "world")

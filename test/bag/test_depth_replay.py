@@ -112,7 +112,7 @@ def test_a_recorded_depth_camera_gives_the_bodies_that_it_gives_live(encoding: s
         found = list(out.messages(["/rig/depth/bodies"]))
         assert out.details["/rig/depth/camera_info"].count == 2, "a viewer needs the calibration"
     live = BodyFitterComponent(BodyFitterSettings(**FAST), FACTORY)  # type: ignore[arg-type]
-    live.expects("initial", True)
+    live.set_expected("initial", True)
     ports = {f"/rig/depth/{name}": "depth"}
     inputs = [(ports.get(topic, topic.rpartition("/")[2]), message) for topic, _, message in stream]
     made = [made for port, message in inputs for made in live.handle(port, message)] + live.flush()

@@ -6,12 +6,12 @@ import pytest
 from scipy.spatial import cKDTree
 
 from benchmarks import plain_search
-from flowing_puppet_ros.body.fit.initialisation import sampled_bodies
+from flowing_puppet_ros.body.fit.initialisation import sample_bodies
 from flowing_puppet_ros.body.search import energy, levenberg
-from flowing_puppet_ros.body.search.dpmp import Search, SearchWeights
-from flowing_puppet_ros.body.search.energy import JointTargets, Judged
+from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
+from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles
 from flowing_puppet_ros.body.search.part_points import PartPoints, part_points
-from flowing_puppet_ros.body.search.particles import Particles, particles_of
+from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.schedule import four_stages
 from flowing_puppet_ros.evaluate.body.synthetic_scans import surface_samples
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
@@ -40,8 +40,8 @@ def grid(model: StitchedPuppet) -> CloudGrid:
 
 @pytest.fixture
 def start(model: StitchedPuppet, grid: CloudGrid) -> list[Particles]:
-    bodies = sampled_bodies(model, grid.points.mean(axis=0), PARTICLES, np.random.default_rng(2))
-    return particles_of(model, bodies)
+    bodies = sample_bodies(model, grid.points.mean(axis=0), PARTICLES, np.random.default_rng(2))
+    return states_to_particles(model, bodies)
 
 
 def _targets(model: StitchedPuppet) -> JointTargets:
@@ -64,7 +64,7 @@ def test_moves_are_the_same(
 ) -> None:
     targets, cloud = _targets(model), plain_search.PlainCloud.of_grid(grid)
     for part in (0, 1, 4, 15):
-        fast = levenberg.improve(points[part], start[part], grid, targets, 3, 60)
+        fast = levenberg.levenberg_marquardt(points[part], start[part], grid, targets, 3, 60)
         slow = plain_search.improve(points[part], start[part], cloud, targets, 3, 60)
         assert np.abs(fast.center - start[part].center).max() > 0.01
         for name in ("center", "rotation", "pose"):
@@ -75,10 +75,10 @@ def test_costs_are_the_same(
     model: StitchedPuppet, points: tuple[PartPoints, ...], grid: CloudGrid, start: list[Particles]
 ) -> None:
     targets = _targets(model)
-    fast = [Judged.judge(p, group, grid, targets) for p, group in zip(points, start, strict=True)]
+    fast = [ScoredParticles.judge(p, group, grid, targets) for p, group in zip(points, start, strict=True)]
     cloud = plain_search.PlainCloud.of_grid(grid)
     for part, group in enumerate(fast):
-        slow = Judged.judge(points[part], start[part], cloud, targets)
+        slow = ScoredParticles.judge(points[part], start[part], cloud, targets)
         np.testing.assert_allclose(group.distance, slow.distance, rtol=1e-9)
         np.testing.assert_array_equal(group.mismatch, slow.mismatch)
     for edge, (a, b) in enumerate(model.tree.edges):
@@ -100,10 +100,13 @@ def test_searches_find_the_same_body(
 ) -> None:
     weights = SearchWeights(lm_steps=1, lm_points=30)
     found = []
-    for search, cloud in ((Search, grid), (plain_search.PlainSearch, plain_search.PlainCloud.of_grid(grid))):
+    for search, cloud in (
+        (BodyParticleSearch, grid),
+        (plain_search.PlainSearch, plain_search.PlainCloud.of_grid(grid)),
+    ):
         stages, rng = four_stages(model.tree), np.random.default_rng(4)
         made = search(model, points, weights)
-        found.append(made.run(start, cloud, JointTargets.none(model), stages, ITERATIONS, rng))  # type: ignore[arg-type]
+        found.append(made.optimise(start, cloud, JointTargets.none(model), stages, ITERATIONS, rng))  # type: ignore[arg-type]
     assert found[0].cost == pytest.approx(found[1].cost, rel=1e-6)
     np.testing.assert_allclose(found[0].state.center, found[1].state.center, atol=1e-6)
     np.testing.assert_allclose(found[0].state.rotation, found[1].state.rotation, atol=1e-6)

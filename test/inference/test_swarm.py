@@ -3,9 +3,9 @@
 
 import numpy as np
 
-from flowing_puppet_ros.inference.swarm import Box, Swarm, resampled, search
+from flowing_puppet_ros.inference.swarm import Bounds, Swarm, resampled, search
 
-BOX = Box(np.full(4, -5.0), np.full(4, 5.0), np.full(4, 0.6))
+BOX = Bounds(np.full(4, -5.0), np.full(4, 5.0), np.full(4, 0.6))
 GOAL = np.array([1.0, -2.0, 3.0, 5.0])
 
 

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from flowing_puppet_ros.multiview.distance_transform import FARTHEST, distance_to, signed_distance
+from flowing_puppet_ros.multiview.distance_transform import MAX_DISTANCE, distance_transform, signed_distance
 
 
 def test_distance_is_the_nearest_pixels() -> None:
@@ -12,13 +12,13 @@ def test_distance_is_the_nearest_pixels() -> None:
         mask = rng.random((23, 31)) < share
         pixels, filled = np.argwhere(np.ones_like(mask)), np.argwhere(mask)
         expected = np.linalg.norm(pixels[:, None] - filled[None], axis=2).min(axis=1).reshape(mask.shape)
-        np.testing.assert_allclose(distance_to(mask), expected, rtol=1e-15)
+        np.testing.assert_allclose(distance_transform(mask), expected, rtol=1e-15)
 
 
 def test_without_a_mask_everything_is_far() -> None:
-    assert (distance_to(np.zeros((4, 5), bool)) == FARTHEST).all()
-    assert (signed_distance(np.zeros((4, 5), np.uint8)) == FARTHEST - 0.5).all()
-    assert (signed_distance(np.ones((4, 5), np.uint8)) == 0.5 - FARTHEST).all()
+    assert (distance_transform(np.zeros((4, 5), bool)) == MAX_DISTANCE).all()
+    assert (signed_distance(np.zeros((4, 5), np.uint8)) == MAX_DISTANCE - 0.5).all()
+    assert (signed_distance(np.ones((4, 5), np.uint8)) == 0.5 - MAX_DISTANCE).all()
 
 
 def test_the_sign_changes_half_a_pixel_outside_the_mask() -> None:
@@ -33,5 +33,5 @@ def test_bits_do_not_depend_on_where_the_memory_lies() -> None:
     bits, kept = set(), []
     for size in rng.integers(1, 100_000, 25):
         kept.append(np.empty(size, np.uint8))
-        bits.add(distance_to(mask.copy()).tobytes())
+        bits.add(distance_transform(mask.copy()).tobytes())
     assert len(bits) == 1

@@ -6,10 +6,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.cloud.correspondence import Quadratic
+from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.multiview.rim_term import Outline, OutlineTerm, distances_outside, edges_of
+from flowing_puppet_ros.multiview.rim_term import Outline, RimTerm, distances_outside, mesh_edges
 
 Ring = Callable[..., list[Camera]]
 CENTRE, RADII = np.array([0.05, -0.04, 0.1]), np.array([0.25, 0.4, 0.7])
@@ -35,15 +35,15 @@ def ellipsoid_mask(camera: Camera) -> np.ndarray:
     return np.where(b * b - a * (offset @ offset - 1) >= 0, 255, 0).astype(np.uint8)
 
 
-def attraction(vertices: np.ndarray, faces: np.ndarray, seen: list[Outline], sigma: float) -> Quadratic:
-    return OutlineTerm(seen, faces, edges_of(faces))(vertices, sigma)
+def attraction(vertices: np.ndarray, faces: np.ndarray, seen: list[Outline], sigma: float) -> VertexQuadratic:
+    return RimTerm(seen, faces, mesh_edges(faces))(vertices, sigma)
 
 
 def outlines(cameras: list[Camera]) -> list[Outline]:
     return [Outline.of(camera, ellipsoid_mask(camera)) for camera in cameras]
 
 
-def energy(quadratic: Quadratic, move: np.ndarray) -> float:
+def energy(quadratic: VertexQuadratic, move: np.ndarray) -> float:
     return float(
         np.einsum("vi,vij,vj->", move, quadratic.matrix, move) + 2 * np.einsum("vi,vi->", move, quadratic.vector)
     )
@@ -121,7 +121,7 @@ def test_a_mask_without_an_outline_is_refused(ring: Ring) -> None:
 
 def test_edges_are_those_of_the_faces() -> None:
     faces = np.array([[0, 1, 2], [2, 1, 3], [0, 2, 3], [0, 3, 1]], np.int32)
-    assert edges_of(faces).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+    assert mesh_edges(faces).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
 
 
 def test_distances_to_a_silhouette_are_metres_at_the_depth(ring: Ring) -> None:

@@ -59,8 +59,8 @@ def walk(estimator: SilhouetteEstimator, frames: int) -> tuple[np.ndarray, np.nd
         x = 170 + 60 * np.sin(0.3 * index)
         truth = person(x, lift=0.3 + 0.2 * np.cos(0.3 * index))
         puppet = np.roll(person(x, grow=-0.02, lift=0.3 + 0.2 * np.cos(0.3 * index)), 4, axis=1)
-        observation = estimator.observe(frame(truth, index), puppet, SCALE)
-    silhouette = estimator.cut(observation)
+        observation = estimator.update_background(frame(truth, index), puppet, SCALE)
+    silhouette = estimator.segment(observation)
     assert silhouette.problem == ""
     return silhouette.mask, truth, puppet
 
@@ -135,7 +135,7 @@ def test_silhouette_is_much_better_than_the_puppet() -> None:
 def test_a_learned_background_keeps_out_what_looks_like_the_person() -> None:
     learned, truth, puppet = walk(SilhouetteEstimator(), 25)
     fresh = SilhouetteEstimator()
-    alone = fresh.cut(fresh.observe(frame(truth, 24), puppet, SCALE)).mask
+    alone = fresh.segment(fresh.update_background(frame(truth, 24), puppet, SCALE)).mask
     pole = truth[POLE] == 0
     assert (alone[POLE][pole] > 0).mean() > 0.7
     assert (learned[POLE][pole] > 0).mean() < 0.1
@@ -145,9 +145,9 @@ def test_a_standing_person_does_not_become_background() -> None:
     estimator = SilhouetteEstimator()
     truth = person(150)
     for index in range(30):
-        observation = estimator.observe(frame(truth, index), truth, SCALE)
+        observation = estimator.update_background(frame(truth, index), truth, SCALE)
     assert not estimator.background.known[truth > 0].any()
-    assert overlap(estimator.cut(observation).mask, truth) > 0.9
+    assert overlap(estimator.segment(observation).mask, truth) > 0.9
 
 
 def test_silhouettes_come_at_working_scale() -> None:
@@ -162,7 +162,7 @@ def test_an_arm_that_the_puppet_has_elsewhere_is_found() -> None:
     estimator = SilhouetteEstimator()
     walk(estimator, 25)
     truth, wrong = person(70, lift=0.2), person(70, lift=-0.7)
-    mask = estimator.cut(estimator.observe(frame(truth, 50), wrong, SCALE)).mask
+    mask = estimator.segment(estimator.update_background(frame(truth, 50), wrong, SCALE)).mask
     arm, ghost = (truth == 5), (wrong == 5) & (truth == 0)
     assert (mask[arm] > 0).mean() > 0.95
     assert (mask[ghost] > 0).mean() < 0.2
@@ -174,8 +174,8 @@ def test_other_people_are_neither_background_nor_silhouette() -> None:
     left, right = person(100, lift=0.3), person(260, lift=-0.5)
     for index in range(5):
         both = np.maximum(left, right)
-        observation = estimator.observe(frame(both, 50 + index), both, SCALE, left)
-    mask = estimator.cut(observation).mask
+        observation = estimator.update_background(frame(both, 50 + index), both, SCALE, left)
+    mask = estimator.segment(observation).mask
     assert overlap(mask, left) > 0.93
     assert not mask[:, 270:].any()
     assert estimator.background.mean[300, 275].max() < 110  # still the floor, not the other person's leg
@@ -185,10 +185,10 @@ def test_specks_far_from_the_puppet_are_dropped() -> None:
     estimator = SilhouetteEstimator()
     truth = person(120)
     for index in range(8):
-        estimator.observe(frame(person(120 + 10 * index), index), person(120 + 10 * index), SCALE)
+        estimator.update_background(frame(person(120 + 10 * index), index), person(120 + 10 * index), SCALE)
     image = frame(truth, 99)
     image[300:320, 330:350] = 255
-    mask = estimator.cut(estimator.observe(image, truth, SCALE)).mask
+    mask = estimator.segment(estimator.update_background(image, truth, SCALE)).mask
     assert not mask[290:330, 320:].any()
 
 
@@ -200,20 +200,20 @@ def test_a_mask_unlike_the_recent_ones_raises_the_alarm() -> None:
     estimator = SilhouetteEstimator()
     truth = person(150)
     for index in range(8):
-        assert estimator.cut(estimator.observe(frame(truth, index), truth, SCALE)).problem == ""
+        assert estimator.segment(estimator.update_background(frame(truth, index), truth, SCALE)).problem == ""
     legs_only = np.where((truth == 3) | (truth == 4), truth, 0).astype(np.uint8)
-    alarmed = estimator.cut(estimator.observe(frame(legs_only, 9), legs_only, SCALE))
+    alarmed = estimator.segment(estimator.update_background(frame(legs_only, 9), legs_only, SCALE))
     assert "of its running median" in alarmed.problem
-    assert estimator.cut(estimator.observe(frame(truth, 10), truth, SCALE)).problem == ""
+    assert estimator.segment(estimator.update_background(frame(truth, 10), truth, SCALE)).problem == ""
 
 
 def test_frames_without_a_puppet_teach_nothing_and_give_an_empty_mask() -> None:
     estimator = SilhouetteEstimator()
     truth = person(150)
     for index in range(6):
-        observation = estimator.observe(frame(truth, index), np.zeros(SHAPE, np.uint8), SCALE)
+        observation = estimator.update_background(frame(truth, index), np.zeros(SHAPE, np.uint8), SCALE)
     assert not estimator.background.known.any()
-    silhouette = estimator.cut(observation)
+    silhouette = estimator.segment(observation)
     assert silhouette.problem == "no puppet in the image" and not silhouette.mask.any()
 
 
@@ -221,7 +221,7 @@ def test_a_puppet_that_fills_the_image_is_cut_without_fuss() -> None:
     estimator = SilhouetteEstimator()
     everywhere = np.ones(SHAPE, np.uint8)
     for index in range(4):
-        silhouette = estimator.cut(estimator.observe(frame(everywhere, index), everywhere, SCALE))
+        silhouette = estimator.segment(estimator.update_background(frame(everywhere, index), everywhere, SCALE))
     assert (silhouette.mask == 255).all()
 
 
@@ -229,9 +229,9 @@ def test_another_image_size_starts_afresh() -> None:
     estimator = SilhouetteEstimator()
     walk(estimator, 5)
     labels = person(150)[:300]
-    observation = estimator.observe(frame(person(150), 0)[:300], labels, SCALE)
+    observation = estimator.update_background(frame(person(150), 0)[:300], labels, SCALE)
     assert estimator.background.count.max() == 1
-    assert estimator.cut(observation).mask.shape == (300, 360)
+    assert estimator.segment(observation).mask.shape == (300, 360)
 
 
 def test_images_and_labels_that_do_not_fit_are_refused() -> None:
@@ -239,13 +239,13 @@ def test_images_and_labels_that_do_not_fit_are_refused() -> None:
     labels = person(150)
     image = frame(labels, 0)
     with pytest.raises(InputError, match="RGB image"):
-        estimator.observe(image[..., 0], labels, SCALE)
+        estimator.update_background(image[..., 0], labels, SCALE)
     with pytest.raises(InputError, match="RGB image"):
-        estimator.observe(image[:0], labels[:0], SCALE)
+        estimator.update_background(image[:0], labels[:0], SCALE)
     with pytest.raises(InputError, match="part labels"):
-        estimator.observe(image, labels[:-1], SCALE)
+        estimator.update_background(image, labels[:-1], SCALE)
     for scale in (0.0, -1.0, float("nan")):
         with pytest.raises(InputError, match="scale"):
-            estimator.observe(image, labels, scale)
+            estimator.update_background(image, labels, scale)
     with pytest.raises(InputError, match="part labels"):
-        estimator.observe(image, labels, SCALE, labels[:-1])
+        estimator.update_background(image, labels, SCALE, labels[:-1])

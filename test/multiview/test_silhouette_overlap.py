@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.rim_term import Outline
-from flowing_puppet_ros.multiview.silhouette_overlap import outline_gap, overlap, rendered, shares_inside
+from flowing_puppet_ros.multiview.silhouette_overlap import outline_gap, render_mask, shares_inside, silhouette_iou
 
 Ring = Callable[..., list[Camera]]
 FLAT = Camera(np.eye(3), np.zeros(5), (20, 15), np.eye(3), np.zeros(3))
@@ -25,7 +25,7 @@ def disc(radius: float, shape: tuple[int, int] = (120, 120), centre: tuple[float
 @given(st.lists(st.tuples(st.floats(-8, 28), st.floats(-8, 24)), min_size=3, max_size=3))
 def test_a_triangle_covers_the_pixels_inside_it(corners: list[tuple[float, float]]) -> None:
     plane = np.array(corners)
-    drawn = rendered(FLAT, np.hstack([plane, np.ones((3, 1))]), np.array([[0, 1, 2]], np.int32))
+    drawn = render_mask(FLAT, np.hstack([plane, np.ones((3, 1))]), np.array([[0, 1, 2]], np.int32))
     rows, columns = np.indices((15, 20))
     pixels = np.stack([columns, rows], axis=-1)
     sides = []
@@ -41,19 +41,19 @@ def test_a_triangle_covers_the_pixels_inside_it(corners: list[tuple[float, float
 def test_what_lies_behind_or_outside_is_not_drawn() -> None:
     faces = np.array([[0, 1, 2]], np.int32)
     square = np.array([[2.0, 2, 1], [10, 2, 1], [2, 10, 1]])
-    assert rendered(FLAT, square, faces).sum() > 30
+    assert render_mask(FLAT, square, faces).sum() > 30
     for scale, shift in (((1, 1, -1), (0, 0, 0)), ((1, 1, 1), (100, 0, 0)), ((1, 1, 1), (0, -100, 0))):
-        assert not rendered(FLAT, square * np.array(scale) + np.array(shift), faces).any()
+        assert not render_mask(FLAT, square * np.array(scale) + np.array(shift), faces).any()
     square[1, 2] = -1.0
-    assert not rendered(FLAT, square, faces).any(), "a face that reaches behind the camera"
+    assert not render_mask(FLAT, square, faces).any(), "a face that reaches behind the camera"
 
 
 def test_overlap_is_intersection_over_union() -> None:
     first, second = np.zeros((4, 5), bool), np.zeros((4, 5), bool)
-    assert overlap(first, second) == 0
+    assert silhouette_iou(first, second) == 0
     first[0], second[0, 3:], second[1, 0] = True, True, True
-    assert overlap(first, second) == pytest.approx(2 / 6)
-    assert overlap(first, first) == 1
+    assert silhouette_iou(first, second) == pytest.approx(2 / 6)
+    assert silhouette_iou(first, first) == 1
 
 
 @pytest.mark.parametrize("shift", [0, 3, 8])

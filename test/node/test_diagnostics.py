@@ -7,7 +7,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from flowing_puppet_ros.node.diagnostics import SILENCE, Condition, Diagnostics
+from flowing_puppet_ros.node.diagnostics import SILENCE, Diagnostics, NodeStatus
 
 pytestmark = pytest.mark.ros
 
@@ -22,9 +22,9 @@ def test_rates_latency_and_counters() -> None:
     for _ in range(30):
         diagnostics.received("image")
     for seconds in (0.1, 0.1, 0.4):
-        diagnostics.took(seconds)
+        diagnostics.record_latency(seconds)
     diagnostics.people = 2
-    report = diagnostics.report(Time(sec=5), 2.0, Condition(counters={"images": 30}))
+    report = diagnostics.report(Time(sec=5), 2.0, NodeStatus(counters={"images": 30}))
     assert report.header.stamp.sec == 5
     assert report.status[0].name == "cam01.puppet_tracker: puppet_tracker"
     assert report.status[0].level == DiagnosticStatus.OK
@@ -32,13 +32,13 @@ def test_rates_latency_and_counters() -> None:
         "state": "active", "image (Hz)": "15.0", "latency median (s)": "0.100", "latency max (s)": "0.400",
         "people": "2", "images": "30", "resets": "0",
     }  # fmt: skip
-    quiet = values(diagnostics.report(Time(), 1.0, Condition()))
+    quiet = values(diagnostics.report(Time(), 1.0, NodeStatus()))
     assert quiet["image (Hz)"] == "0.0" and "latency median (s)" not in quiet
 
 
 def level(diagnostics: Diagnostics, **condition: Any) -> tuple[bytes, str]:
     """Return level and message of a report."""
-    status = diagnostics.report(Time(), 1.0, Condition(**condition)).status[0]
+    status = diagnostics.report(Time(), 1.0, NodeStatus(**condition)).status[0]
     return status.level, status.message
 
 
@@ -51,7 +51,7 @@ def test_level_follows_what_is_new() -> None:
     assert (unusable[0], unusable[1][:1]) == (DiagnosticStatus.WARN, "2")
     assert level(diagnostics, counters={"unusable": 2}, dropped={"image": 3})[0] == DiagnosticStatus.OK
     diagnostics.failed("ZeroDivisionError: it broke")
-    report = diagnostics.report(Time(), 1.0, Condition())
+    report = diagnostics.report(Time(), 1.0, NodeStatus())
     assert report.status[0].level == DiagnosticStatus.ERROR
     assert values(report)["last error"] == "ZeroDivisionError: it broke"
     # A component that was made anew counts from zero.
@@ -67,7 +67,7 @@ def test_states_and_silence_have_their_levels(monkeypatch: pytest.MonkeyPatch) -
     stale = level(diagnostics, publishers={"/camera/image": 0})
     assert stale == (DiagnosticStatus.STALE, "no message for 10 s; topics and their publishers: /camera/image (0)")
     assert level(diagnostics, state="inactive")[0] == DiagnosticStatus.OK
-    diagnostics.waits()
+    diagnostics.reset_silence()
     assert level(diagnostics) == (DiagnosticStatus.OK, "waiting for messages")
     broken = level(diagnostics, state="unconfigured", problem="cameras is empty")
     assert broken == (DiagnosticStatus.ERROR, "the node cannot work: cameras is empty")

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS, Pairing
+from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS, TimeSynchronizer
 
 SLOP = 5
 stamps = st.lists(st.integers(0, 200), unique=True, max_size=25).map(sorted)
@@ -35,7 +35,7 @@ def reference(streams: list[list[int]], slop: int) -> list[tuple[int, ...]]:
 @given(st.lists(stamps, min_size=2, max_size=3), st.randoms(use_true_random=False))
 def test_sets_are_those_of_the_reference_in_every_interleaving(streams: Any, random: Any) -> None:
     names = tuple("abc"[: len(streams)])
-    pairing = Pairing(names, SLOP)
+    pairing = TimeSynchronizer(names, SLOP)
     left = {name: list(stream) for name, stream in zip(names, streams, strict=True)}
     sets = []
     while any(left.values()):
@@ -50,20 +50,20 @@ def test_sets_are_those_of_the_reference_in_every_interleaving(streams: Any, ran
 
 
 def test_an_exact_set_is_made_at_once() -> None:
-    pairing = Pairing(("image", "labels"))
+    pairing = TimeSynchronizer(("image", "labels"))
     assert pairing.add("image", 7, "i") == []
     assert pairing.add("labels", 7, "l") == [{"image": (7, "i"), "labels": (7, "l")}]
 
 
 def test_nearest_waits_until_nothing_nearer_can_come() -> None:
-    pairing = Pairing(("a", "b"), slop_ns=10)
+    pairing = TimeSynchronizer(("a", "b"), slop_ns=10)
     pairing.add("b", 93, "early")
     assert pairing.add("a", 100, "lead") == []
     assert [each["b"] for each in pairing.add("b", 104, "late")] == [(104, "late")]
 
 
 def test_a_recording_that_starts_again_pairs_again() -> None:
-    pairing = Pairing(("a", "b"), slop_ns=1)
+    pairing = TimeSynchronizer(("a", "b"), slop_ns=1)
     second = 10 * BACKWARD_JUMP_NS
     found = []
     for stamps_of_loop in ((0, second), (0, second)):
@@ -75,7 +75,7 @@ def test_a_recording_that_starts_again_pairs_again() -> None:
 
 
 def test_slightly_disordered_and_repeated_stamps_are_left_out() -> None:
-    pairing = Pairing(("a", "b"))
+    pairing = TimeSynchronizer(("a", "b"))
     for stamp in (1000, 1000, 999):
         pairing.add("a", stamp, stamp)
     assert pairing.counters["disordered"] == 2
@@ -84,7 +84,7 @@ def test_slightly_disordered_and_repeated_stamps_are_left_out() -> None:
 
 @pytest.mark.parametrize("depth", [1, 4])
 def test_memory_is_bounded_and_the_newest_are_kept(depth: Any) -> None:
-    pairing = Pairing(("a", "b"), depth=depth)
+    pairing = TimeSynchronizer(("a", "b"), depth=depth)
     for stamp in range(100):
         pairing.add("a", stamp, stamp)
     assert pairing.counters["dropped"] == 100 - depth
@@ -93,13 +93,13 @@ def test_memory_is_bounded_and_the_newest_are_kept(depth: Any) -> None:
 
 
 def test_reset_forgets_what_waits() -> None:
-    pairing = Pairing(("a", "b"))
+    pairing = TimeSynchronizer(("a", "b"))
     pairing.add("a", 5, "old")
     pairing.reset()
     assert pairing.add("b", 5, "new") == []
 
 
-def feed(pairing: Pairing, streams: dict[str, list[int]]) -> list[dict[str, int]]:
+def feed(pairing: TimeSynchronizer, streams: dict[str, list[int]]) -> list[dict[str, int]]:
     """Add the stamps of all inputs in their order, and return the sets' stamps."""
     entries = sorted((stamp, name) for name, stream in streams.items() for stamp in stream)
     made = [each for stamp, name in entries for each in pairing.add(name, stamp, None)]
@@ -108,20 +108,20 @@ def feed(pairing: Pairing, streams: dict[str, list[int]]) -> list[dict[str, int]
 
 def test_with_patience_sets_go_on_without_an_input_that_died() -> None:
     whole, short = list(range(0, 100, 10)), [0, 10, 20]
-    pairing = Pairing(("a", "b", "c"), SLOP, patience=2)
+    pairing = TimeSynchronizer(("a", "b", "c"), SLOP, patience=2)
     sets = feed(pairing, {"a": whole, "b": whole, "c": short})
     assert sets == [{"a": t, "b": t, "c": t} if t <= 20 else {"a": t, "b": t} for t in whole]
     assert pairing.counters["incomplete"] == 7
-    sets = feed(Pairing(("a", "b", "c"), SLOP, patience=2), {"a": short, "b": whole, "c": whole})
+    sets = feed(TimeSynchronizer(("a", "b", "c"), SLOP, patience=2), {"a": short, "b": whole, "c": whole})
     assert sets == [{"a": t, "b": t, "c": t} if t <= 20 else {"b": t, "c": t} for t in whole]
-    assert len(feed(Pairing(("a", "b", "c"), SLOP), {"a": whole, "b": whole, "c": short})) == 3
+    assert len(feed(TimeSynchronizer(("a", "b", "c"), SLOP), {"a": whole, "b": whole, "c": short})) == 3
 
 
 def test_with_patience_a_lone_item_is_no_set_and_a_late_one_is_waited_for() -> None:
-    pairing = Pairing(("a", "b", "c"), SLOP, patience=3)
+    pairing = TimeSynchronizer(("a", "b", "c"), SLOP, patience=3)
     assert feed(pairing, {"a": [0, 10, 20, 30, 40, 50]}) == []
     assert pairing.counters["unpaired"] == 6
-    pairing = Pairing(("a", "b", "c"), SLOP, patience=3)
+    pairing = TimeSynchronizer(("a", "b", "c"), SLOP, patience=3)
     for stamp in (0, 10, 20):
         assert pairing.add("a", stamp, None) == pairing.add("b", stamp, None) == []
     assert [set(each) for each in pairing.add("c", 0, None)] == [{"a", "b", "c"}]
@@ -133,7 +133,7 @@ def test_patience_changes_nothing_when_nothing_is_missing(stream: list[int], cou
     names = tuple("abc"[:count])
     found = []
     for patience in (0, 30):
-        pairing, sets = Pairing(names, patience=patience), []
+        pairing, sets = TimeSynchronizer(names, patience=patience), []
         left = {name: list(stream) for name in names}
         while any(left.values()):
             name = random.choice([name for name in names if left[name]])

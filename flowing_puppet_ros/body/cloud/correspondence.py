@@ -31,7 +31,7 @@ class Cloud:
 
     points: np.ndarray
     normals: np.ndarray
-    tree: NearestPoints
+    nearest: NearestPoints
     viewpoint: np.ndarray | None
 
     @classmethod
@@ -47,7 +47,7 @@ class Cloud:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Quadratic:
+class VertexQuadratic:
     """sum_v (x_v - v)^T A_v (x_v - v) + 2 b_v^T (x_v - v) over vertices v, square metres.
 
     Attributes:
@@ -59,7 +59,7 @@ class Quadratic:
     vector: np.ndarray
 
 
-class Matches:
+class TwoWayCorrespondence:
     """Matches both ways between a cloud and the bodies of one fit."""
 
     def __init__(self, cloud: Cloud, most: int | None = None) -> None:
@@ -69,7 +69,7 @@ class Matches:
         step = 1 if most is None else max(1, -(-len(cloud.points) // most))
         self._looking = np.arange(0, len(cloud.points), step)
 
-    def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float) -> Quadratic:
+    def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float) -> VertexQuadratic:
         """Match both ways and return what draws the vertices to the cloud.
 
         Every vertex that the sensor sees goes to its closest cloud point, every cloud point to its closest vertex,
@@ -93,7 +93,7 @@ class Matches:
                 vertex, point, vertices, normals, cloud.points, cloud.normals, sigma**2, 1 / max(len(point), 1),
                 matrix, vector,
             )  # fmt: skip
-        return Quadratic(matrix, vector)
+        return VertexQuadratic(matrix, vector)
 
     def nearest(self, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """How far vertices (V, 3) and cloud are apart where opposite normals count as 6 cm more.
@@ -140,6 +140,6 @@ def two_way_distance(vertices: np.ndarray, faces: np.ndarray, cloud: Cloud) -> f
     surface = np.concatenate([vertices, corners.mean(axis=1)])
     face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     seen = cloud.sees(surface, np.concatenate([normals, face_normals]))
-    there = cloud.tree.query(surface[seen])[0].mean() if seen.any() else np.inf
+    there = cloud.nearest.query(surface[seen])[0].mean() if seen.any() else np.inf
     back = NearestPoints(surface).query(cloud.points)[0].mean()
     return float((there + back) / 2)

@@ -11,7 +11,7 @@ HIDDEN_SHARE = 0.21  # of the points of a whole body at least this share lies be
 INSIDE = 0.5  # length of the mean direction to the points; shorter when they lie around the origin
 
 
-def one_sided(points: np.ndarray) -> bool:
+def is_single_view(points: np.ndarray) -> bool:
     """Whether a person's points (N, 3) in metres are what a sensor at the origin sees of them.
 
     From there every bundle of rays ends on one surface; of a whole body it ends on the front and on the back.

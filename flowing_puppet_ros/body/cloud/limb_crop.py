@@ -24,7 +24,7 @@ TRUNK: tuple[tuple[str, str, float, float], ...] = (
 )
 
 
-def near_limbs(points: np.ndarray, joints: dict[str, np.ndarray], factor: float) -> np.ndarray:
+def crop_to_limbs(points: np.ndarray, joints: dict[str, np.ndarray], factor: float) -> np.ndarray:
     """Which points (N,) lie within `factor` limb radii of the limbs' axes.
 
     Args:

@@ -12,7 +12,7 @@ NEIGHBOURS = (9, 24)
 POINTS_A_NEIGHBOUR = 100
 
 
-def thinned(points: np.ndarray, normals: np.ndarray | None, limit: int) -> tuple[np.ndarray, np.ndarray | None]:
+def downsample(points: np.ndarray, normals: np.ndarray | None, limit: int) -> tuple[np.ndarray, np.ndarray | None]:
     """Replace the points of each voxel by their mean until at most `limit` are left.
 
     Args:
@@ -43,7 +43,7 @@ def _sums(values: np.ndarray, group: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(group, column) for column in values.T], axis=1)
 
 
-def estimated_normals(
+def estimate_normals(
     points: np.ndarray, viewpoint: np.ndarray | None, surface: tuple[np.ndarray, np.ndarray] | None = None
 ) -> np.ndarray:
     """Outward unit normals (N, 3) of a cloud (N, 3) in metres, by Open3D.

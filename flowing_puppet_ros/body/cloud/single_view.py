@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, Quadratic
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.one_sided import OneSidedView
@@ -17,13 +17,13 @@ VIEW_POINTS = 4000
 """More points than that of one side add time and no accuracy."""
 NEAREST = 0.05
 """Metres before the sensor."""
-BEFORE, NOISES, NOISE_NEIGHBOURS = 0.01, 2.5, 6
+DEPTH_TOLERANCE, NOISES, NOISE_NEIGHBOURS = 0.01, 2.5, 6
 """Metres, and multiples of the noise, before the seen surface up to which a vertex is left alone. Noise that counted on
 one side only would push the body away from the sensor."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ViewCloud(Cloud):
+class SingleViewCloud(Cloud):
     """A cloud to fit that was seen from one place.
 
     Attributes:
@@ -32,10 +32,10 @@ class ViewCloud(Cloud):
     """
 
     view: OneSidedView
-    before: float
+    depth_tolerance: float
 
     @classmethod
-    def seen_from(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> ViewCloud:
+    def seen_from(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> SingleViewCloud:
         """Index a cloud; arguments as of `Cloud`.
 
         Raises:
@@ -50,14 +50,14 @@ class ViewCloud(Cloud):
         near = points[cKDTree(points).query(points, k=min(NOISE_NEIGHBOURS, len(points)))[1]]
         noise = float(np.median(np.abs(((near - points[:, None]) * normals[:, None]).sum(axis=2)[:, 1:])))
         view = OneSidedView.build(points, viewpoint)
-        return cls(points, normals, NearestPoints(points), viewpoint, view, max(BEFORE, NOISES * noise))
+        return cls(points, normals, NearestPoints(points), viewpoint, view, max(DEPTH_TOLERANCE, NOISES * noise))
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Which vertices (V,) face the sensor and are not hidden by what it saw."""
         facing = ((self.view.viewpoint - vertices) * normals).sum(axis=1) > 0
         return np.asarray(facing & ~self.view.hidden(vertices))
 
-    def free_space(self, vertices: np.ndarray, sigma: float) -> Quadratic:
+    def free_space(self, vertices: np.ndarray, sigma: float) -> VertexQuadratic:
         """Draw vertices (V, 3) out of the space that the sensor saw to be free.
 
         Beside the silhouette a vertex goes towards its nearest ray, before the surface along its ray back to it, both
@@ -69,11 +69,11 @@ class ViewCloud(Cloud):
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         across = beside - (beside * ray).sum(axis=1, keepdims=True) * ray
         inside = ~beside.any(axis=1)
-        depth = np.where(inside, np.minimum(behind + self.before, 0.0), 0.0)
+        depth = np.where(inside, np.minimum(behind + self.depth_tolerance, 0.0), 0.0)
         weight = _geman_mcclure((across**2).sum(axis=1), sigma) * ~inside / len(vertices)
         weight_along = _geman_mcclure(depth**2, sigma) * (depth < 0) / len(vertices)
         outer = ray[:, :, None] * ray[:, None, :]
-        return Quadratic(
+        return VertexQuadratic(
             weight[:, None, None] * (np.eye(3) - outer) + weight_along[:, None, None] * outer,
             weight[:, None] * across + (weight_along * depth)[:, None] * ray,
         )

@@ -10,21 +10,21 @@ import numpy as np
 
 from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
-from flowing_puppet_ros.body.cloud.limb_crop import near_limbs
-from flowing_puppet_ros.body.cloud.normals import estimated_normals, thinned
-from flowing_puppet_ros.body.cloud.single_view import VIEW_POINTS, ViewCloud
-from flowing_puppet_ros.body.fit.hypotheses import BodyFinder, FitterSettings, Progress, part_of
+from flowing_puppet_ros.body.cloud.limb_crop import crop_to_limbs
+from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.single_view import VIEW_POINTS, SingleViewCloud
+from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses, FitterSettings, Progress, sub_progress
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, joint_targets
-from flowing_puppet_ros.body.fit.quality import judged
-from flowing_puppet_ros.body.refine.gauss_newton import LOOSE, Refiner
-from flowing_puppet_ros.body.refine.hand_pose import with_hands
-from flowing_puppet_ros.body.refine.nonrigid import FinishWeights, SurfaceFinish
+from flowing_puppet_ros.body.fit.quality import assess_fit
+from flowing_puppet_ros.body.refine.gauss_newton import LOOSE, GaussNewton
+from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
+from flowing_puppet_ros.body.refine.nonrigid import NonRigidRefinement, NonRigidWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, ExactCloud
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-__all__ = ["BodyFit", "BodyFitter", "FitterSettings", "Progress", "checked_cloud"]
+__all__ = ["BodyFit", "BodyFitter", "FitterSettings", "Progress", "check_cloud"]
 
 MIN_POINTS = 50
 # Models that are warm in this process.
@@ -32,7 +32,7 @@ _WARM: set[str] = set()
 WARM_VIEW = np.array([3.0, 0.0, 0.0])  # metres from the body
 # Points that a cloud needs before it may shape the surface more finely than the model does.
 DENSE_CLOUD = 3000
-PROMISE_POINTS = 1500
+COARSE_POINTS = 1500
 # Widest sides, in metres, between which a cloud may be a person or a part of one, with some surroundings.
 PERSON_EXTENT = (0.1, 20.0)
 
@@ -68,11 +68,11 @@ class BodyFitter:
     def __init__(self, model: StitchedPuppet, settings: FitterSettings) -> None:
         self.model = model
         self.settings = settings
-        self._finder = BodyFinder(model, settings)
-        self._surface_finish = SurfaceFinish(model.faces, len(model.part_of_vertex), FinishWeights())
+        self._finder = BodyHypotheses(model, settings)
+        self._surface_finish = NonRigidRefinement(model.faces, len(model.part_of_vertex), NonRigidWeights())
 
     @property
-    def refiner(self) -> Refiner:
+    def gauss_newton(self) -> GaussNewton:
         """The Gauss-Newton over all parts."""
         return self._finder.refiner
 
@@ -84,7 +84,7 @@ class BodyFitter:
         with one_blas_thread():
             points = self.model.vertices(self.model.rest_state())
             cloud = self.cloud(points, None, None)
-            view = ViewCloud.seen_from(cloud.points, cloud.normals, cloud.points.mean(axis=0) + WARM_VIEW)
+            view = SingleViewCloud.seen_from(cloud.points, cloud.normals, cloud.points.mean(axis=0) + WARM_VIEW)
             self._finder.warm_up(cloud, view)
             self.result(self.model.rest_state(), cloud)
 
@@ -118,25 +118,25 @@ class BodyFitter:
         """
         rng = np.random.default_rng(self.settings.seed if seed is None else seed)
         with one_blas_thread():
-            points, normals = checked_cloud(points, normals)
+            points, normals = check_cloud(points, normals)
             if initial is None:
                 cloud = self.cloud(points, normals, viewpoint)
-                state = self._finder.find(cloud, rng, progress or _silent, quick)
-                (progress or _silent)(1.0)
+                state = self._finder.search(cloud, rng, progress or _no_progress, quick)
+                (progress or _no_progress)(1.0)
                 if not self._follows_surface(cloud):
                     return self.result(state, cloud)
-                state = with_hands(self.model, self._finder.refiner, state, cloud)
+                state = refine_hand_pose(self.model, self._finder.refiner, state, cloud)
                 if not own_surface:
                     return self.result(state, cloud)
-                return self._with_own_surface(self.result(state, cloud), cloud)
-            return self._fit_from_joints(points, normals, initial, viewpoint, rng, progress or _silent)
+                return self._refine_nonrigid(self.result(state, cloud), cloud)
+            return self._fit_from_joints(points, normals, initial, viewpoint, rng, progress or _no_progress)
 
     def cloud(self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None) -> Cloud:
         """Thin and index the points; InputError when they cannot be the surface of a person."""
         points, normals = self.person_points(points, normals, viewpoint)
         if normals is None:
-            normals = estimated_normals(points, viewpoint)
-        return Cloud.of(points, normals) if viewpoint is None else ViewCloud.seen_from(points, normals, viewpoint)
+            normals = estimate_normals(points, viewpoint)
+        return Cloud.of(points, normals) if viewpoint is None else SingleViewCloud.seen_from(points, normals, viewpoint)
 
     def person_points(
         self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None
@@ -148,7 +148,7 @@ class BodyFitter:
                 f"the cloud is {extent:.3g} m wide, which is no person; check the unit or cut out one person"
             )
         limit = self.settings.cloud_points
-        points, normals = thinned(points, normals, limit if viewpoint is None else min(limit, VIEW_POINTS))
+        points, normals = downsample(points, normals, limit if viewpoint is None else min(limit, VIEW_POINTS))
         # Along one axis alone that is quickly told, of nearly every cloud.
         places = len(np.unique(points[:, 2]))
         if places < MIN_POINTS and (places := len(np.unique(points, axis=0))) < MIN_POINTS:
@@ -157,15 +157,17 @@ class BodyFitter:
             )
         return points, normals
 
-    def promise(self, points: np.ndarray, viewpoint: np.ndarray | None = None) -> float:
+    def coarse_cost(self, points: np.ndarray, viewpoint: np.ndarray | None = None) -> float:
         """How well, in metres, any upright body may explain a cloud (N, 3) in metres; lower is better, and fast.
 
         Compares frames in which a cloud may be meant before one is fitted in.
         """
-        points = thinned(points, None, PROMISE_POINTS)[0]
+        points = downsample(points, None, COARSE_POINTS)[0]
         unknown = np.zeros_like(points)
-        cloud = Cloud.of(points, unknown) if viewpoint is None else ViewCloud.seen_from(points, unknown, viewpoint)
-        return self._finder.bank.promise(cloud)
+        cloud = (
+            Cloud.of(points, unknown) if viewpoint is None else SingleViewCloud.seen_from(points, unknown, viewpoint)
+        )
+        return self._finder.bank.coarse_cost(cloud)
 
     def _fit_from_joints(
         self,
@@ -181,7 +183,9 @@ class BodyFitter:
         body = body_from_joints(self.model, self._finder.refiner, targets)
         if self.settings.clip_factor > 0:
             joints = self.model.joints(self.model.vertices(body))
-            near = near_limbs(points, dict(zip(self.model.joint_names, joints, strict=True)), self.settings.clip_factor)
+            near = crop_to_limbs(
+                points, dict(zip(self.model.joint_names, joints, strict=True)), self.settings.clip_factor
+            )
             if np.count_nonzero(near) < MIN_POINTS:
                 raise InputError(
                     f"only {np.count_nonzero(near)} of {len(points)} points lie around the initial joints; check that"
@@ -191,8 +195,8 @@ class BodyFitter:
         cloud = self.cloud(points, normals, viewpoint)
         grid = CloudGrid.build(cloud.points, cloud.normals)
         targets = targets.scaled(self.settings.joint_strength)
-        found = self._finder.near(body, grid, targets, rng, part_of(progress, 0.1, 0.8))
-        body = self._finder.finish(found, cloud, targets, self.settings.refine_iterations)
+        found = self._finder.search_near(body, grid, targets, rng, sub_progress(progress, 0.1, 0.8))
+        body = self._finder.refine(found, cloud, targets, self.settings.refine_iterations)
         progress(1.0)
         return self.result(body, cloud)
 
@@ -200,7 +204,7 @@ class BodyFitter:
         """Whether a cloud is dense and whole enough for hands and vertices of their own."""
         return self.settings.surface_finish and cloud.viewpoint is None and len(cloud.points) >= DENSE_CLOUD
 
-    def _with_own_surface(self, fit: BodyFit, cloud: Cloud) -> BodyFit:
+    def _refine_nonrigid(self, fit: BodyFit, cloud: Cloud) -> BodyFit:
         """The fit with vertices that follow a dense whole cloud closer than the model can."""
         loose = self._finder.refiner.run(fit.state, cloud, JointTargets.none(self.model), LOOSE)
         vertices = self._surface_finish.run(self.model.vertices(loose), cloud)
@@ -210,12 +214,12 @@ class BodyFitter:
     def result(self, state: BodyState, cloud: Cloud) -> BodyFit:
         """What is known of a body that was fitted to a cloud."""
         vertices = self.model.vertices(state)
-        judgement = judged(self.model, vertices, cloud)
+        judgement = assess_fit(self.model, vertices, cloud)
         return BodyFit(
             state,
             vertices,
             self.model.joints(vertices),
-            self._finder.search.energy(state, ExactCloud(cloud.points, cloud.normals, cloud.tree)),
+            self._finder.particle_search.energy(state, ExactCloud(cloud.points, cloud.normals, cloud.nearest)),
             judgement.part_confidence,
             judgement.confidence,
             judgement.reliable,
@@ -223,7 +227,7 @@ class BodyFitter:
         )
 
 
-def checked_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
+def check_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Return float64 arrays without the points that are not finite; normals most of which are missing become None.
 
     Raises:
@@ -250,5 +254,5 @@ def checked_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.nd
     return points, normals
 
 
-def _silent(done: float) -> None:
+def _no_progress(done: float) -> None:
     """Take a fraction and do nothing."""

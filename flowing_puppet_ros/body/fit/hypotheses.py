@@ -13,22 +13,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
-from flowing_puppet_ros.body.cloud.single_view import ViewCloud
-from flowing_puppet_ros.body.fit.initialisation import sampled_bodies, turned_around
-from flowing_puppet_ros.body.fit.pose_bank import BodyBank, Coarse
-from flowing_puppet_ros.body.fit.quality import RELIABLY_UNCOVERED, Judgement, judged
-from flowing_puppet_ros.body.fit.single_view_search import ViewSearch
-from flowing_puppet_ros.body.refine.gauss_newton import Refiner, RefineWeights
-from flowing_puppet_ros.body.search.dpmp import Search, SearchWeights
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
+from flowing_puppet_ros.body.fit.initialisation import flip_heading, sample_bodies
+from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
+from flowing_puppet_ros.body.fit.quality import RELIABLY_UNCOVERED, FitQuality, assess_fit
+from flowing_puppet_ros.body.fit.single_view_search import SingleViewSearch
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
+from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.limb_search import SINGLE_LIMBS, LimbSearch, limb_groups
 from flowing_puppet_ros.body.search.part_points import part_points
-from flowing_puppet_ros.body.search.particles import Particles, particles_of
+from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer, WalkNoise
 from flowing_puppet_ros.body.search.schedule import four_stages, local_stages
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.parallel import ordered, usable
+from flowing_puppet_ros.parallel import parallel_map, usable_threads
 from flowing_puppet_ros.settings import Settings, setting
 
 Progress = Callable[[float], None]
@@ -68,92 +68,96 @@ class FitterSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class BodyCandidate:
     """A body and what the cloud says of it."""
 
     state: BodyState
-    judgement: Judgement
+    quality: FitQuality
 
     @property
     def cost(self) -> float:
         """What candidates are compared by, metres."""
-        return self.judgement.cost
+        return self.quality.cost
 
 
-class BodyFinder:
+class BodyHypotheses:
     """The search, its hypotheses and the finish, for one model."""
 
     def __init__(self, model: StitchedPuppet, settings: FitterSettings) -> None:
         self._model = model
         self._settings = settings
-        self._threads = usable(settings.threads)
+        self._threads = usable_threads(settings.threads)
         points = part_points(model)
-        self.search = Search(model, points, SearchWeights(lm_steps=settings.lm_steps))
-        self.refiner = Refiner(model)
+        self.particle_search = BodyParticleSearch(model, points, SearchWeights(lm_steps=settings.lm_steps))
+        self.refiner = GaussNewton(model)
         self._proposer = Proposer(model, points)
-        self.limbs = LimbSearch(model, self.search, self._proposer)
-        self.bank = BodyBank(model, points)
-        self._view_search = ViewSearch(model, self.bank, self._proposer, self.refiner, self._threads)
+        self.limbs = LimbSearch(model, self.particle_search, self._proposer)
+        self.bank = PoseBank(model, points)
+        self._view_search = SingleViewSearch(model, self.bank, self._proposer, self.refiner, self._threads)
 
-    def find(self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False) -> BodyState:
+    def search(self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False) -> BodyState:
         """The body of a cloud of which nothing but the upright is known.
 
         `quick` tries a small search first and is content when its body lies close, whatever its limbs do.
         """
-        if isinstance(cloud, ViewCloud):
+        if isinstance(cloud, SingleViewCloud):
             return self._view_search.run(cloud, rng, self._settings.refine_iterations, progress)
         grid = CloudGrid.build(cloud.points, cloud.normals)
         none, steps = JointTargets.none(self._model), self._settings.refine_iterations
         if quick:
-            best = self._two_bodies(cloud, grid, rng, part_of(progress, 0.0, 0.3), QUICK)[0]
+            best = self._both_headings(cloud, grid, rng, sub_progress(progress, 0.0, 0.3), QUICK)[0]
             if self._is_close(best):
-                return self.finish(best.state, cloud, none, steps)
+                return self.refine(best.state, cloud, none, steps)
         tries = 1 + self._settings.restarts
-        tried: list[Candidate] = []
+        tried: list[BodyCandidate] = []
         for turn in range(tries):
-            for candidate in self._two_bodies(cloud, grid, rng, part_of(progress, turn / tries, (turn + 0.7) / tries)):
-                tried.append(self.mended(candidate, cloud, grid, rng))
+            for candidate in self._both_headings(
+                cloud, grid, rng, sub_progress(progress, turn / tries, (turn + 0.7) / tries)
+            ):
+                tried.append(self.repair_limbs(candidate, cloud, grid, rng))
                 best = min(tried, key=lambda candidate: candidate.cost)
                 if self._is_close(best):
-                    return self.finish(best.state, cloud, none, steps)
-        return self.finish(best.state, cloud, none, steps)
+                    return self.refine(best.state, cloud, none, steps)
+        return self.refine(best.state, cloud, none, steps)
 
-    def _is_close(self, candidate: Candidate) -> bool:
+    def _is_close(self, candidate: BodyCandidate) -> bool:
         return candidate.cost < self._settings.restart_distance
 
-    def warm_up(self, cloud: Cloud, view: ViewCloud) -> None:
+    def warm_up(self, cloud: Cloud, view: SingleViewCloud) -> None:
         """Use all compiled code once, on any cloud from all sides and any from one side."""
         grid = CloudGrid.build(cloud.points, cloud.normals)
-        self._two_bodies(cloud, grid, np.random.default_rng(0), lambda _: None, WARM)
-        state = self.bank.best(Coarse.of(view), 1)[0]
-        self.finish(state, view, JointTargets.none(self._model), 1)
+        self._both_headings(cloud, grid, np.random.default_rng(0), lambda _: None, WARM)
+        state = self.bank.best(CoarseCloud.of(view), 1)[0]
+        self.refine(state, view, JointTargets.none(self._model), 1)
 
-    def near(
+    def search_near(
         self, body: BodyState, grid: CloudGrid, targets: JointTargets, rng: np.random.Generator, progress: Progress
     ) -> BodyState:
         """Search around a body; the body itself is among the first particles."""
         start = []
-        for group in particles_of(self._model, [body]):
+        for group in states_to_particles(self._model, [body]):
             copies = group.take(np.zeros(self._settings.local_particles - 1, dtype=np.int64))
-            walked = self._proposer.walk(copies, WalkNoise(0.02, 0.12, 0.5, 0.2), rng)
+            walked = self._proposer.random_walk(copies, WalkNoise(0.02, 0.12, 0.5, 0.2), rng)
             start.append(Particles.join([group, walked]))
         stages, iterations = local_stages(self._model.tree), self._settings.local_iterations
-        return self.search.run(start, grid, targets, stages, iterations, rng, progress, threads=self._threads).state
+        return self.particle_search.optimise(
+            start, grid, targets, stages, iterations, rng, progress, threads=self._threads
+        ).state
 
-    def finish(self, body: BodyState, cloud: Cloud, targets: JointTargets, steps: int) -> BodyState:
+    def refine(self, body: BodyState, cloud: Cloud, targets: JointTargets, steps: int) -> BodyState:
         """The body after `steps` of the Gauss-Newton over all parts."""
-        terms = [cloud.free_space] if isinstance(cloud, ViewCloud) else []
+        terms = [cloud.free_space] if isinstance(cloud, SingleViewCloud) else []
         return self.refiner.run(body, cloud, targets, RefineWeights(iterations=steps), terms)
 
-    def candidate(self, body: BodyState, cloud: Cloud) -> Candidate:
+    def candidate(self, body: BodyState, cloud: Cloud) -> BodyCandidate:
         """A hypothesis after a short finish, judged."""
         steps = min(HYPOTHESIS_STEPS, self._settings.refine_iterations)
-        state = self.finish(body, cloud, JointTargets.none(self._model), steps)
-        return Candidate(state, judged(self._model, self._model.vertices(state), cloud))
+        state = self.refine(body, cloud, JointTargets.none(self._model), steps)
+        return BodyCandidate(state, assess_fit(self._model, self._model.vertices(state), cloud))
 
-    def _two_bodies(
+    def _both_headings(
         self, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator, progress: Progress, share: float = 1.0
-    ) -> list[Candidate]:
+    ) -> list[BodyCandidate]:
         """Search with unknown yaw: the body found and the best one that faces the other way, the closer one first.
 
         `share` is of the usual particles and rounds.
@@ -162,51 +166,57 @@ class BodyFinder:
         particles, iterations = (
             max(1, round(share * count)) for count in (self._settings.particles, self._settings.iterations)
         )
-        bodies = sampled_bodies(self._model, cloud.points.mean(axis=0), particles, rng)
+        bodies = sample_bodies(self._model, cloud.points.mean(axis=0), particles, rng)
         noise = WalkNoise(center=0.05, rotation=0.1, pose=0.0, shape=0.0)
-        start = [self._proposer.walk(group, noise, rng) for group in particles_of(self._model, bodies)]
+        start = [self._proposer.random_walk(group, noise, rng) for group in states_to_particles(self._model, bodies)]
         stages = four_stages(self._model.tree)
-        found = self.search.run(
-            start, grid, none, stages, iterations, rng, part_of(progress, 0.0, 0.8), threads=self._threads
+        found = self.particle_search.optimise(
+            start, grid, none, stages, iterations, rng, sub_progress(progress, 0.0, 0.8), threads=self._threads
         )
         body = self.candidate(found.state, cloud)
-        turned = self.near(turned_around(self._model, body.state), grid, none, rng, part_of(progress, 0.8, 1.0))
+        turned = self.search_near(
+            flip_heading(self._model, body.state), grid, none, rng, sub_progress(progress, 0.8, 1.0)
+        )
         return sorted([body, self.candidate(turned, cloud)], key=lambda candidate: candidate.cost)
 
-    def mended(self, body: Candidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> Candidate:
+    def repair_limbs(
+        self, body: BodyCandidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator
+    ) -> BodyCandidate:
         """The body with limbs moved to where they lie closer, while one seems to be in a wrong place."""
         for _ in range(self._settings.limb_rounds):
-            if not body.judgement.doubtful or body.cost > HOPELESS:
+            if not body.quality.limb_suspect or body.cost > HOPELESS:
                 break
             states = [body.state, *self._limbs_moved(body, cloud, grid, rng)]
-            candidates = ordered(lambda state: self.candidate(state, cloud), states, self._threads)
+            candidates = parallel_map(lambda state: self.candidate(state, cloud), states, self._threads)
             closest = min(candidates, key=lambda candidate: candidate.cost)
-            wanted = LEAP if body.judgement.uncovered > MOSTLY_OFF else CLOSER
+            wanted = LEAP if body.quality.uncovered > MOSTLY_OFF else CLOSER
             body, before = min(body, closest, key=lambda candidate: candidate.cost), body
             if closest.cost > wanted * before.cost:
                 break
         return body
 
-    def _limbs_moved(self, body: Candidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator) -> list[BodyState]:
+    def _limbs_moved(
+        self, body: BodyCandidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator
+    ) -> list[BodyState]:
         """The closest of the bodies with limbs searched anew, and those with a limb that is off as it usually hangs.
 
         Several limbs at once are searched when much of the cloud is uncovered.
         """
         groups = limb_groups(self._model.tree)
         limbs = groups[:SINGLE_LIMBS]
-        if body.judgement.uncovered <= RELIABLY_UNCOVERED:
+        if body.quality.uncovered <= RELIABLY_UNCOVERED:
             groups = limbs
-        found = ordered(
+        found = parallel_map(
             lambda pair: self.limbs.run(body.state, pair[0], cloud, grid, pair[1]),
             list(zip(groups, rng.spawn(len(groups)), strict=True)),
             self._threads,
         )
         bodies = [state for state in found if state is not None]
         bodies.sort(key=lambda state: two_way_distance(self._model.vertices(state), self._model.faces, cloud))
-        off = [limb for limb in limbs if body.judgement.part_confidence[list(limb)].min() < LIMB_OFF]
-        return bodies[:LIMBS_FINISHED] + [self.limbs.usual(body.state, limb) for limb in off]
+        off = [limb for limb in limbs if body.quality.part_confidence[list(limb)].min() < LIMB_OFF]
+        return bodies[:LIMBS_FINISHED] + [self.limbs.mean_limb(body.state, limb) for limb in off]
 
 
-def part_of(progress: Progress, low: float, high: float) -> Progress:
+def sub_progress(progress: Progress, low: float, high: float) -> Progress:
     """Progress of one stretch of the work."""
     return lambda done: progress(low + (high - low) * done)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from flowing_puppet_ros.body.refine.gauss_newton import Refiner, RefineWeights
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model import rotation as so3
@@ -66,7 +66,7 @@ def joint_targets(model: StitchedPuppet, initial: Mapping[str, tuple[float, floa
     return JointTargets(points, weight)
 
 
-def body_from_joints(model: StitchedPuppet, refiner: Refiner, targets: JointTargets) -> BodyState:
+def body_from_joints(model: StitchedPuppet, refiner: GaussNewton, targets: JointTargets) -> BodyState:
     """Place all parts so that the model's joints come to lie on the targets.
 
     The trunk is aligned by Procrustes, every other part is turned the shortest way towards its far joint, and a
@@ -126,7 +126,7 @@ def _shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return so3.exp(axis / np.linalg.norm(axis) * np.arctan2(sine, cosine))
 
 
-def sampled_bodies(model: StitchedPuppet, center: np.ndarray, count: int, rng: np.random.Generator) -> list[BodyState]:
+def sample_bodies(model: StitchedPuppet, center: np.ndarray, count: int, rng: np.random.Generator) -> list[BodyState]:
     """Draw upright bodies of mean shape with the torso at `center` (3,) and uniformly random yaw.
 
     The yaws are spread evenly with one random offset, so that no quarter of the circle is left out.
@@ -141,7 +141,7 @@ def sampled_bodies(model: StitchedPuppet, center: np.ndarray, count: int, rng: n
     return bodies
 
 
-def turned_around(model: StitchedPuppet, state: BodyState) -> BodyState:
+def flip_heading(model: StitchedPuppet, state: BodyState) -> BodyState:
     """The hypothesis that the body faces the other way: its left limbs take the places of its right ones.
 
     Every part is turned by half a circle about the vertical through its own axis; deformations are forgotten.

@@ -11,15 +11,15 @@ import numpy as np
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import farthest_points
-from flowing_puppet_ros.body.cloud.single_view import ViewCloud
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.search.part_points import PartPoints, PointSet
-from flowing_puppet_ros.body.search.particles import Particles, particles_of, state_of
+from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
 from flowing_puppet_ros.evidence.cloud.one_sided import distances, mean_distance
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 BANK, YAWS = 200, 16
-PROMISE_BANK, PROMISE_TARGETS = 40, 100
+COARSE_BANK, COARSE_TARGETS = 40, 100
 """Bodies and points of the cloud by which frames are compared."""
 TARGETS = 250
 """Points of the cloud that must be covered."""
@@ -35,7 +35,7 @@ JOINT_RIDGE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Coarse:
+class CoarseCloud:
     """A cloud with the few of its points that must be covered.
 
     Attributes:
@@ -47,13 +47,13 @@ class Coarse:
     targets: np.ndarray
 
     @classmethod
-    def of(cls, cloud: Cloud, targets: int = TARGETS) -> Coarse:
+    def of(cls, cloud: Cloud, targets: int = TARGETS) -> CoarseCloud:
         """Choose the targets."""
         return cls(cloud, cloud.points[farthest_points(cloud.points, targets)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Covered:
+class CoverageCost:
     """Whole bodies against a cloud.
 
     Attributes:
@@ -65,7 +65,7 @@ class Covered:
     distance: np.ndarray
 
 
-class BodyBank:
+class PoseBank:
     """Bodies of one model."""
 
     def __init__(self, model: StitchedPuppet, points: tuple[PartPoints, ...]) -> None:
@@ -77,39 +77,39 @@ class BodyBank:
         spread = [np.linalg.inv(pair.covariance[:3, :3] + JOINT_RIDGE**2 * np.eye(3)) for pair in model.pairwise]
         self._joints = [(pair.mean[:3], precision) for pair, precision in zip(model.pairwise, spread, strict=True)]
 
-    def best(self, coarse: Coarse, count: int) -> list[BodyState]:
+    def best(self, coarse: CoarseCloud, count: int) -> list[BodyState]:
         """The bank's bodies that explain a cloud best, each the best of its yaw and moved to the cloud."""
         bodies = self._placed(bank_bodies(self._model), coarse)
-        cost = self.judge(bodies, coarse, range(len(bodies))).cost.reshape(YAWS, BANK)
+        cost = self.coverage_cost(bodies, coarse, range(len(bodies))).cost.reshape(YAWS, BANK)
         yaws = np.argsort(cost.min(axis=1), kind="stable")[:count]
         rows = [yaw * BANK + int(cost[yaw].argmin()) for yaw in yaws]
-        return [state_of(self._model, bodies, np.full(len(bodies), row)) for row in rows]
+        return [particles_to_state(self._model, bodies, np.full(len(bodies), row)) for row in rows]
 
-    def promise(self, cloud: Cloud) -> float:
+    def coarse_cost(self, cloud: Cloud) -> float:
         """How well, in metres, any upright body of a small bank explains a cloud; lower is better.
 
         Tells a cloud whose z axis is the body's long axis from the same cloud turned over.
         """
-        coarse = Coarse.of(cloud, PROMISE_TARGETS)
-        rows = np.flatnonzero(np.arange(YAWS * BANK) % BANK < PROMISE_BANK)
+        coarse = CoarseCloud.of(cloud, COARSE_TARGETS)
+        rows = np.flatnonzero(np.arange(YAWS * BANK) % BANK < COARSE_BANK)
         bodies = self._placed([group.take(rows) for group in bank_bodies(self._model)], coarse)
-        return float(self.judge(bodies, coarse, range(len(bodies))).cost.min())
+        return float(self.coverage_cost(bodies, coarse, range(len(bodies))).cost.min())
 
-    def cost(self, body: BodyState, coarse: Coarse) -> float:
+    def cost(self, body: BodyState, coarse: CoarseCloud) -> float:
         """How badly, in metres, one body explains a cloud."""
-        groups = particles_of(self._model, [body])
-        return float(self.judge(groups, coarse, range(len(groups))).cost[0])
+        groups = states_to_particles(self._model, [body])
+        return float(self.coverage_cost(groups, coarse, range(len(groups))).cost[0])
 
-    def judge(
-        self, bodies: list[Particles], coarse: Coarse, parts: Sequence[int], already: np.ndarray | float = np.inf
-    ) -> Covered:
+    def coverage_cost(
+        self, bodies: list[Particles], coarse: CoarseCloud, parts: Sequence[int], already: np.ndarray | float = np.inf
+    ) -> CoverageCost:
         """Judge bodies (row p of every part is body p) by some of their parts.
 
         The cost is the mean distance of the cloud to the body, the mean distance by which the body contradicts the
         cloud, and what unusual joints cost. `already` (1, M) is how far the targets are from the other parts.
         """
         points, normals = self._points(bodies, parts)
-        if isinstance(coarse.cloud, ViewCloud):
+        if isinstance(coarse.cloud, SingleViewCloud):
             misfit, able = coarse.cloud.view.misfit(points, normals)
         else:
             misfit, able = mean_distance(points, coarse.targets), np.ones(points.shape[:2], dtype=np.bool_)
@@ -121,14 +121,14 @@ class BodyBank:
                 above = bodies[self._model.tree.parents[part]].rotation.transpose(0, 2, 1)
                 gap = so3.log(above @ bodies[part].rotation) - mean
                 cost = cost + PRIOR * ((gap @ precision) * gap).sum(axis=1)
-        return Covered(cost, distance)
+        return CoverageCost(cost, distance)
 
-    def _placed(self, bodies: list[Particles], coarse: Coarse) -> list[Particles]:
+    def _placed(self, bodies: list[Particles], coarse: CoarseCloud) -> list[Particles]:
         """Move each body so that the mean of its surface, or of what of it faces the sensor, is the cloud's."""
         points, normals = self._points(bodies, range(len(bodies)))
         middle = coarse.targets.mean(axis=0)
         seen = np.ones((*points.shape[:2], 1), dtype=bool)
-        if isinstance(coarse.cloud, ViewCloud):
+        if isinstance(coarse.cloud, SingleViewCloud):
             seen = (normals @ (middle - coarse.cloud.view.viewpoint) < 0)[:, :, None]
         shift = middle - (points * seen).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
         return [Particles(group.center + shift, group.rotation, group.pose, group.shape) for group in bodies]
@@ -144,7 +144,7 @@ class BodyBank:
 def bank_bodies(model: StitchedPuppet) -> list[Particles]:
     """Per part the bank's bodies in every yaw; made once for a model."""
     rng = np.random.default_rng(0)
-    bank = particles_of(model, [model.sample(rng, shape_scale=0.0) for _ in range(BANK)])
+    bank = states_to_particles(model, [model.sample(rng, shape_scale=0.0) for _ in range(BANK)])
     turns = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
     return [Particles.join([_turned(group, turn) for turn in turns]) for group in bank]
 

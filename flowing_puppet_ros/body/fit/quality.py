@@ -16,17 +16,17 @@ WIDTH = 0.04  # metres: a vertex or point that far from the other surface counts
 UNCOVERED = 0.04  # metres
 # A body with more of the cloud uncovered, or a part less on the cloud, has a limb in a wrong place, or may have.
 MUCH_UNCOVERED, LITTLE_ON_CLOUD = 0.005, 0.3
-LEAST_SEEN = 0.1
+MIN_SEEN = 0.1
 RELIABLE, RELIABLY_UNCOVERED = 0.6, 0.05
 # Metres between the centres of two neighbours that lie in each other: a little more than what the search forbids (Eq.
 # 51), less than in an elbow that is bent as far as it goes (0.064 in a telephone call).
-FOLDED = 0.055
+SELF_INTERSECTING = 0.055
 # What a folded limb costs in metres of distance: limbs vanish into limbs where they would otherwise be in the air.
-FOLDED_COST = 0.003
+SELF_INTERSECTION_COST = 0.003
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judgement:
+class FitQuality:
     """A body against a cloud.
 
     Attributes:
@@ -42,19 +42,19 @@ class Judgement:
     seen: np.ndarray
     explained: float
     uncovered: float
-    folded: int
+    self_intersections: int
     distance: float
 
     @property
     def cost(self) -> float:
         """What hypotheses are compared by, metres."""
-        return self.distance + FOLDED_COST * self.folded
+        return self.distance + SELF_INTERSECTION_COST * self.self_intersections
 
     @property
-    def doubtful(self) -> bool:
+    def limb_suspect(self) -> bool:
         """Whether a limb may be in a wrong place."""
         least = self.part_confidence[self.seen].min(initial=1.0)
-        return self.uncovered > MUCH_UNCOVERED or self.folded > 0 or bool(least < LITTLE_ON_CLOUD)
+        return self.uncovered > MUCH_UNCOVERED or self.self_intersections > 0 or bool(least < LITTLE_ON_CLOUD)
 
     @property
     def confidence(self) -> float:
@@ -66,7 +66,7 @@ class Judgement:
             return 0.0
         seen = self.part_confidence[self.seen]
         weakest = min(1.0, float(seen.min()) / LITTLE_ON_CLOUD)
-        return float(np.sqrt(seen.mean() * self.explained)) * (1 + weakest) / 2 / (1 + self.folded)
+        return float(np.sqrt(seen.mean() * self.explained)) * (1 + weakest) / 2 / (1 + self.self_intersections)
 
     @property
     def reliable(self) -> bool:
@@ -78,14 +78,14 @@ class Judgement:
         return self.confidence >= RELIABLE and self.uncovered <= RELIABLY_UNCOVERED
 
 
-def judged(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> Judgement:
+def assess_fit(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> FitQuality:
     """Compare a body with vertices (V, 3), metres, with a cloud.
 
     A vertex or a cloud point counts by the Geman-McClure weight of its distance to the other surface at 4 cm; a vertex
     counts nothing where the normals disagree.
     """
     normals = vertex_normals(vertices, model.faces)
-    distance, index = cloud.tree.query(vertices)
+    distance, index = cloud.nearest.query(vertices)
     weight = (WIDTH**2 / (WIDTH**2 + distance**2)) ** 2
     weight *= (normals * cloud.normals[index]).sum(axis=1) > 0
     seen = cloud.sees(vertices, normals)
@@ -95,11 +95,11 @@ def judged(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> Judgeme
     back = NearestPoints(vertices).query(cloud.points)[0]
     centers = np.stack([vertices[owner == part].mean(axis=0) for part in range(parts)])
     apart = [np.linalg.norm(centers[parent] - centers[child]) for parent, child in model.tree.edges]
-    return Judgement(
+    return FitQuality(
         share,
-        count >= LEAST_SEEN * size,
+        count >= MIN_SEEN * size,
         float(((WIDTH**2 / (WIDTH**2 + back**2)) ** 2).mean()),
         float((back > UNCOVERED).mean()),
-        int(np.sum(np.array(apart) < FOLDED)),
+        int(np.sum(np.array(apart) < SELF_INTERSECTING)),
         two_way_distance(vertices, model.faces, cloud),
     )

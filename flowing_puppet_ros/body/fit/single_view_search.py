@@ -13,14 +13,14 @@ from collections.abc import Callable
 
 import numpy as np
 
-from flowing_puppet_ros.body.cloud.single_view import ViewCloud
-from flowing_puppet_ros.body.fit.pose_bank import BodyBank, Coarse
-from flowing_puppet_ros.body.refine.gauss_newton import Refiner, RefineWeights
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
+from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.search.particles import particles_of, state_of
+from flowing_puppet_ros.body.search.particles import particles_to_state, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.parallel import ordered
+from flowing_puppet_ros.parallel import parallel_map
 
 STARTS, KEPT = 32, 8
 LIMB_SAMPLES, LIMB_ROUNDS = 600, 3
@@ -33,11 +33,11 @@ ROUGH = RefineWeights(sigma_start=0.2, sigma_end=0.08, iterations=8)
 CLOSE = RefineWeights(sigma_start=0.06, sigma_end=0.04, iterations=5)
 
 
-class ViewSearch:
+class SingleViewSearch:
     """Finds bodies of one model in clouds from one side."""
 
     def __init__(
-        self, model: StitchedPuppet, bank: BodyBank, proposer: Proposer, refiner: Refiner, threads: int = 1
+        self, model: StitchedPuppet, bank: PoseBank, proposer: Proposer, refiner: GaussNewton, threads: int = 1
     ) -> None:
         self._model = model
         self._threads = threads
@@ -51,7 +51,7 @@ class ViewSearch:
         ]
 
     def run(
-        self, cloud: ViewCloud, rng: np.random.Generator, steps: int, progress: Callable[[float], None]
+        self, cloud: SingleViewCloud, rng: np.random.Generator, steps: int, progress: Callable[[float], None]
     ) -> BodyState:
         """Find the body of a cloud in metres, z up, of which nothing is known but that it is upright.
 
@@ -61,7 +61,7 @@ class ViewSearch:
             steps: Gauss-Newton steps of the finish.
             progress: called with the fraction done.
         """
-        coarse = Coarse.of(cloud)
+        coarse = CoarseCloud.of(cloud)
         starts = self._starts(cloud, coarse)
         progress(0.2)
 
@@ -70,25 +70,25 @@ class ViewSearch:
             body = self._refined(body, cloud, _finish(cloud, steps))
             return self._bank.cost(body, coarse), body
 
-        found = ordered(improved, list(zip(starts, rng.spawn(len(starts)), strict=True)), self._threads)
+        found = parallel_map(improved, list(zip(starts, rng.spawn(len(starts)), strict=True)), self._threads)
         progress(1.0)
         return min(found, key=lambda pair: pair[0])[1]
 
-    def _starts(self, cloud: ViewCloud, coarse: Coarse) -> list[BodyState]:
+    def _starts(self, cloud: SingleViewCloud, coarse: CoarseCloud) -> list[BodyState]:
         """The best of the bank's bodies after a few steps of Gauss-Newton."""
         best = self._bank.best(coarse, STARTS)
-        bodies = ordered(lambda body: self._refined(body, cloud, ROUGH), best, self._threads)
+        bodies = parallel_map(lambda body: self._refined(body, cloud, ROUGH), best, self._threads)
         return sorted(bodies, key=lambda body: self._bank.cost(body, coarse))[:KEPT]
 
     def _with_better_limbs(
-        self, body: BodyState, cloud: ViewCloud, coarse: Coarse, rng: np.random.Generator
+        self, body: BodyState, cloud: SingleViewCloud, coarse: CoarseCloud, rng: np.random.Generator
     ) -> BodyState:
         """Hang every limb anew in many ways, keep what is better after Gauss-Newton, until nothing is."""
         cost = self._bank.cost(body, coarse)
         for _ in range(LIMB_ROUNDS):
             changed = False
             for limb in self._limbs:
-                hung = self._hung(body, limb, coarse, cost + TRIED, rng)
+                hung = self._resample_limb(body, limb, coarse, cost + TRIED, rng)
                 if hung is None:
                     continue
                 hung = self._refined(hung, cloud, CLOSE)
@@ -99,32 +99,32 @@ class ViewSearch:
                 break
         return body
 
-    def _hung(
-        self, body: BodyState, limb: tuple[int, ...], coarse: Coarse, limit: float, rng: np.random.Generator
+    def _resample_limb(
+        self, body: BodyState, limb: tuple[int, ...], coarse: CoarseCloud, limit: float, rng: np.random.Generator
     ) -> BodyState | None:
         """The body with the best of many samples of one limb, None when all cost more than `limit`."""
-        groups = particles_of(self._model, [body])
+        groups = states_to_particles(self._model, [body])
         rest = [part for part in range(len(groups)) if part not in limb]
-        without = self._bank.judge(groups, coarse, rest)
+        without = self._bank.coverage_cost(groups, coarse, rest)
         for part in limb:
             above = groups[self._model.tree.parents[part]]
             above = above if len(above) > 1 else above.take(np.zeros(LIMB_SAMPLES, dtype=np.int64))
-            groups[part] = self._proposer.hang(part, above, body.shape[part], rng)
-        judged = self._bank.judge(groups, coarse, limb, without.distance)
+            groups[part] = self._proposer.attach_to_parent(part, above, body.shape[part], rng)
+        judged = self._bank.coverage_cost(groups, coarse, limb, without.distance)
         total = judged.cost + without.cost - without.distance.mean()
         best = int(total.argmin())
         if total[best] > limit:
             return None
         pick = np.zeros(len(groups), dtype=np.int64)
         pick[list(limb)] = best
-        return state_of(self._model, groups, pick)
+        return particles_to_state(self._model, groups, pick)
 
-    def _refined(self, body: BodyState, cloud: ViewCloud, weights: RefineWeights) -> BodyState:
+    def _refined(self, body: BodyState, cloud: SingleViewCloud, weights: RefineWeights) -> BodyState:
         none = JointTargets.none(self._model)
         return self._refiner.run(body, cloud, none, weights, terms=[cloud.free_space])
 
 
-def _finish(cloud: ViewCloud, steps: int) -> RefineWeights:
+def _finish(cloud: SingleViewCloud, steps: int) -> RefineWeights:
     """Noise of centimetres must not bend a body: sparse clouds take a wider kernel and heavier priors."""
     if len(cloud.points) >= SPARSE:
         return RefineWeights(sigma_start=0.08, iterations=steps)

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, checked_cloud
-from flowing_puppet_ros.body.fit.hypotheses import Progress, part_of
-from flowing_puppet_ros.body.scans.scan_frame import Frame, upright
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, check_cloud
+from flowing_puppet_ros.body.fit.hypotheses import Progress, sub_progress
+from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, rotation_to_z_up
 
 MOST_FITS = 3
 
@@ -23,7 +23,7 @@ def fit_in_best_frame(
     ups: Sequence[np.ndarray],
     sensor: np.ndarray | None = None,
     progress: Progress,
-) -> tuple[Frame, BodyFit]:
+) -> tuple[ScanFrame, BodyFit]:
     """Fit a cloud of one person in the frame that explains it best.
 
     The directions are ordered by `BodyFitter.promise`; at most three are fitted in, until a fit is reliable.
@@ -43,18 +43,18 @@ def fit_in_best_frame(
     Raises:
         InputError: when the cloud cannot be the surface of a person.
     """
-    points, normals = checked_cloud(points, normals)
-    frames = [Frame(scale, upright(up)) for up in ups]
+    points, normals = check_cloud(points, normals)
+    frames = [ScanFrame(scale, rotation_to_z_up(up)) for up in ups]
     if len(frames) > 1:
-        promise = [fitter.promise(frame.to_body(points), _moved(frame, sensor)) for frame in frames]
+        promise = [fitter.coarse_cost(frame.to_body(points), _moved(frame, sensor)) for frame in frames]
         frames = [frames[index] for index in np.argsort(promise, kind="stable")[:MOST_FITS]]
-    fits: list[tuple[Frame, BodyFit]] = []
+    fits: list[tuple[ScanFrame, BodyFit]] = []
     for turn, frame in enumerate(frames):
         fit = fitter.fit(
             frame.to_body(points),
             None if normals is None else normals @ frame.rotation.T,
             viewpoint=_moved(frame, sensor),
-            progress=part_of(progress, turn / len(frames), (turn + 1) / len(frames)),
+            progress=sub_progress(progress, turn / len(frames), (turn + 1) / len(frames)),
         )
         fits.append((frame, fit))
         if fit.reliable:
@@ -63,5 +63,5 @@ def fit_in_best_frame(
     return min(fits, key=lambda pair: pair[1].two_way_distance)
 
 
-def _moved(frame: Frame, sensor: np.ndarray | None) -> np.ndarray | None:
+def _moved(frame: ScanFrame, sensor: np.ndarray | None) -> np.ndarray | None:
     return None if sensor is None else frame.to_body(sensor)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, Matches, Quadratic
-from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, Placed
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic
+from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, PosedPoints
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -28,7 +28,7 @@ JOINT_WIDTH = 2.5
 MATCHED = 3000
 
 # What else draws the body's vertices (V, 3), given the width in metres of the robust kernel at this step.
-SurfaceTerm = Callable[[np.ndarray, float], Quadratic]
+SurfaceTerm = Callable[[np.ndarray, float], VertexQuadratic]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +64,7 @@ class RefineWeights:
 LOOSE = RefineWeights(stitch=0.01, sigma_start=0.05, sigma_end=0.05, iterations=6)
 
 
-class Refiner:
+class GaussNewton:
     """Gauss-Newton for one model."""
 
     def __init__(self, model: StitchedPuppet) -> None:
@@ -94,7 +94,7 @@ class Refiner:
         )
         drawn = list(terms)
         if cloud is not None:
-            matches = Matches(cloud, MATCHED)
+            matches = TwoWayCorrespondence(cloud, MATCHED)
             drawn.append(lambda vertices, sigma: matches.attract(vertices, self._model.faces, sigma))
         ratio = weights.sigma_end / weights.sigma_start
         for step in range(weights.iterations):
@@ -121,13 +121,13 @@ class Refiner:
         equations.add_joint_prior(weights.pairwise, state, hessian, gradient)
         self._add_priors(state, weights, hessian, gradient)
         hessian[np.diag_indices(equations.size)] += 1e-9 + 1e-3 * hessian.diagonal()
-        return self._moved(state, solve(hessian, -gradient, lower=True, assume_a="pos", overwrite_a=True))
+        return self._retract(state, solve(hessian, -gradient, lower=True, assume_a="pos", overwrite_a=True))
 
     def _add_joints(
         self,
         targets: JointTargets,
         width: float,
-        placed: Placed,
+        placed: PosedPoints,
         turns: np.ndarray,
         hessian: np.ndarray,
         gradient: np.ndarray,
@@ -156,7 +156,7 @@ class Refiner:
         expected = 0.0 if weights.shape_center is None else weights.shape_center
         gradient[shape] += weights.shape * (state.shape[0] - expected)
 
-    def _moved(self, state: BodyState, step: np.ndarray) -> BodyState:
+    def _retract(self, state: BodyState, step: np.ndarray) -> BodyState:
         first, (rows, parts, numbers) = self._equations.first, self._equations.coefficients
         pose = state.pose.copy()
         rigid = step[first[:-1, None] + np.arange(6)]

@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, Matches
-from flowing_puppet_ros.body.refine.gauss_newton import Refiner, RefineWeights
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -22,10 +22,10 @@ CLOSE = 0.015
 """Metres at which a vertex or point counts as half explained."""
 
 
-def with_hands(model: StitchedPuppet, refiner: Refiner, state: BodyState, cloud: Cloud) -> BodyState:
+def refine_hand_pose(model: StitchedPuppet, refiner: GaussNewton, state: BodyState, cloud: Cloud) -> BodyState:
     """Return the body with the hands that lie closest to a dense cloud seen from all sides, each chosen by itself."""
     hands = [part for part, name in enumerate(model.tree.names) if name.endswith("_hand")]
-    none, matches = JointTargets.none(model), Matches(cloud)
+    none, matches = JointTargets.none(model), TwoWayCorrespondence(cloud)
     tried = [state]
     for start in STARTS:
         pose = state.pose.copy()
@@ -43,7 +43,7 @@ def with_hands(model: StitchedPuppet, refiner: Refiner, state: BodyState, cloud:
     return refiner.run(BodyState(center, rotation, pose, state.shape), cloud, none, STEPS)
 
 
-def _costs(model: StitchedPuppet, body: BodyState, matches: Matches, hands: list[int]) -> list[float]:
+def _costs(model: StitchedPuppet, body: BodyState, matches: TwoWayCorrespondence, hands: list[int]) -> list[float]:
     """Share of each hand that is not on the cloud and of the cloud about it that is not on the hand, 0 to 2."""
     there, vertex, back = matches.nearest(model.vertices(body), model.faces)
     away, astray = (gap**2 / (gap**2 + CLOSE**2) for gap in (there, back))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix, diags_array, eye_array
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, Matches
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence
 
 # Weight of the squared offsets themselves: where the cloud says nothing at all, nothing moves.
 ANCHOR = 0.01
@@ -26,7 +26,7 @@ MAX_SOLVER_STEPS = 60
 
 
 @dataclass(frozen=True, slots=True)
-class FinishWeights:
+class NonRigidWeights:
     """How far and how stiffly vertices move.
 
     Attributes:
@@ -43,7 +43,7 @@ class FinishWeights:
     iterations: int = 6
 
 
-def umbrella(faces: np.ndarray, count: int) -> csr_matrix:
+def umbrella_laplacian(faces: np.ndarray, count: int) -> csr_matrix:
     """The operator (V, V) that takes from every vertex's value the mean of its neighbours' along the edges of faces."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
@@ -52,13 +52,13 @@ def umbrella(faces: np.ndarray, count: int) -> csr_matrix:
     return (diags_array((degree > 0).astype(float)) - linked).tocsr()
 
 
-class SurfaceFinish:
+class NonRigidRefinement:
     """The finish for meshes of one topology; what depends on the topology alone is computed once."""
 
-    def __init__(self, faces: np.ndarray, count: int, weights: FinishWeights) -> None:
+    def __init__(self, faces: np.ndarray, count: int, weights: NonRigidWeights) -> None:
         self._faces = faces
         self._weights = weights
-        operator = umbrella(faces, count)
+        operator = umbrella_laplacian(faces, count)
         self._stiff = (weights.stiffness * (operator.T @ operator) + ANCHOR * eye_array(count)).tocsr()
         # The matches couple the coordinates of a vertex and are different every time; without that coupling the system
         # is one and the same for all bodies, and its factors precondition conjugate gradients well.
@@ -70,7 +70,7 @@ class SurfaceFinish:
     def run(self, vertices: np.ndarray, cloud: Cloud) -> np.ndarray:
         """Move fitted vertices (V, 3), metres, onto a cloud that shows all sides; (V, 3)."""
         weights, count = self._weights, len(vertices)
-        matches, offsets = Matches(cloud), np.zeros_like(vertices)
+        matches, offsets = TwoWayCorrespondence(cloud), np.zeros_like(vertices)
         ratio = weights.sigma_end / weights.sigma_start
         for turn in range(weights.iterations):
             sigma = weights.sigma_start * ratio ** (turn / max(weights.iterations - 1, 1))

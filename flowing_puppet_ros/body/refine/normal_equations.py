@@ -22,7 +22,7 @@ PRIOR_RIDGE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Placed:
+class PosedPoints:
     """A body's points: (M, 3) of all parts one after the other in their own frames and in the world, metres.
 
     `vertices` (V, 3) are the template's, the mean of the copies in different parts.
@@ -87,7 +87,7 @@ class NormalEquations:
         own = np.arange(self.first[part], self.first[part + 1])
         return np.concatenate([own, np.arange(self.first[-1], self.size)])
 
-    def jacobians(self, placed: Placed) -> list[np.ndarray]:
+    def jacobians(self, placed: PosedPoints) -> list[np.ndarray]:
         """Per part the derivatives (N_i, 3, unknowns) of its points in its own frame."""
         shapes, made = self.size - int(self.first[-1]), []
         for part, (start, end) in enumerate(pairwise(self._starts)):
@@ -96,16 +96,18 @@ class NormalEquations:
             made.append(jacobian)
         return made
 
-    def placed(self, state: BodyState) -> Placed:
+    def placed(self, state: BodyState) -> PosedPoints:
         """Where the points of a body are; its shape is that of the first part."""
         body = (state.center, state.rotation, state.pose, state.shape[0])
-        return Placed(*_placed(*body, self._mean, self.basis, self._poses, self._starts, self._rows, self.share))
+        return PosedPoints(
+            *_pose_points(*body, self._mean, self.basis, self._poses, self._starts, self._rows, self.share)
+        )
 
     def add_surface(
         self,
         matrix: np.ndarray,
         vector: np.ndarray,
-        placed: Placed,
+        placed: PosedPoints,
         turns: np.ndarray,
         hessian: np.ndarray,
         gradient: np.ndarray,
@@ -120,7 +122,7 @@ class NormalEquations:
         )  # fmt: skip
 
     def add_stitching(
-        self, strength: float, placed: Placed, turns: np.ndarray, hessian: np.ndarray, gradient: np.ndarray
+        self, strength: float, placed: PosedPoints, turns: np.ndarray, hessian: np.ndarray, gradient: np.ndarray
     ) -> None:
         """Add `strength` times the mean squared gap of every interface (Eq. 48)."""
         _add_stitching(
@@ -139,7 +141,7 @@ class NormalEquations:
 
 
 @njit(cache=True, nogil=True)
-def _placed(  # type: ignore[no-untyped-def]
+def _pose_points(  # type: ignore[no-untyped-def]
     center, turns, pose, shape, mean, basis, poses, starts, rows, share
 ):
     local, world = np.empty_like(mean), np.empty_like(mean)

@@ -32,7 +32,7 @@ def axis_of(name: str) -> np.ndarray:
     return (-1.0 if name[0] == "-" else 1.0) * np.eye(3)["xyz".index(name[-1])]
 
 
-def upright(up: np.ndarray) -> np.ndarray:
+def rotation_to_z_up(up: np.ndarray) -> np.ndarray:
     """The rotation (3, 3) that takes the direction `up` (3,) to z.
 
     Of the axis nearest to it the next one, in the order x y z x, becomes x: people in frames with y up look along z.
@@ -49,7 +49,7 @@ def upright(up: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class ScanFrame:
     """metres with z up = scale * rotation * the scan's coordinates.
 
     Attributes:

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.body.search.energy import JointTargets, Judged, stitching_costs
-from flowing_puppet_ros.body.search.levenberg import improve
+from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles, stitching_costs
+from flowing_puppet_ros.body.search.levenberg import levenberg_marquardt
 from flowing_puppet_ros.body.search.part_points import PartPoints
-from flowing_puppet_ros.body.search.particles import Particles, particles_of, state_of
+from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer
 from flowing_puppet_ros.body.search.schedule import Stage, four_stages
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, DataCost
 from flowing_puppet_ros.inference.diverse import select_diverse
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product, message_foundation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.parallel import ordered
+from flowing_puppet_ros.parallel import parallel_map
 
 EXCLUDED = 1e6  # cost of a particle that is not to be used
 NO_GRIDS: Mapping[int, CloudGrid] = {}
@@ -46,7 +46,7 @@ class SearchWeights:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class SearchResult:
     """Result of a search.
 
     Attributes:
@@ -57,11 +57,11 @@ class Found:
 
     state: BodyState
     cost: float
-    judged: list[Judged]
+    scored: list[ScoredParticles]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Turn:
+class _SearchContext:
     """What all iterations of one search share: the cloud of every part, believed joints, and threads."""
 
     grids: list[CloudGrid]
@@ -69,7 +69,7 @@ class _Turn:
     threads: int
 
 
-class Search:
+class BodyParticleSearch:
     """D-PMP for one model; one instance serves any number of clouds."""
 
     def __init__(self, model: StitchedPuppet, points: tuple[PartPoints, ...], weights: SearchWeights) -> None:
@@ -78,7 +78,7 @@ class Search:
         self._weights = weights
         self._proposer = Proposer(model, points)
 
-    def run(
+    def optimise(
         self,
         start: list[Particles],
         grid: CloudGrid,
@@ -90,7 +90,7 @@ class Search:
         own: Mapping[int, CloudGrid] = NO_GRIDS,
         keep: int | None = None,
         threads: int = 1,
-    ) -> Found:
+    ) -> SearchResult:
         """Improve particles and return the best body.
 
         Args:
@@ -105,45 +105,50 @@ class Search:
             keep: particles a part that go on after all of the start were improved; None for as many as there are.
             threads: how many; the result does not depend on it.
         """
-        turn = _Turn([own.get(part, grid) for part in range(len(start))], targets, threads)
+        turn = _SearchContext([own.get(part, grid) for part in range(len(start))], targets, threads)
         judged = [
-            Judged.judge(points, particles, grid, targets)
+            ScoredParticles.judge(points, particles, grid, targets)
             for points, particles, grid in zip(self._points, start, turn.grids, strict=True)
         ]
         searched = [part for part, particles in enumerate(start) if len(particles) > 1]
         counts = [len(particles) if keep is None else min(keep, len(particles)) for particles in start]
         if keep is not None:
-            judged = self._go_on(judged, {part: start[part] for part in searched}, counts, stages[0], turn)
+            judged = self._improve_and_select(judged, {part: start[part] for part in searched}, counts, stages[0], turn)
         best = self._solve(judged, stages[0])[0].assignment
         for iteration in range(iterations):
             stage = next(stage for stage in stages if iteration < stage.until * iterations or stage is stages[-1])
             proposed = {part: self._propose(part, judged, best, stage, rng) for part in searched}
-            judged = self._go_on(judged, proposed, counts, stage, turn)
+            judged = self._improve_and_select(judged, proposed, counts, stage, turn)
             best = np.zeros(len(judged), dtype=np.int64)
             if progress is not None:
                 progress((iteration + 1) / iterations)
         result, _ = self._solve(judged, stages[-1])
-        return Found(self._body(judged, result), result.cost, judged)
+        return SearchResult(self._body(judged, result), result.cost, judged)
 
-    def modes(self, found: Found, part: int) -> list[BodyState]:
+    def modes(self, found: SearchResult, part: int) -> list[BodyState]:
         """The best body with each of the particles that a search left of a part."""
-        nodes, edges = self._costs(found.judged, four_stages(self._model.tree)[-1])
+        nodes, edges = self._costs(found.scored, four_stages(self._model.tree)[-1])
         bodies = []
         for particle in range(len(nodes[part])):
             only = np.full(len(nodes[part]), EXCLUDED)
             only[particle] = nodes[part][particle]
             costs = [*nodes[:part], only, *nodes[part + 1 :]]
-            bodies.append(self._body(found.judged, max_product(self._model.tree, costs, edges)))
+            bodies.append(self._body(found.scored, max_product(self._model.tree, costs, edges)))
         return bodies
 
-    def _body(self, judged: list[Judged], result: MaxProduct) -> BodyState:
-        return state_of(self._model, [group.particles for group in judged], result.assignment)
+    def _body(self, judged: list[ScoredParticles], result: MaxProduct) -> BodyState:
+        return particles_to_state(self._model, [group.particles for group in judged], result.assignment)
 
-    def _go_on(
-        self, judged: list[Judged], proposed: dict[int, Particles], counts: list[int], stage: Stage, turn: _Turn
-    ) -> list[Judged]:
+    def _improve_and_select(
+        self,
+        judged: list[ScoredParticles],
+        proposed: dict[int, Particles],
+        counts: list[int],
+        stage: Stage,
+        turn: _SearchContext,
+    ) -> list[ScoredParticles]:
         """Improve proposed particles, add them to the present ones, and keep `counts` of each part, the best first."""
-        improved = ordered(
+        improved = parallel_map(
             lambda pair: self._improved(*pair, turn.grids[pair[0]], turn.targets), proposed.items(), turn.threads
         )
         judged = list(judged)
@@ -158,29 +163,31 @@ class Search:
         """Eq. 50 of one body, with every weight as in the last stage of the search."""
         none = JointTargets.none(self._model)
         judged = [
-            Judged.judge(points, group, cloud, none)
-            for points, group in zip(self._points, particles_of(self._model, [state]), strict=True)
+            ScoredParticles.judge(points, group, cloud, none)
+            for points, group in zip(self._points, states_to_particles(self._model, [state]), strict=True)
         ]
         return self._solve(judged, four_stages(self._model.tree)[-1])[0].cost
 
     def _propose(
-        self, part: int, judged: list[Judged], best: np.ndarray, stage: Stage, rng: np.random.Generator
+        self, part: int, judged: list[ScoredParticles], best: np.ndarray, stage: Stage, rng: np.random.Generator
     ) -> Particles:
         if stage.greedy:
             copies = judged[part].particles.take(np.full(len(judged[part].particles), best[part]))
-            return self._proposer.walk(copies, stage.noise, rng, deformation_only=0.5)
+            return self._proposer.random_walk(copies, stage.noise, rng, deformation_only=0.5)
         return self._proposer.propose(part, judged, stage.noise, self._weights.neighbours, rng)
 
-    def _improved(self, part: int, new: Particles, grid: CloudGrid, targets: JointTargets) -> Judged:
-        moved = improve(self._points[part], new, grid, targets, self._weights.lm_steps, self._weights.lm_points)
-        return Judged.judge(self._points[part], moved, grid, targets)
+    def _improved(self, part: int, new: Particles, grid: CloudGrid, targets: JointTargets) -> ScoredParticles:
+        moved = levenberg_marquardt(
+            self._points[part], new, grid, targets, self._weights.lm_steps, self._weights.lm_points
+        )
+        return ScoredParticles.judge(self._points[part], moved, grid, targets)
 
-    def _solve(self, judged: list[Judged], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
+    def _solve(self, judged: list[ScoredParticles], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
         """Run max-product with the weights of a stage."""
         nodes, edges = self._costs(judged, stage)
         return max_product(self._model.tree, nodes, edges), edges
 
-    def _costs(self, judged: list[Judged], stage: Stage) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def _costs(self, judged: list[ScoredParticles], stage: Stage) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Costs of every part's particles and of every edge's pairs with the weights of a stage (Eqs. 50-52)."""
         nodes = [
             beta * (group.distance + self._weights.mismatch * group.mismatch) + group.pull

@@ -43,7 +43,7 @@ class JointTargets:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class ScoredParticles:
     """Particles with all that the energy needs of them, so that kept ones are not computed again.
 
     Attributes:
@@ -61,7 +61,7 @@ class Judged:
     interfaces: dict[int, np.ndarray]
 
     @classmethod
-    def judge(cls, points: PartPoints, particles: Particles, cloud: DataCost, targets: JointTargets) -> Judged:
+    def judge(cls, points: PartPoints, particles: Particles, cloud: DataCost, targets: JointTargets) -> ScoredParticles:
         """Compare particles of one part with the cloud and with believed joints."""
         normals = points.normals @ particles.rotation.transpose(0, 2, 1)
         distance, mismatch = cloud.data_cost(points.surface.world(particles), normals)
@@ -70,9 +70,9 @@ class Judged:
         interfaces = {edge: interface.world(particles) for edge, interface in points.interfaces.items()}
         return cls(particles, distance, mismatch, (gap**2).sum(axis=2) @ weight, interfaces)
 
-    def take(self, index: np.ndarray) -> Judged:
+    def take(self, index: np.ndarray) -> ScoredParticles:
         """Return the judged particles of `index`."""
-        return Judged(
+        return ScoredParticles(
             self.particles.take(index),
             self.distance[index],
             self.mismatch[index],
@@ -80,9 +80,9 @@ class Judged:
             {edge: points[index] for edge, points in self.interfaces.items()},
         )
 
-    def extend(self, other: Judged) -> Judged:
+    def extend(self, other: ScoredParticles) -> ScoredParticles:
         """Return these particles followed by the other ones."""
-        return Judged(
+        return ScoredParticles(
             Particles.join([self.particles, other.particles]),
             np.concatenate([self.distance, other.distance]),
             np.concatenate([self.mismatch, other.mismatch]),

@@ -35,7 +35,7 @@ PartArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, n
 Triple = tuple[float, float, float]
 
 
-def improve(
+def levenberg_marquardt(
     points: PartPoints, particles: Particles, grid: CloudGrid, targets: JointTargets, steps: int, count: int
 ) -> Particles:
     """Run `steps` LM steps on every particle of one part, with the closest points renewed at each step.
@@ -52,13 +52,13 @@ def improve(
         Particles of the same shape coefficients whose sum of squares is not larger.
     """
     center, rotation, pose = particles.center.copy(), particles.rotation.copy(), particles.pose.copy()
-    mean, part = prepared_part(points, particles, targets, min(count, len(points.surface)))
+    mean, part = prepare_part(points, particles, targets, min(count, len(points.surface)))
     cloud = (grid.points, grid.normals, grid.nearest, grid.origin, grid.cell)
-    _improve_all(center, rotation, pose, mean, part, cloud, steps)
+    _optimise_all(center, rotation, pose, mean, part, cloud, steps)
     return Particles(center, rotation, pose, particles.shape)
 
 
-def prepared_part(
+def prepare_part(
     points: PartPoints, particles: Particles, targets: JointTargets, count: int
 ) -> tuple[np.ndarray, PartArrays]:
     """Undeformed points (P, count + M, 3) of every particle, surface before joints, and what all particles share."""
@@ -73,7 +73,7 @@ def prepared_part(
 
 
 @njit(cache=True, nogil=True)
-def _improve_all(
+def _optimise_all(
     center: np.ndarray,
     rotation: np.ndarray,
     pose: np.ndarray,

@@ -12,9 +12,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
-from flowing_puppet_ros.body.search.dpmp import Search
+from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.search.particles import Particles, particles_of
+from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer
 from flowing_puppet_ros.body.search.schedule import limb_stages
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
@@ -31,7 +31,7 @@ EXPLAINED = 0.03
 LEAST_LEFT = 0.01
 FAR = 0.1  # metres: what is farther counts as this far
 # How many ways to hang each part are tried, how many particles go on, and for how many rounds.
-HANGINGS, PARTICLES, ITERATIONS = 120, 30, 14
+ATTACHMENTS, PARTICLES, ITERATIONS = 120, 30, 14
 
 
 def limb_groups(tree: PartTree) -> tuple[tuple[int, ...], ...]:
@@ -46,7 +46,7 @@ def limb_groups(tree: PartTree) -> tuple[tuple[int, ...], ...]:
 class LimbSearch:
     """Searches limbs of one model."""
 
-    def __init__(self, model: StitchedPuppet, search: Search, proposer: Proposer) -> None:
+    def __init__(self, model: StitchedPuppet, search: BodyParticleSearch, proposer: Proposer) -> None:
         self._model = model
         self._search = search
         self._proposer = proposer
@@ -74,16 +74,16 @@ class LimbSearch:
         points = cloud.points[left]
         grids = dict.fromkeys(limbs, CloudGrid.build(points, cloud.normals[left]))
         start, none, stages = (
-            self._hung(body, limbs, rng),
+            self._attached(body, limbs, rng),
             JointTargets.none(self._model),
             limb_stages(self._model.tree),
         )
-        found = self._search.run(start, grid, none, stages, ITERATIONS, rng, own=grids, keep=PARTICLES)
+        found = self._search.optimise(start, grid, none, stages, ITERATIONS, rng, own=grids, keep=PARTICLES)
         ends = [part for part in limbs if not self._model.tree.children(part)]
         bodies = [found.state, *(mode for end in ends for mode in self._search.modes(found, end))]
         return min(bodies, key=lambda state: _gap(self._model.vertices(state)[own], points, cloud))
 
-    def usual(self, body: BodyState, limbs: tuple[int, ...]) -> BodyState:
+    def mean_limb(self, body: BodyState, limbs: tuple[int, ...]) -> BodyState:
         """The body with limbs at the mean of their Gaussians (Eq. 49): where they hang when the cloud hides them."""
         model = self._model
         state = BodyState(body.center.copy(), body.rotation.copy(), body.pose.copy(), body.shape)
@@ -104,18 +104,20 @@ class LimbSearch:
             state.center[part] = above[interface.parent_index].mean(axis=0) - rotation @ local.mean(axis=0)
         return state
 
-    def _hung(self, body: BodyState, limbs: tuple[int, ...], rng: np.random.Generator) -> list[Particles]:
+    def _attached(self, body: BodyState, limbs: tuple[int, ...], rng: np.random.Generator) -> list[Particles]:
         """The body's parts, and the limbs' also hanging on it in many ways."""
-        start = particles_of(self._model, [body])
+        start = states_to_particles(self._model, [body])
         for part in limbs:
             above = start[self._model.tree.parents[part]]
-            parents = above.take(np.arange(HANGINGS) % len(above))
-            start[part] = Particles.join([start[part], self._proposer.hang(part, parents, start[part].shape[0], rng)])
+            parents = above.take(np.arange(ATTACHMENTS) % len(above))
+            start[part] = Particles.join(
+                [start[part], self._proposer.attach_to_parent(part, parents, start[part].shape[0], rng)]
+            )
         return start
 
 
 def _gap(limb: np.ndarray, points: np.ndarray, cloud: Cloud) -> float:
     """Mean distance from a limb's vertices (V, 3) to the cloud and back from the points (M, 3) that it should cover."""
-    there = cloud.tree.query(limb)[0]
+    there = cloud.nearest.query(limb)[0]
     back = cKDTree(limb).query(points, distance_upper_bound=FAR)[0]
     return float(np.minimum(there, FAR).mean() + np.minimum(back, FAR).mean())

@@ -44,7 +44,7 @@ class Particles:
         )
 
 
-def state_of(model: StitchedPuppet, groups: list[Particles], pick: np.ndarray) -> BodyState:
+def particles_to_state(model: StitchedPuppet, groups: list[Particles], pick: np.ndarray) -> BodyState:
     """The body made of particle `pick[i]` of every part i."""
     pose = np.zeros((len(groups), POSE_WIDTH))
     for part, group in enumerate(groups):
@@ -57,7 +57,7 @@ def state_of(model: StitchedPuppet, groups: list[Particles], pick: np.ndarray) -
     )
 
 
-def particles_of(model: StitchedPuppet, states: list[BodyState]) -> list[Particles]:
+def states_to_particles(model: StitchedPuppet, states: list[BodyState]) -> list[Particles]:
     """Per part one particle a body."""
     return [
         Particles(

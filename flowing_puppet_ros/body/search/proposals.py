@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.body.search.energy import Judged
+from flowing_puppet_ros.body.search.energy import ScoredParticles
 from flowing_puppet_ros.body.search.part_points import PartPoints
 from flowing_puppet_ros.body.search.particles import Particles
 from flowing_puppet_ros.model import rotation as so3
@@ -69,7 +69,12 @@ class Proposer:
                 )
 
     def propose(
-        self, part: int, judged: list[Judged], noise: WalkNoise, neighbour_share: float, rng: np.random.Generator
+        self,
+        part: int,
+        judged: list[ScoredParticles],
+        noise: WalkNoise,
+        neighbour_share: float,
+        rng: np.random.Generator,
     ) -> Particles:
         """Make one new particle for every present one of `part`.
 
@@ -80,7 +85,7 @@ class Proposer:
         count = len(present)
         asked = rng.random(count) < neighbour_share
         asked_part = rng.choice(self._neighbours[part], count)
-        groups = [self.walk(present.take(np.flatnonzero(~asked)), noise, rng, deformation_only=0.5)]
+        groups = [self.random_walk(present.take(np.flatnonzero(~asked)), noise, rng, deformation_only=0.5)]
         for other in self._neighbours[part]:
             wanted = int(np.count_nonzero(asked & (asked_part == other)))
             if wanted:
@@ -88,7 +93,7 @@ class Proposer:
                 groups.append(self._from_neighbour(part, int(other), source, rng))
         return Particles.join(groups)
 
-    def walk(
+    def random_walk(
         self, particles: Particles, noise: WalkNoise, rng: np.random.Generator, deformation_only: float = 0.0
     ) -> Particles:
         """Disturb particles; with probability `deformation_only` just their pose deformation."""
@@ -104,7 +109,7 @@ class Proposer:
             np.clip(shape, -DEVIATIONS, DEVIATIONS),
         )
 
-    def hang(self, part: int, parent: Particles, shape: np.ndarray, rng: np.random.Generator) -> Particles:
+    def attach_to_parent(self, part: int, parent: Particles, shape: np.ndarray, rng: np.random.Generator) -> Particles:
         """Hang a part on particles of its parent, turned anyhow within the joint's limits.
 
         Args:
@@ -123,7 +128,7 @@ class Proposer:
         own = np.average(self._points[part].interfaces[edge].local(pose, shapes), axis=1, weights=weight)
         return Particles(target - (rotation @ own[:, :, None])[:, :, 0], rotation, pose, shapes)
 
-    def _from_neighbour(self, part: int, other: int, source: Judged, rng: np.random.Generator) -> Particles:
+    def _from_neighbour(self, part: int, other: int, source: ScoredParticles, rng: np.random.Generator) -> Particles:
         """Stitch `part` to particles of its neighbour, with its deformation drawn given the neighbour's.
 
         Half of them are drawn given a relative rotation too, uniform within the joint's limits.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.body.segmentation.planes import Plane, PlaneMemory, find_floor, find_wall
+from flowing_puppet_ros.body.segmentation.planes import Plane, PlaneCache, find_floor, find_wall
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
 
@@ -31,10 +31,10 @@ LOWEST = (0.5, 1.2)
 
 
 @dataclass(frozen=True)
-class ExtractionSettings(Settings):
+class SegmentationSettings(Settings):
     """Settings of `extract_people`."""
 
-    people: int = setting(8, "most people taken from a cloud, the likeliest first", low=1, high=100)
+    max_people: int = setting(8, "most people taken from a cloud, the likeliest first", low=1, high=100)
     reach: float = setting(30.0, "distance from the sensor beyond which points are left out", unit="m",
                            low=0.5, high=1000.0)  # fmt: skip
     clearance: float = setting(0.05, "height above the floor, or distance from a wall, up to which points belong to it",
@@ -42,7 +42,7 @@ class ExtractionSettings(Settings):
     gap: float = setting(0.12, "widest gap in a person's surface up to 4 m from the sensor", unit="m",
                          low=0.02, high=1.0)  # fmt: skip
     least_points: int = setting(60, "points of a person", low=50, high=100000)
-    likeness: float = setting(0.5, "least likeness to a person", low=0.0, high=1.0)
+    min_score: float = setting(0.5, "least likeness to a person", low=0.0, high=1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,17 +60,17 @@ class PersonCloud:
     points: np.ndarray
     normals: np.ndarray | None
     rows: np.ndarray
-    likeness: float
+    score: float
     owner: int | None = None
 
 
-def extract_people(
+def segment_people(
     points: np.ndarray,
     normals: np.ndarray | None,
-    settings: ExtractionSettings,
+    settings: SegmentationSettings,
     viewpoint: np.ndarray | None = None,
     known: Sequence[np.ndarray] = (),
-    memory: PlaneMemory | None = None,
+    memory: PlaneCache | None = None,
 ) -> list[PersonCloud]:
     """Find the people in a scene; the same cloud gives the same answer.
 
@@ -102,7 +102,7 @@ def extract_people(
         return []
     # Small numbers keep their digits in what follows, wherever the map's origin is.
     local = points[rows] - origin
-    drawn_in = _drawn_in(local) if viewpoint is not None else local
+    drawn_in = _compensate_range(local) if viewpoint is not None else local
     voxel = _voxels(drawn_in, settings.gap / VOXELS_A_GAP)
     centres = _means(local, voxel)
     free, floor = _without_planes(centres, settings.clearance, origin, memory)
@@ -112,22 +112,24 @@ def extract_people(
     if known and len(free):
         whole = {
             number for number, group in _groups(label[voxel])
-            if person_likeness(local[group], floor) >= settings.likeness
+            if person_score(local[group], floor) >= settings.min_score
         }  # fmt: skip
-        label[free] = _claimed(centres[free] + origin, label[free], known, whole)
+        label[free] = _assign_to_known(centres[free] + origin, label[free], known, whole)
     people = []
     for number, group in _groups(label[voxel]):
         owner = int(number - strangers) if number >= strangers else None
-        likeness = person_likeness(local[group], floor)
-        if len(group) >= settings.least_points and (owner is not None or likeness >= settings.likeness):
+        likeness = person_score(local[group], floor)
+        if len(group) >= settings.least_points and (owner is not None or likeness >= settings.min_score):
             chosen = rows[group]
             own_normals = None if normals is None else normals[chosen]
             people.append(PersonCloud(points[chosen], own_normals, chosen, likeness, owner))
-    people.sort(key=lambda person: (person.owner is None, -person.likeness))
-    return people[: settings.people]
+    people.sort(key=lambda person: (person.owner is None, -person.score))
+    return people[: settings.max_people]
 
 
-def _claimed(centres: np.ndarray, label: np.ndarray, known: Sequence[np.ndarray], whole: Set[int]) -> np.ndarray:
+def _assign_to_known(
+    centres: np.ndarray, label: np.ndarray, known: Sequence[np.ndarray], whole: Set[int]
+) -> np.ndarray:
     """Labels (M,) with the places (M, 3) of the k-th known body's points under the first free label + k.
 
     A body takes a cluster of which it explains most, and one of those that are a `whole` person even where it lags
@@ -149,7 +151,7 @@ def _claimed(centres: np.ndarray, label: np.ndarray, known: Sequence[np.ndarray]
     return claimed
 
 
-def person_likeness(points: np.ndarray, floor: Plane | None) -> float:
+def person_score(points: np.ndarray, floor: Plane | None) -> float:
     """How much (0 to 1) a cluster (N, 3) in metres is like a person: three extents, curvature, height above a floor."""
     if len(points) < 3:
         return 0.0
@@ -181,7 +183,7 @@ def _flat_share(points: np.ndarray) -> float:
     return float(((cosine[first] > FLAT_COSINE) | (cosine[second] > FLAT_COSINE) | (third > FLAT_COSINE)).mean())
 
 
-def _drawn_in(points: np.ndarray) -> np.ndarray:
+def _compensate_range(points: np.ndarray) -> np.ndarray:
     """Points beyond `NEAR` drawn in towards the sensor at 0, so that distances shrink as the sensor's grid widens."""
     distance = np.linalg.norm(points, axis=1, keepdims=True)
     far = np.maximum(distance / NEAR, 1.0)
@@ -201,20 +203,20 @@ def _means(points: np.ndarray, voxel: np.ndarray) -> np.ndarray:
 
 
 def _without_planes(
-    centres: np.ndarray, clearance: float, origin: np.ndarray, memory: PlaneMemory | None
+    centres: np.ndarray, clearance: float, origin: np.ndarray, memory: PlaneCache | None
 ) -> tuple[np.ndarray, Plane | None]:
     """Which voxels (M,) belong neither to the floor nor to what is below it nor to walls, and the floor.
 
     `centres` are relative to `origin`, which may differ from cloud to cloud.
     """
-    known = memory.recall(centres, clearance, origin) if memory else None
+    known = memory.get(centres, clearance, origin) if memory else None
     floor, walls = known or _found_planes(centres, clearance)
     if memory and known is None:
-        memory.keep(centres, clearance, floor, walls, origin)
-    return np.flatnonzero(_off(centres, clearance, floor, walls)), floor
+        memory.put(centres, clearance, floor, walls, origin)
+    return np.flatnonzero(_above_planes(centres, clearance, floor, walls)), floor
 
 
-def _off(centres: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]) -> np.ndarray:
+def _above_planes(centres: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]) -> np.ndarray:
     off = np.ones(len(centres), dtype=bool) if floor is None else floor.height(centres) > clearance
     for wall in walls:
         off &= np.abs(wall.height(centres)) > clearance
@@ -226,7 +228,7 @@ def _found_planes(centres: np.ndarray, clearance: float) -> tuple[Plane | None, 
     floor = find_floor(_some(centres), clearance, rng)
     walls: list[Plane] = []
     while len(walls) < MAX_WALLS:
-        free = centres[_off(centres, clearance, floor, walls)]
+        free = centres[_above_planes(centres, clearance, floor, walls)]
         wall = find_wall(_some(free), clearance, rng) if len(free) >= 3 else None
         if wall is None:
             break

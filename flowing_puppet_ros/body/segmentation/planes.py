@@ -55,7 +55,7 @@ class Plane:
         return Plane(self.normal, self.offset + float(self.normal @ step))
 
 
-class PlaneMemory:
+class PlaneCache:
     """The floor and walls of the last cloud of a stream: looked for anew only now and then, or when they are gone."""
 
     def __init__(self) -> None:
@@ -64,9 +64,7 @@ class PlaneMemory:
         self._has_floor = False
         self._left = 0
 
-    def recall(
-        self, points: np.ndarray, clearance: float, origin: np.ndarray
-    ) -> tuple[Plane | None, list[Plane]] | None:
+    def get(self, points: np.ndarray, clearance: float, origin: np.ndarray) -> tuple[Plane | None, list[Plane]] | None:
         """Return floor and walls moved to where points (N, 3) in metres have them; None when to look for them.
 
         Points and planes are relative to `origin` (3,), which may differ from cloud to cloud.
@@ -85,7 +83,7 @@ class PlaneMemory:
         floor = moved.pop(0) if self._has_floor else None
         return floor, moved
 
-    def keep(
+    def put(
         self, points: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane], origin: np.ndarray
     ) -> None:
         """Remember what was found, and how much of the cloud (N, 3) it is."""

@@ -8,17 +8,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from flowing_puppet_ros.body.scans.scan_frame import Frame, upright
-from flowing_puppet_ros.body.segmentation.people import ExtractionSettings, PersonCloud, extract_people
+from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, rotation_to_z_up
+from flowing_puppet_ros.body.segmentation.people import PersonCloud, SegmentationSettings, segment_people
 
 
-def people_of_scene(
+def segment_people_unknown_up(
     points: np.ndarray,
     normals: np.ndarray | None,
     scale: float,
     ups: Sequence[np.ndarray],
     sensor: np.ndarray | None,
-    settings: ExtractionSettings,
+    settings: SegmentationSettings,
 ) -> tuple[np.ndarray, list[PersonCloud]]:
     """Extract the people with every direction taken for up, and keep the direction that leaves the likeliest.
 
@@ -35,10 +35,10 @@ def people_of_scene(
     """
     best: tuple[float, np.ndarray, list[PersonCloud]] = (-1.0, ups[0], [])
     for up in ups:
-        frame = Frame(scale, upright(up))
+        frame = ScanFrame(scale, rotation_to_z_up(up))
         viewpoint = None if sensor is None else frame.to_body(sensor)
-        found = extract_people(frame.to_body(points), None, settings, viewpoint)
-        likeness = max((person.likeness for person in found), default=0.0)
+        found = segment_people(frame.to_body(points), None, settings, viewpoint)
+        likeness = max((person.score for person in found), default=0.0)
         if likeness > best[0]:
             best = (likeness, up, found)
     _, up, found = best

@@ -12,7 +12,7 @@ import numpy as np
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.errors import InputError
 
-CHASE_NS, MOST_KEPT, FEW = 300_000_000, 8, 2
+CATCH_UP_SPACING_NS, MAX_KEPT, FEW = 300_000_000, 8, 2
 """Least time between the clouds kept while a fit is made, how many are, and so few that the body is nearly there."""
 
 
@@ -31,7 +31,7 @@ class _Stopped(Exception):
     """Nobody wants the fit any more."""
 
 
-class _Run:
+class _FitJob:
     """One pursuit of one person."""
 
     def __init__(self, number: int, tracker: BodyTracker, task: Task) -> None:
@@ -39,7 +39,7 @@ class _Run:
         self.tracker = tracker
         self.first = task
         self.coming: list[Task] = []
-        self.apart = CHASE_NS
+        self.apart = CATCH_UP_SPACING_NS
         self.lock = threading.Lock()
         self.stopped = False
         self.done = False
@@ -54,7 +54,7 @@ class _Run:
             if self.coming and self.coming[-1].stamp - before.stamp < self.apart:
                 self.coming.pop()
             self.coming.append(task)
-            if len(self.coming) > MOST_KEPT:
+            if len(self.coming) > MAX_KEPT:
                 # Evenly spread still, so that the longest fit leaves no more to follow.
                 self.coming, self.apart = [*self.coming[1::2], task], 2 * self.apart
             return True
@@ -73,10 +73,10 @@ class _Run:
         A person may have turned or sat down meanwhile, so nothing between is left out. Clouds come while others are
         followed too; that ends when they are few, or no fewer than before, as where the tracker is the slower one.
         """
-        fitted, before = self._took(self.first, search=True), MOST_KEPT + 1
+        fitted, before = self._took(self.first, search=True), MAX_KEPT + 1
         while not self.stopped:
             with self.lock:
-                tasks, self.coming, self.apart = self.coming, [], CHASE_NS
+                tasks, self.coming, self.apart = self.coming, [], CATCH_UP_SPACING_NS
                 self.done = not tasks
             for task in tasks:
                 if not self.stopped:
@@ -98,21 +98,21 @@ class _Run:
 
     def _take(self, task: Task, search: bool) -> None:
         if search:
-            self.tracker.step(task.points, task.normals, task.stamp, task.viewpoint, task.seed, self._check)
+            self.tracker.track_or_refit(task.points, task.normals, task.stamp, task.viewpoint, task.seed, self._check)
         else:
-            self.tracker.follow(task.points, task.normals, task.stamp, task.viewpoint)
+            self.tracker.track(task.points, task.normals, task.stamp, task.viewpoint)
 
     def _check(self, _: float) -> None:
         if self.stopped:
             raise _Stopped
 
 
-class Pursuit:
+class BackgroundFit:
     """At most one run at a time."""
 
     def __init__(self) -> None:
         """Start with none."""
-        self._run: _Run | None = None
+        self._run: _FitJob | None = None
 
     @property
     def busy(self) -> bool:
@@ -121,7 +121,7 @@ class Pursuit:
 
     def start(self, number: int, tracker: BodyTracker, task: Task, background: Executor | None) -> None:
         """Fit the person `number` by `tracker`, which belongs to the run from now on, on `background` or in line."""
-        self._run = _Run(number, tracker, task)
+        self._run = _FitJob(number, tracker, task)
         if background is None:
             self._run.run()
         else:

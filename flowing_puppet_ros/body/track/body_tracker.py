@@ -16,8 +16,8 @@ import numpy as np
 from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.cloud.normals import estimated_normals, thinned
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, checked_cloud
+from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, check_cloud
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model import rotation
@@ -47,7 +47,7 @@ class BodyTrackerSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
+class _Observation:
     """A fit, the time of its cloud in nanoseconds, and the mean (3,) of the cloud's points, metres."""
 
     fit: BodyFit
@@ -69,8 +69,8 @@ class BodyTracker:
 
     def reset(self) -> None:
         """Forget the person."""
-        self._before: _Seen | None = None
-        self._last: _Seen | None = None
+        self._before: _Observation | None = None
+        self._last: _Observation | None = None
         self._best = np.inf
         self._frames = 0
         self._turned = False
@@ -95,7 +95,7 @@ class BodyTracker:
         if self._last is not None:
             self._best, self.lost = self._last.fit.two_way_distance, False
 
-    def step(
+    def track_or_refit(
         self,
         points: np.ndarray,
         normals: np.ndarray | None,
@@ -123,9 +123,9 @@ class BodyTracker:
             if fit is None or self.lost:
                 fit = self._searched(fit, cloud, seed, progress)
                 self.lost = False
-        return self._noted(fit, cloud, stamp)
+        return self._record(fit, cloud, stamp)
 
-    def follow(
+    def track(
         self, points: np.ndarray, normals: np.ndarray | None, stamp: int, viewpoint: np.ndarray | None = None
     ) -> BodyFit | None:
         """Fit the next cloud as `step` does, but never by a full fit: None when there is no body to start from.
@@ -134,26 +134,26 @@ class BodyTracker:
         """
         if self._last is None:
             # Normals take long, and nobody would use them.
-            self._fitter.person_points(*checked_cloud(points, normals), viewpoint)
+            self._fitter.person_points(*check_cloud(points, normals), viewpoint)
             return None
         with one_blas_thread():
             cloud = self._next_cloud(points, normals, stamp, viewpoint)
             fit = self._followed(cloud, stamp)
-        return None if fit is None else self._noted(fit, cloud, stamp)
+        return None if fit is None else self._record(fit, cloud, stamp)
 
     def _next_cloud(
         self, points: np.ndarray, normals: np.ndarray | None, stamp: int, viewpoint: np.ndarray | None
     ) -> Cloud:
-        points, normals = checked_cloud(points, normals)
+        points, normals = check_cloud(points, normals)
         if viewpoint is None:
-            points, normals = thinned(points, normals, self._settings.track_points)
+            points, normals = downsample(points, normals, self._settings.track_points)
         if self._last is not None and stamp <= self._last.stamp:
             self.reset()
         self._hidden = viewpoint is not None and self._is_hidden(points, stamp, viewpoint)
         self._turned = normals is None and viewpoint is None and self._last is not None
         if self._turned and self._last is not None:
             vertices = self._fitter.model.vertices(self._predicted(self._last, points.mean(axis=0), stamp))
-            normals = estimated_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
+            normals = estimate_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
         return self._fitter.cloud(points, normals, viewpoint)
 
     def _followed(self, cloud: Cloud, stamp: int) -> BodyFit | None:
@@ -170,8 +170,8 @@ class BodyTracker:
         self.lost = fit is None or self._is_lost(fit)
         return fit
 
-    def _noted(self, fit: BodyFit, cloud: Cloud, stamp: int) -> BodyFit:
-        self._before, self._last = self._last, _Seen(fit, stamp, cloud.points.mean(axis=0))
+    def _record(self, fit: BodyFit, cloud: Cloud, stamp: int) -> BodyFit:
+        self._before, self._last = self._last, _Observation(fit, stamp, cloud.points.mean(axis=0))
         if not self.lost and not self._hidden:
             self._best = min(self._best, fit.two_way_distance)
         self._frames += not self._hidden
@@ -204,7 +204,7 @@ class BodyTracker:
         self._best = fit.two_way_distance
         return fit
 
-    def _predicted(self, last: _Seen, middle: np.ndarray, stamp: int) -> BodyState:
+    def _predicted(self, last: _Observation, middle: np.ndarray, stamp: int) -> BodyState:
         """The last body, moved on by its last motion in proportion to the time.
 
         After a long gap, which a search leaves in a live stream too, it moves as the middle of the cloud did.
@@ -222,7 +222,7 @@ class BodyTracker:
             rotation=state.rotation @ rotation.exp(share * turn),
         )
 
-    def _carried(self, last: _Seen, stamp: int) -> BodyState:
+    def _carried(self, last: _Observation, stamp: int) -> BodyState:
         """The last body, moved on as its torso moved, in the pose that it has."""
         state = last.fit.state
         if self._before is None:
@@ -231,7 +231,7 @@ class BodyTracker:
         return replace(state, center=state.center + self._stretch(self._before, last, stamp) * moved)
 
     @staticmethod
-    def _stretch(before: _Seen, last: _Seen, stamp: int) -> float:
+    def _stretch(before: _Observation, last: _Observation, stamp: int) -> float:
         return min((stamp - last.stamp) / (last.stamp - before.stamp), MOST_STRETCH)
 
     def _is_hidden(self, points: np.ndarray, stamp: int, viewpoint: np.ndarray) -> bool:
@@ -246,8 +246,8 @@ class BodyTracker:
         learned = BELIEF * min(self._frames, MOST_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
         # What turns to the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
-        facing = Cloud(cloud.points, cloud.normals, cloud.tree, cloud.viewpoint)
-        return self._fitter.result(self._fitter.refiner.run(start, facing, self._none, weights), cloud)
+        facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint)
+        return self._fitter.result(self._fitter.gauss_newton.run(start, facing, self._none, weights), cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
         return fit.two_way_distance > self._settings.track_lost_ratio * self._best + self._settings.track_lost_distance

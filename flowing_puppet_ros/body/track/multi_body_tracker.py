@@ -17,11 +17,11 @@ from scipy.optimize import linear_sum_assignment
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.segmentation.people import PersonCloud
-from flowing_puppet_ros.body.track.background_fit import Pursuit, Task
+from flowing_puppet_ros.body.track.background_fit import BackgroundFit, Task
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.ids import letters
-from flowing_puppet_ros.parallel import ordered, usable
+from flowing_puppet_ros.ids import letters_of_seed
+from flowing_puppet_ros.parallel import parallel_map, usable_threads
 from flowing_puppet_ros.settings import setting
 
 NEAR = 0.6  # metres by which the middle of a person's cloud may miss where it is expected
@@ -35,14 +35,14 @@ BODY_POINTS = 8  # every so many vertices stand for a body
 
 
 @dataclass(frozen=True)
-class CrowdSettings(BodyTrackerSettings):
+class MultiBodyTrackerSettings(BodyTrackerSettings):
     """Settings of `Crowd`."""
 
     hold: float = setting(2.0, "time for which a person out of sight keeps the id", unit="s", low=0.0, high=60.0)
 
 
 @dataclass(slots=True, eq=False)
-class _Member:
+class _BodyTrack:
     """A person: where the middle (3,) of their points was and how it moves, m/s; what tracks them; the last search."""
 
     id: str
@@ -68,7 +68,7 @@ class _Member:
         self.middle, self.stamp = middle, stamp
 
 
-class Crowd:
+class MultiBodyTracker:
     """Tracks everybody in the clouds of one sensor.
 
     `counters` counts tracked people, searches and lost people, `errors` collects why people could not be used.
@@ -78,15 +78,15 @@ class Crowd:
     meantime before its body is shown: what a live node needs. Which cloud shows it first depends on the time it took.
     """
 
-    def __init__(self, fitter: BodyFitter, settings: CrowdSettings, seed: int) -> None:
+    def __init__(self, fitter: BodyFitter, settings: MultiBodyTrackerSettings, seed: int) -> None:
         """Fit with `fitter`; the first ids begin with b, and with more letters for seeds above 0."""
         self._fitter = fitter
         self._settings = settings
-        self._threads = usable(fitter.settings.threads)
-        self._prefix = "b" + (letters(seed) if seed else "")
+        self._threads = usable_threads(fitter.settings.threads)
+        self._prefix = "b" + (letters_of_seed(seed) if seed else "")
         self._started = 0
-        self._members: list[_Member] = []
-        self._pursuit = Pursuit()
+        self._members: list[_BodyTrack] = []
+        self._pursuit = BackgroundFit()
         self.counters: Counter[str] = Counter()
         self.errors: list[InputError] = []
         self._stamp: int | None = None
@@ -98,7 +98,7 @@ class Crowd:
         self._stamp = None
 
     @property
-    def held(self) -> list[str]:
+    def occluded_ids(self) -> list[str]:
         """Ids of the people who have a body and were not seen in the last cloud."""
         return [member.id for member in self._members if member.tracker.last and member.stamp != self._stamp]
 
@@ -133,17 +133,17 @@ class Crowd:
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
         self._stamp = stamp
-        self._collect()
+        self._adopt_finished_fit()
         seen = self._associated(people, stamp)
         tasks = [
-            Task(person.points, person.normals, stamp, viewpoint, _mixed(seed, member.number))
+            Task(person.points, person.normals, stamp, viewpoint, _person_seed(seed, member.number))
             for member, person in seen
         ]
-        followed = ordered(
+        followed = parallel_map(
             _follow, [(m.tracker, task) for (m, _), task in zip(seen, tasks, strict=True)], self._threads
         )
         fits: list[tuple[str, BodyFit]] = []
-        wanting: list[tuple[_Member, Task]] = []
+        wanting: list[tuple[_BodyTrack, Task]] = []
         for (member, _), task, fit in zip(seen, tasks, followed, strict=True):
             if isinstance(fit, InputError):
                 self.errors.append(fit)
@@ -171,7 +171,7 @@ class Crowd:
             member.middle, member.velocity = np.median(person.points, axis=0), np.zeros(3)
         return self.step([person], stamp, viewpoint, seed, background)
 
-    def named(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[str, PersonCloud]]:
+    def associate_only(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[str, PersonCloud]]:
         """Say who the people of the next cloud are, without tracking their bodies."""
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
@@ -180,7 +180,7 @@ class Crowd:
         self._forget(stamp)
         return named
 
-    def _search(self, wanting: list[tuple[_Member, Task]], background: Executor | None) -> list[tuple[str, BodyFit]]:
+    def _search(self, wanting: list[tuple[_BodyTrack, Task]], background: Executor | None) -> list[tuple[str, BodyFit]]:
         """Start a full fit of the person who needs it most; in line it is finished when this returns."""
         if not wanting or self._pursuit.busy:
             return []
@@ -194,11 +194,11 @@ class Crowd:
         # Live, a body that may have a limb wrong is shown and followed while a better one is searched.
         quick = background is not None and known is None
         self._pursuit.start(member.number, member.tracker.fork(quick), task, background)
-        self._collect()
+        self._adopt_finished_fit()
         fit = member.tracker.last
         return [(member.id, fit)] if known is None and fit is not None else []
 
-    def _collect(self) -> None:
+    def _adopt_finished_fit(self) -> None:
         """Take over the tracker that a full fit has led to, unless the person's own is closer by now."""
         done = self._pursuit.finished()
         if done is None:
@@ -212,7 +212,7 @@ class Crowd:
                 else:
                     member.tracker.accept()
 
-    def _associated(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[_Member, PersonCloud]]:
+    def _associated(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[_BodyTrack, PersonCloud]]:
         """Who each of the people is: the least summed distance from where they should be; the rest are new."""
         middles = [np.median(person.points, axis=0) for person in people]
         cost = np.full((len(self._members), len(people)), np.inf)
@@ -233,10 +233,10 @@ class Crowd:
                 matched[column] = self._new(middle, stamp)
         return [(matched[column], person) for column, person in enumerate(people) if column in matched]
 
-    def _new(self, middle: np.ndarray, stamp: int) -> _Member:
+    def _new(self, middle: np.ndarray, stamp: int) -> _BodyTrack:
         self._started += 1
         tracker = BodyTracker(self._fitter, self._settings)
-        self._members.append(_Member(f"{self._prefix}{self._started}", self._started, middle, stamp, tracker))
+        self._members.append(_BodyTrack(f"{self._prefix}{self._started}", self._started, middle, stamp, tracker))
         return self._members[-1]
 
     def _forget(self, stamp: int) -> None:
@@ -250,11 +250,11 @@ class Crowd:
 def _follow(pair: tuple[BodyTracker, Task]) -> BodyFit | InputError | None:
     tracker, task = pair
     try:
-        return tracker.follow(task.points, task.normals, task.stamp, task.viewpoint)
+        return tracker.track(task.points, task.normals, task.stamp, task.viewpoint)
     except InputError as error:
         return error
 
 
-def _mixed(seed: int, number: int) -> int:
+def _person_seed(seed: int, number: int) -> int:
     """A seed of one person in one cloud."""
     return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])

@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
 from flowing_puppet_ros.cli.batch.task import Answer, Task, answer
-from flowing_puppet_ros.parallel import usable
+from flowing_puppet_ros.parallel import usable_threads
 
 # What tells the libraries how many threads to start; it is read when they are imported.
 THREADS = (
@@ -36,7 +36,7 @@ def in_processes(tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Ans
 
     A task whose process dies (killed, out of memory) is tried once more in a new one before it counts as failed.
     """
-    share = max(1, usable(MOST_THREADS) // workers)
+    share = max(1, usable_threads(MOST_THREADS) // workers)
     waiting = deque(range(len(tasks)))
     tries = [0] * len(tasks)
     running: dict[Connection, _Worker] = {}

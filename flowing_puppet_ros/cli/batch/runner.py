@@ -23,7 +23,7 @@ from tqdm import tqdm
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.cli.batch.task import Answer, Summary, Task, answer
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.parallel import usable
+from flowing_puppet_ros.parallel import usable_threads
 from flowing_puppet_ros.settings import make_out_folder
 
 
@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--again", action="store_true", help="redo inputs that are finished")
 
 
-def placed(path: Path, arguments: argparse.Namespace) -> Path:
+def resolve_path(path: Path, arguments: argparse.Namespace) -> Path:
     """A path as the machines of a cluster find it, whose processes run in other folders."""
     return path if arguments.scheduler is None else path.absolute()
 
@@ -70,9 +70,9 @@ def run_batch(verb: Verb, sources: Sequence[Path], options: Any, out: Path, argu
     """
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}; give 1 or more")
-    _refuse_twins(sources)
+    _refuse_duplicates(sources)
     make_out_folder(out)
-    ledger = Ledger(out / f"{verb.name}.jsonl", verb.files)
+    ledger = ResultLog(out / f"{verb.name}.jsonl", verb.files)
     keys = [_key(verb.name, source, options) for source in sources]
     answers: dict[int, Answer] = {}
     for index, key in enumerate(keys):
@@ -99,7 +99,7 @@ def run_batch(verb: Verb, sources: Sequence[Path], options: Any, out: Path, argu
 
 def _engine(tasks: Sequence[Task], arguments: argparse.Namespace) -> Generator[tuple[int, Answer]]:
     """Yield (index, answer) as tasks are done, in any order."""
-    workers = min(len(tasks), arguments.jobs or usable(len(tasks)))
+    workers = min(len(tasks), arguments.jobs or usable_threads(len(tasks)))
     if tasks and arguments.scheduler is not None:
         from flowing_puppet_ros.cli.batch.cluster import on_cluster
 
@@ -138,13 +138,13 @@ def stem_of(source: Path) -> str:
     return source.name if source.is_dir() else source.stem
 
 
-def _refuse_twins(sources: Iterable[Path]) -> None:
+def _refuse_duplicates(sources: Iterable[Path]) -> None:
     double = next((stem for stem, count in Counter(map(stem_of, sources)).items() if count > 1), None)
     if double is not None:
         raise InputError(f"two inputs are called {double!r} and would overwrite each other's result; do them apart")
 
 
-class Ledger:
+class ResultLog:
     """What is finished in a folder of results: a line of JSON for each, the last one that wrote a file counts.
 
     Only the process that runs the batch writes it; a line that was cut off in the middle does not count.

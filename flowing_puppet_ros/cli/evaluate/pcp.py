@@ -24,7 +24,7 @@ from flowing_puppet_ros.evaluate.output import Chart, Figures, Line, Outcome, ru
 from flowing_puppet_ros.evaluate.output import add_arguments as add_output
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
-from flowing_puppet_ros.image.formats.stickmen import sticks_of
+from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints
 from flowing_puppet_ros.image.pose.settings import PoseSettings
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -127,7 +127,7 @@ def _of_poses(arguments: argparse.Namespace, source: Path, truth: Truth) -> dict
 def _people(names: tuple[str, ...], puppets: list[dict[str, Any]]) -> list[PosedSticks]:
     people = []
     for puppet in puppets:
-        sticks = sticks_of(names, np.array(puppet["joints"], np.float64)[:, :2])
-        others = [sticks_of(names, np.array(one["joints"], np.float64)) for one in puppet.get("solutions", [])]
+        sticks = sticks_from_joints(names, np.array(puppet["joints"], np.float64)[:, :2])
+        others = [sticks_from_joints(names, np.array(one["joints"], np.float64)) for one in puppet.get("solutions", [])]
         people.append(PosedSticks(sticks, np.stack([sticks, *others])))
     return people

@@ -22,7 +22,7 @@ from flowing_puppet_ros.evaluate.joints import LIMB_JOINTS, named_points
 from flowing_puppet_ros.image.formats.keypoints import normalise_name
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.triangulation import triangulate
-from flowing_puppet_ros.stream.component import untransported
+from flowing_puppet_ros.stream.component import base_topic
 from flowing_puppet_ros.stream.messages.depth import depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 
@@ -78,7 +78,7 @@ class Recording:
 
 def namespace(topic: str) -> str:
     """The topic without its last word; that of a transport does not count."""
-    return untransported(topic).rpartition("/")[0]
+    return base_topic(topic).rpartition("/")[0]
 
 
 def read_recording(given: Bag, made: Bag) -> Recording:
@@ -112,7 +112,7 @@ def read_recording(given: Bag, made: Bag) -> Recording:
 
 def leaf(topic: str) -> str:
     """The last word of a topic; that of a transport does not count."""
-    return untransported(topic).rpartition("/")[2]
+    return base_topic(topic).rpartition("/")[2]
 
 
 def _role(topic: str, kind: str) -> str:

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.evaluate.image.likelihood import Ranks
 from flowing_puppet_ros.evidence.image.hands import EXTRAS, SPEED, HandDetectors, HandMaps, hand_score
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
@@ -15,8 +15,6 @@ from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.learn.likelihood.samples import Posed
 from flowing_puppet_ros.learn.thesis_loop.hands import maps_of, wrists_of, wrong_places
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-
-Array = np.ndarray[Any, Any]
 
 MOVES = 0.015  # m a frame; hands that move less are at rest
 

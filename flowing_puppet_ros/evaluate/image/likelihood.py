@@ -10,18 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.evidence.image.contour import LEVELS, ContourFilter, describe, kind_of, on_right
-from flowing_puppet_ros.evidence.image.likelihood import TERMS_OF, PartLikelihood, Scene
+from flowing_puppet_ros.evidence.image.likelihood import TERMS_OF, ImageEvidence, PartLikelihood
 from flowing_puppet_ros.evidence.image.steered_hog import SIDES
 from flowing_puppet_ros.learn.likelihood.samples import Moves, Posed, wrong_contours
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-
-Array = np.ndarray[Any, Any]
 
 CUES = {"contour": ("contour",), "skin": ("skin", "skin_around", "hand"), "torso colour": ("torso", "torso_around")}
 """Terms that are taken away together."""
@@ -33,7 +30,7 @@ SIDE_NAMES = ("inside", "on", "outside")
 class Ranks:
     """Places (n,) of right contours among `wrong` wrong ones, from 0; a tie counts as half a place."""
 
-    places: NDArray[np.float64]
+    places: F64
     wrong: int
 
     def row(self) -> tuple[float, float, float, float]:
@@ -68,7 +65,7 @@ def rank(
     }
 
 
-def _term_scores(scene: Scene, part: int, contours: Array, scale: float) -> dict[str, Array]:
+def _term_scores(scene: ImageEvidence, part: int, contours: Array, scale: float) -> dict[str, Array]:
     """Weighted sums (P,) with all terms, with each cue alone, and without each where two others are left."""
     kind = kind_of(scene.names[part])
     weighted = scene.terms(part, contours, scale) * scene.likelihood.terms[kind]
@@ -82,7 +79,7 @@ def _term_scores(scene: Scene, part: int, contours: Array, scale: float) -> dict
     return scores
 
 
-def _contour_scores(scene: Scene, part: int, contours: Array, scale: float) -> dict[str, Array]:
+def _contour_scores(scene: ImageEvidence, part: int, contours: Array, scale: float) -> dict[str, Array]:
     """Margins (P,) of the contour's filter with only, and without, the descriptors of a side or of a pyramid level."""
     name = scene.names[part]
     known = scene.likelihood.contour.filters[kind_of(name)]

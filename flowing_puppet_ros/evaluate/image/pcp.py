@@ -11,13 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.image.formats.stickmen import STICKS
-
-Array = np.ndarray[Any, Any]
 
 THRESHOLD = 0.5
 FOUND = 0.75

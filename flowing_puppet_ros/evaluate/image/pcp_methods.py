@@ -6,21 +6,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.evaluate.image.pcp import PosedSticks, Tally
 from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
-from flowing_puppet_ros.image.formats.stickmen import sticks_of
-from flowing_puppet_ros.image.pose.estimator import Detector, PoseEstimator
-from flowing_puppet_ros.image.pose.evidence import Found, Likelihood
+from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints
+from flowing_puppet_ros.image.pose.estimator import PoseDetectorLike, PoseEstimator
+from flowing_puppet_ros.image.pose.evidence import LikelihoodLike, PersonHypotheses
 from flowing_puppet_ros.image.pose.result import PosedPuppet
 from flowing_puppet_ros.image.pose.settings import PoseSettings
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-
-Array = np.ndarray[Any, Any]
 
 METHODS: dict[str, dict[str, bool]] = {
     "NL": {"likelihood": False},
@@ -36,11 +34,11 @@ DETECTOR = "detector"
 class _Once:
     """A detector that looks at each image once, for all rows."""
 
-    def __init__(self, detector: Detector) -> None:
+    def __init__(self, detector: PoseDetectorLike) -> None:
         self._detector = detector
-        self._seen: tuple[bytes, Sequence[Found]] | None = None
+        self._seen: tuple[bytes, Sequence[PersonHypotheses]] | None = None
 
-    def detect(self, image: Array) -> Sequence[Found]:
+    def detect(self, image: Array) -> Sequence[PersonHypotheses]:
         pixels = image.tobytes()
         if self._seen is None or self._seen[0] != pixels:
             self._seen = pixels, self._detector.detect(image)
@@ -51,8 +49,8 @@ def measure_methods(
     images: Iterable[tuple[Array, Sequence[Array]]],
     model: DeformableStructures,
     sides: MultiViewStructures,
-    detector: Detector,
-    likelihood: Likelihood,
+    detector: PoseDetectorLike,
+    likelihood: LikelihoodLike,
     settings: PoseSettings,
     pixels: float,
     progress: Callable[[], None],
@@ -88,14 +86,14 @@ def measure_methods(
 
 
 def _posed(posed: PosedPuppet, model: DeformableStructures) -> PosedSticks:
-    solutions = [sticks_of(model.joint_names, solution.joints) for solution in posed.solutions]
-    return PosedSticks(sticks_of(model.joint_names, posed.joints), np.stack(solutions))
+    solutions = [sticks_from_joints(model.joint_names, solution.joints) for solution in posed.solutions]
+    return PosedSticks(sticks_from_joints(model.joint_names, posed.joints), np.stack(solutions))
 
 
-def _detected(found: Found, model: DeformableStructures) -> PosedSticks:
+def _detected(found: PersonHypotheses, model: DeformableStructures) -> PosedSticks:
     """The detector's own answer: its best pose, and as many others as it knows."""
     several = []
     for keypoints, _ in found.modes(10):
         joints, _ = joints_from_keypoints(model, keypoints)
-        several.append(sticks_of(model.joint_names, joints))
+        several.append(sticks_from_joints(model.joint_names, joints))
     return PosedSticks(several[0], np.stack(several))

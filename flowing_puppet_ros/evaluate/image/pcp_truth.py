@@ -12,18 +12,16 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.formats.stickmen import read_sticks, sticks_of
+from flowing_puppet_ros.image.formats.stickmen import read_sticks, sticks_from_joints
 from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
-from flowing_puppet_ros.image.formats.video_reader import Frame, open_frames
+from flowing_puppet_ros.image.formats.video_reader import VideoFrame, open_frames
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
-
-Array = np.ndarray[Any, Any]
 
 type Truth = Mapping[str | int, Sequence[Array]]
 """Sticks (6,2,2) of the people of an image, by its key in annotations.json or by its number."""
@@ -56,7 +54,7 @@ def _annotations(path: Path) -> Truth | None:
 
 
 def _annotated_sticks(names: Sequence[str], joints: Array) -> Array:
-    return sticks_of(names, np.where(joints[:, 2:] > 0, joints[:, :2], np.nan))
+    return sticks_from_joints(names, np.where(joints[:, 2:] > 0, joints[:, :2], np.nan))
 
 
 def _person_sticks(person: Keypoints) -> Array:
@@ -64,16 +62,16 @@ def _person_sticks(person: Keypoints) -> Array:
     found = person.usable()
     nowhere = (np.nan, np.nan, 0.0)
     names = JOINT_NAMES[10]
-    return sticks_of(names, np.array([found.get(name, nowhere)[:2] for name in names]))
+    return sticks_from_joints(names, np.array([found.get(name, nowhere)[:2] for name in names]))
 
 
-def images_of(folder: Path, truth: Truth) -> Iterator[tuple[Frame, Sequence[Array]]]:
+def images_of(folder: Path, truth: Truth) -> Iterator[tuple[VideoFrame, Sequence[Array]]]:
     """The images below `folder` that have people in `truth`, with their people, in the order of the truth.
 
     A number is that in the name of an image, or the image's place in the folder when names have none or share them.
     """
     numbered = _numbered(folder) if any(isinstance(key, int) for key in truth) else {}
-    clip: tuple[str, dict[int, Frame]] = ("", {})
+    clip: tuple[str, dict[int, VideoFrame]] = ("", {})
     for key, people in truth.items():
         if not people:
             continue
@@ -94,7 +92,7 @@ def images_of(folder: Path, truth: Truth) -> Iterator[tuple[Frame, Sequence[Arra
         yield clip[1][int(number)], people
 
 
-def _only(path: Path) -> Frame:
+def _only(path: Path) -> VideoFrame:
     (frame,) = open_frames(path)
     return frame
 

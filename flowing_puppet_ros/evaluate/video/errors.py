@@ -9,15 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.evaluate.bag.recording import Joints, nearest
 from flowing_puppet_ros.evaluate.joints import named_points
 from flowing_puppet_ros.evaluate.video.truth import People
-
-Array = np.ndarray[Any, Any]
 
 MEASURED = ("elbow", "wrist")
 THRESHOLDS = (10.0, 20.0)

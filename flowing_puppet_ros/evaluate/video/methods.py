@@ -12,32 +12,30 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.video.truth import People
 from flowing_puppet_ros.evidence.image.hands import HandDetectors
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, working_size
-from flowing_puppet_ros.image.arms.evidence import Eyes, Sight
+from flowing_puppet_ros.image.arms.evidence import ArmEvidence, ArmEvidenceModel
 from flowing_puppet_ros.image.arms.viterbi import PathSettings
-from flowing_puppet_ros.image.detector.detection import PersonDetection, Place
+from flowing_puppet_ros.image.detector.detection import PersonCandidate, PersonDetection
 from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
-from flowing_puppet_ros.image.formats.video_reader import Frame
-from flowing_puppet_ros.image.thesis_loop.clip import FlowingClip, given_sights
+from flowing_puppet_ros.image.formats.video_reader import VideoFrame
+from flowing_puppet_ros.image.thesis_loop.clip import ThesisClip, evidence_from_keypoints
 from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings
 from flowing_puppet_ros.image.thesis_loop.loop import LoopSettings
 from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings
 from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
-from flowing_puppet_ros.image.video.detection_jobs import Looker
-from flowing_puppet_ros.image.video.live_tracker import FRAME_NS, Lookout, LookoutSettings
-from flowing_puppet_ros.image.video.offline_smoother import Clip
-from flowing_puppet_ros.image.video.tracking_by_detection import DetectionSettings, Detector, VideoTracker
+from flowing_puppet_ros.image.video.detection_jobs import DetectionWorker
+from flowing_puppet_ros.image.video.live_tracker import FRAME_NS, LiveTracker, LiveTrackerSettings
+from flowing_puppet_ros.image.video.offline_smoother import OfflineSmoother
+from flowing_puppet_ros.image.video.tracking_by_detection import DetectingTracker, DetectionSettings, DetectorLike
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-
-type Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,8 +43,8 @@ class Located:
     """One person in one image: `joints` (J, 2) px, NaN where unknown, and `confidence` (J,)."""
 
     id: str
-    joints: Floats
-    confidence: Floats
+    joints: F64
+    confidence: F64
 
 
 type Track = list[list[Located]]
@@ -70,20 +68,20 @@ class VideoSettings:
 class _Remembering:
     """A detector that looks at each image once, for all rows."""
 
-    detector: Detector
+    detector: DetectorLike
     _seen: dict[tuple[bytes, DetectorSettings], list[PersonDetection]] = field(default_factory=dict)
-    _candidates: dict[bytes, list[Place]] = field(default_factory=dict)
+    _candidates: dict[bytes, list[PersonCandidate]] = field(default_factory=dict)
 
-    def candidates(self, image: NDArray[np.uint8]) -> list[Place]:
+    def propose(self, image: U8) -> list[PersonCandidate]:
         key = image.tobytes()
         if key not in self._candidates:
-            self._candidates[key] = self.detector.candidates(image)
+            self._candidates[key] = self.detector.propose(image)
         return self._candidates[key]
 
-    def at(self, image: NDArray[np.uint8], places: Sequence[Place]) -> list[PersonDetection]:
-        return self.detector.at(image, places)
+    def detect_at(self, image: U8, places: Sequence[PersonCandidate]) -> list[PersonDetection]:
+        return self.detector.detect_at(image, places)
 
-    def detect(self, image: NDArray[np.uint8], settings: DetectorSettings) -> list[PersonDetection]:
+    def detect(self, image: U8, settings: DetectorSettings) -> list[PersonDetection]:
         key = image.tobytes(), settings
         if key not in self._seen:
             self._seen[key] = self.detector.detect(image, settings)
@@ -95,14 +93,14 @@ class ClipRun:
     """One clip, and what the rows need to run on it. `given` are keypoints to start from, by frame."""
 
     model: DeformableStructures
-    frames: Sequence[Frame]
-    detector: Detector
+    frames: Sequence[VideoFrame]
+    detector: DetectorLike
     likelihood: PartLikelihood
     given: People | None
     settings: VideoSettings
 
     @classmethod
-    def load(cls, frames: Sequence[Frame], given: People | None, settings: VideoSettings) -> ClipRun:
+    def load(cls, frames: Sequence[VideoFrame], given: People | None, settings: VideoSettings) -> ClipRun:
         """A run with the shipped model, detector and likelihood."""
         model = DeformableStructures.load()
         detector = _Remembering(PartDetector.load())
@@ -113,13 +111,15 @@ class ClipRun:
         """Names of the joints of all rows."""
         return self.model.joint_names
 
-    def keypoints(self, frame: Frame) -> Sequence[Keypoints] | None:
+    def keypoints(self, frame: VideoFrame) -> Sequence[Keypoints] | None:
         """The given people of a frame; None when nobody looked there."""
         return (self.given or {}).get(frame.index)
 
-    def video(self) -> VideoTracker:
+    def video(self) -> DetectingTracker:
         """A new tracker with the detector of this run."""
-        return VideoTracker(self.tracker(), self.detector, Eyes(self.model, self.likelihood), self.settings.detection)
+        return DetectingTracker(
+            self.tracker(), self.detector, ArmEvidenceModel(self.model, self.likelihood), self.settings.detection
+        )
 
     def tracker(self) -> FlowingPuppetTracker:
         """A new tracker without a detector."""
@@ -138,7 +138,7 @@ def _alone(run: ClipRun) -> Track:
     ]
 
 
-def _keypoints(run: ClipRun, video: VideoTracker, frame: Frame) -> Sequence[Keypoints]:
+def _keypoints(run: ClipRun, video: DetectingTracker, frame: VideoFrame) -> Sequence[Keypoints]:
     if run.given is not None:
         return run.keypoints(frame) or ()
     return [person.keypoints for person in video.detect(frame.image)]
@@ -146,7 +146,7 @@ def _keypoints(run: ClipRun, video: VideoTracker, frame: Frame) -> Sequence[Keyp
 
 def _steps(
     run: ClipRun, still: bool = False, whole: bool = True
-) -> Iterator[tuple[TrackResult, dict[str, Sight] | None]]:
+) -> Iterator[tuple[TrackResult, dict[str, ArmEvidence] | None]]:
     """Step through the clip; `still`: nothing is said to move; `whole`: it is searched for people first."""
     video, tracker = run.video(), run.tracker()
     paths = video.search(frame.image for frame in run.frames) if whole and run.given is None else None
@@ -156,10 +156,10 @@ def _steps(
             yield tracker.step(frame.image, frame.stamp_ns, run.keypoints(frame), flow), None
         else:
             result, found = video.step(frame.image, frame.stamp_ns, flow, paths)
-            yield result, video.sights(frame.image, result, found)
+            yield result, video.arm_evidence(frame.image, result, found)
 
 
-def _no_flow(run: ClipRun, frame: Frame) -> FlowPair:
+def _no_flow(run: ClipRun, frame: VideoFrame) -> FlowPair:
     width, height = working_size(frame.image.shape, run.settings.flow.max_side)
     nothing = np.zeros((height, width, 2), np.float32)
     return nothing, nothing
@@ -178,15 +178,15 @@ def _node(run: ClipRun) -> Track:
         return _live(run)
     settings = replace(run.settings.flow, preset="fast")
     tracker = FlowingPuppetTracker(run.model, run.settings.tracker, settings)
-    looker = Looker(run.detector, Eyes(run.model, run.likelihood), run.settings.path)
-    lookout = Lookout(LookoutSettings(), tracker, Counter(), looker)
+    looker = DetectionWorker(run.detector, ArmEvidenceModel(run.model, run.likelihood), run.settings.path)
+    lookout = LiveTracker(LiveTrackerSettings(), tracker, Counter(), looker)
     shown = [*run.frames, *run.frames[::-1], *run.frames]
     results = [lookout.step(frame.image, number * FRAME_NS, None, None) for number, frame in enumerate(shown)]
     return [_located(result.puppets) for result in results[-len(run.frames) :]]
 
 
 def _whole(run: ClipRun, still: bool = False) -> Track:
-    clip = Clip(run.model, run.settings.smoothing, run.settings.path)
+    clip = OfflineSmoother(run.model, run.settings.smoothing, run.settings.path)
     for result, sights in _steps(run, still):
         clip.add(result, sights)
     return [_located(puppets) for puppets in clip.people()]
@@ -209,10 +209,10 @@ def _thesis(run: ClipRun, flow: bool = True, hands: bool = True) -> Track:
         loop, energy = replace(loop, carried=0), replace(energy, forward=False, backward=False)
     if not hands:
         energy = replace(energy, hand_weight=0.0)
-    clip = FlowingClip(run.model, HandDetectors.load(), loop, energy)
+    clip = ThesisClip(run.model, HandDetectors.load(), loop, energy)
     for frame, (result, sights) in zip(run.frames, _steps(run), strict=True):
         if sights is None:
-            given = given_sights(run.model, run.likelihood, frame.image, result, run.keypoints(frame))
+            given = evidence_from_keypoints(run.model, run.likelihood, frame.image, result, run.keypoints(frame))
             clip.add(result, given)
         else:
             clip.add(result, sights)

@@ -8,17 +8,16 @@ chroma and hue (L*C*h*), the same plane in polar coordinates; that told lower ar
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8, Array
 from flowing_puppet_ros.evidence.image.features import as_rgb
 from flowing_puppet_ros.evidence.image.region import RegionMap
 from flowing_puppet_ros.model.ds.render import render_labels
-
-Array = np.ndarray[Any, Any]
 
 BINS = 32
 """Bins a side of a histogram over a* and b*."""
@@ -38,24 +37,24 @@ class ColourImage:
     """The colour bin of every pixel (H,W), and how common each of the BINS^2 bins is in the image."""
 
     bins: NDArray[np.intp]
-    histogram: NDArray[np.float64]
+    histogram: F64
 
     @classmethod
-    def of(cls, image: NDArray[np.uint8]) -> Self:
+    def of(cls, image: U8) -> Self:
         """Bin an RGB (H,W,3) or grey (H,W) uint8 image; InputError for anything else."""
         lab = cv2.cvtColor(np.asarray(as_rgb(image), np.float32) / np.float32(255.0), cv2.COLOR_RGB2LAB)
         a_and_b = np.clip(np.asarray(lab)[:, :, 1:] / _WIDTH + BINS / 2, 0, BINS - 1).astype(np.intp)
         bins = a_and_b[:, :, 0] * BINS + a_and_b[:, :, 1]
         return cls(bins, histogram_of(bins.ravel()))
 
-    def inside(self, *contours: Array) -> NDArray[np.float64] | None:
+    def inside(self, *contours: Array) -> F64 | None:
         """Histogram (BINS^2,) of the pixels in contours (K,2) px together; None where they cover next to nothing."""
         if not all(np.isfinite(contour).all() for contour in contours):
             return None
         covered = self.bins[render_labels(contours, range(len(contours)), self.bins.shape) > 0]
         return histogram_of(covered) if len(covered) >= _FEWEST else None
 
-    def log_ratio(self, histogram: Array) -> NDArray[np.float64]:
+    def log_ratio(self, histogram: Array) -> F64:
         """Log of how much commoner each pixel's colour is in `histogram` (BINS^2,) than in the image, (H,W)."""
         return log_ratio(histogram, self.histogram)[self.bins]
 
@@ -64,7 +63,7 @@ class ColourImage:
 class SkinColour:
     """Log ratio (BINS^2,) of each colour on skin against elsewhere, learned over many images."""
 
-    log_ratio: NDArray[np.float64]
+    log_ratio: F64
 
     def map(self, colours: ColourImage, head: Array | None = None) -> RegionMap:
         """Log skin ratio of every pixel; with the contour `head` (K,2) px, its mean with that of the face's colours.
@@ -93,13 +92,13 @@ def torso_map(colours: ColourImage, torso: Array, head: Array) -> RegionMap:
     return RegionMap.of(np.zeros(colours.bins.shape) if histogram is None else colours.log_ratio(histogram))
 
 
-def histogram_of(bins: Array) -> NDArray[np.float64]:
+def histogram_of(bins: Array) -> F64:
     """Smoothed histogram (BINS^2,) of colour bins (n,), summing to 1."""
     counts = np.bincount(bins, minlength=BINS * BINS).reshape(BINS, BINS).astype(np.float64)
     smooth = np.asarray(cv2.GaussianBlur(counts, (0, 0), _SMOOTHING, borderType=cv2.BORDER_REPLICATE))
     return np.asarray(smooth.ravel() / smooth.sum())
 
 
-def log_ratio(histogram: Array, other: Array) -> NDArray[np.float64]:
+def log_ratio(histogram: Array, other: Array) -> F64:
     """Logarithm (BINS^2,) of a histogram's ratio to another, within LIMIT, 0 for colours that are rare in both."""
     return np.asarray(np.clip(np.log((histogram + _RARE) / (other + _RARE)), -LIMIT, LIMIT))

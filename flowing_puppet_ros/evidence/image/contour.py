@@ -5,17 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, F64, Array, Bools
 from flowing_puppet_ros.evidence.image.features import CHANNELS, ImageFeatures
 from flowing_puppet_ros.evidence.image.outline import mirrored_order
 from flowing_puppet_ros.evidence.image.steered_hog import SIDES, descriptors
 from flowing_puppet_ros.model.tree import mirrored_name
-
-Array = np.ndarray[Any, Any]
 
 CELL_METRES = 0.03
 """Side of a cell of the finest level (Eq. 22; the thesis says 0.02 of the image's height at scale 1)."""
@@ -37,9 +35,7 @@ def on_right(part: str, contours: Array) -> Array:
     return mirrored_order(contours) if mirrored_name(part) != part and part.startswith("left_") else contours
 
 
-def describe(
-    features: ImageFeatures, contours: Array, places: int, scale: Array
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def describe(features: ImageFeatures, contours: Array, places: int, scale: Array) -> tuple[F32, Bools]:
     """Descriptors (P,LEVELS,places,SIDES,CHANNELS) of contours (P,K,2) px at `scale` (P,) px/m, and which are seen.
 
     The places are spread evenly over the contour's points. At every level the descriptors inside and outside are one
@@ -66,8 +62,8 @@ class ContourFilter:
     outside the image contributes, its mean over right and wrong examples. calibration: a_i and b_i of Eq. 21.
     """
 
-    weights: NDArray[np.float32]
-    unseen: NDArray[np.float32]
+    weights: F32
+    unseen: F32
     bias: float
     calibration: tuple[float, float]
 
@@ -82,14 +78,14 @@ class ContourFilter:
         calibration = np.array([self.bias, *self.calibration], np.float32)
         return {f"{kind}_weights": self.weights, f"{kind}_unseen": self.unseen, f"{kind}_calibration": calibration}
 
-    def margin(self, found: Array, visible: Array) -> NDArray[np.float64]:
+    def margin(self, found: Array, visible: Array) -> F64:
         """The SVM's output f (P,) for descriptors as `describe` gives them."""
         flat = found.reshape(len(found), -1)
         seen = np.einsum("pd,d->p", flat, self.weights.ravel())
         hidden = np.einsum("pd,d->p", ~visible.reshape(len(found), -1), self.unseen.ravel())
         return np.asarray(seen + hidden + self.bias, np.float64)
 
-    def log_probability(self, margin: Array) -> NDArray[np.float64]:
+    def log_probability(self, margin: Array) -> F64:
         """Logarithm (P,) of Eq. 21."""
         a, b = self.calibration
         return np.asarray(-np.logaddexp(0.0, a * margin + b))
@@ -101,9 +97,7 @@ class ContourLikelihood:
 
     filters: Mapping[str, ContourFilter]
 
-    def log_likelihood(
-        self, features: ImageFeatures, part: str, contours: Array, scale: Array | float
-    ) -> NDArray[np.float64]:
+    def log_likelihood(self, features: ImageFeatures, part: str, contours: Array, scale: Array | float) -> F64:
         """Logarithm (P,) of Eq. 21 for contours (P,K,2) px of the part called `part` at `scale` ((P,) or one) px/m.
 
         Contours that are not finite, or whose scale is not positive, get -inf; all others are 0 where the part's kind

@@ -10,16 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, U8, Array
 from flowing_puppet_ros.errors import InputError
-
-Array = np.ndarray[Any, Any]
 
 ORDERS = 4
 CHANNELS = 2 * ORDERS + 1
@@ -43,7 +41,7 @@ _NOISE = 2.0  # grey levels a pixel: gradients below are not blown up by the nor
 class OrientationMap:
     """Descriptors at every pixel of one level: `values` (h,w,CHANNELS) float32, `scale` (2,) level px an image px."""
 
-    values: NDArray[np.float32]
+    values: F32
     scale: tuple[float, float]
 
 
@@ -51,11 +49,11 @@ class OrientationMap:
 class ImageFeatures:
     """The orientation maps of one image, made when they are first asked for. `image` (H,W,3) RGB uint8."""
 
-    image: NDArray[np.uint8]
+    image: U8
     _levels: dict[int, OrientationMap] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, image: NDArray[np.uint8]) -> ImageFeatures:
+    def of(cls, image: U8) -> ImageFeatures:
         """Features of an RGB (H,W,3) or grey (H,W) uint8 image; InputError for anything else."""
         cv2.setNumThreads(1)  # results may depend on the number of threads otherwise
         return cls(as_rgb(image))
@@ -75,7 +73,7 @@ class ImageFeatures:
         return self._levels[number]
 
 
-def as_rgb(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def as_rgb(image: U8) -> U8:
     """Return an RGB (H,W,3) or grey (H,W) uint8 image as RGB; InputError for anything else."""
     if image.dtype == np.uint8 and image.ndim == 2:
         image = np.repeat(image[:, :, None], 3, axis=2)
@@ -100,7 +98,7 @@ def orientation_map(image: Array, factor: float) -> OrientationMap:
 
 
 @njit(cache=True, nogil=True)
-def _histogram(padded: NDArray[np.float32]) -> NDArray[np.float32]:
+def _histogram(padded: F32) -> F32:
     """Magnitude times e^{2ik phi} of the strongest channel's gradient at every inner pixel of `padded` (h+2,w+2,3)."""
     height, width = padded.shape[0] - 2, padded.shape[1] - 2
     out = np.zeros((height, width, 2 * ORDERS + 1), np.float32)

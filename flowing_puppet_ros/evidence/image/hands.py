@@ -10,19 +10,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, F64, Array, Flow
 from flowing_puppet_ros.evidence.image.features import CHANNELS, ORDERS, STEPS, OrientationMap, orientation_map
-from flowing_puppet_ros.evidence.image.likelihood import Scene
+from flowing_puppet_ros.evidence.image.likelihood import ImageEvidence
 from flowing_puppet_ros.model import weights
-
-type Floats = NDArray[np.float64]
-type Flow = NDArray[np.float32]
 
 CELL_METRES = 0.04
 ALONG, ACROSS = np.arange(-2, 5), np.arange(-2, 3)
@@ -46,10 +43,10 @@ class HandField:
     """What one detector reads: an orientation map, and the extras (h,w,S) of each of its pixels."""
 
     level: OrientationMap
-    extras: NDArray[np.float32]
+    extras: F32
 
     @classmethod
-    def of_image(cls, scene: Scene, scale: float) -> Self:
+    def of_image(cls, scene: ImageEvidence, scale: float) -> Self:
         """HOG and skin of a scene in which people have `scale` px/m."""
         number = int(scene.features.levels_of(np.array(CELL_METRES * scale)))
         level = scene.features.level(number)
@@ -65,7 +62,7 @@ class HandField:
         level = orientation_map(np.repeat(255 * gradient[..., None], 3, axis=2), factor)
         return cls(level, np.stack([_pooled(gradient, level), _pooled(speed, level)], axis=2))
 
-    def describe(self, wrist: Floats, angle: Floats, cell: float) -> NDArray[np.float32]:
+    def describe(self, wrist: F64, angle: F64, cell: float) -> F32:
         """Descriptors (N,D) of boxes at wrists (N,2) px that point along `angle` (N,), with cells of `cell` px."""
         size = self.level.values.shape[2] + self.extras.shape[2]
         out = np.zeros((len(wrist), len(ALONG) * len(ACROSS), size), np.float32)
@@ -74,7 +71,7 @@ class HandField:
         return out.reshape(len(wrist), len(ALONG) * len(ACROSS) * size)
 
 
-def _moving(flow: Flow, scale: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _moving(flow: Flow, scale: float) -> tuple[F32, F32]:
     """Gradient magnitude of a flow field (H,W,2) and its speed beside the background's, each (H,W) in [0, 1]."""
     known = np.nan_to_num(flow)
     vertical, horizontal = np.gradient(known, axis=(0, 1))
@@ -84,7 +81,7 @@ def _moving(flow: Flow, scale: float) -> tuple[NDArray[np.float32], NDArray[np.f
     return (1 - np.exp(-gradient / _GRADIENT)).astype(np.float32), (1 - np.exp(-speed)).astype(np.float32)
 
 
-def _pooled(values: NDArray[np.float32], level: OrientationMap) -> NDArray[np.float32]:
+def _pooled(values: F32, level: OrientationMap) -> F32:
     """A map (H,W) at the resolution of a level, each pixel the mean of about a cell."""
     height, width = level.values.shape[:2]
     small = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
@@ -93,8 +90,8 @@ def _pooled(values: NDArray[np.float32], level: OrientationMap) -> NDArray[np.fl
 
 @njit(cache=True, nogil=True)
 def _describe(
-    values: NDArray[np.float32], extras: NDArray[np.float32], to_x: float, to_y: float, wrist: Floats, angle: Floats,
-    cell: float, out: NDArray[np.float32],
+    values: F32, extras: F32, to_x: float, to_y: float, wrist: F64, angle: F64,
+    cell: float, out: F32,
 ) -> None:  # fmt: skip
     height, width = values.shape[:2]
     across = len(ACROSS)
@@ -130,7 +127,7 @@ def _describe(
                 re, im = re * turn_re - im * turn_im, re * turn_im + im * turn_re
 
 
-def mirrored(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+def mirrored(descriptors: F32) -> F32:
     """Descriptors (N,D) of the same boxes seen in a mirror along the forearm: a left hand's become a right hand's."""
     cells = descriptors.reshape(len(descriptors), len(ALONG), len(ACROSS), -1)[:, :, ::-1].copy()
     cells[..., 2:CHANNELS:2] *= -1
@@ -141,11 +138,11 @@ def mirrored(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
 class HandFilter:
     """A linear SVM over a box: `weight` (D,) and `bias`; `odds` (2,) turn its margin into the log odds of a hand."""
 
-    weight: NDArray[np.float32]
+    weight: F32
     bias: float
     odds: tuple[float, float]
 
-    def margin(self, descriptors: NDArray[np.float32]) -> Floats:
+    def margin(self, descriptors: F32) -> F64:
         """Output (N,) for descriptors (N,D)."""
         return np.asarray(descriptors @ self.weight + self.bias, np.float64)
 
@@ -155,7 +152,7 @@ class HandDetectors:
     """Both filters, and how much their margins count together: `joint` (3,) weights of image and flow, and bias."""
 
     filters: Mapping[str, HandFilter]
-    joint: Floats
+    joint: F64
 
     @classmethod
     def load(cls, name: str = "upper") -> Self:
@@ -163,7 +160,7 @@ class HandDetectors:
         return cls.from_arrays(weights.load("hands", name))
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
+    def from_arrays(cls, arrays: Mapping[str, Array]) -> Self:
         """Detectors of the arrays that `to_arrays` gives."""
         filters = {}
         for kind in EXTRAS:
@@ -171,7 +168,7 @@ class HandDetectors:
             filters[kind] = HandFilter(np.asarray(arrays[f"{kind}_weight"], np.float32), bias, (slope, offset))
         return cls(filters, np.asarray(arrays["joint"], np.float64))
 
-    def to_arrays(self) -> dict[str, NDArray[np.float32]]:
+    def to_arrays(self) -> dict[str, F32]:
         """Arrays for an .npz file."""
         arrays = {"joint": self.joint.astype(np.float32)}
         for kind, known in self.filters.items():
@@ -191,47 +188,52 @@ class HandMaps:
     detectors: HandDetectors
     fields: Mapping[str, HandField]
     scale: float
-    corner: Floats
+    corner: F64
     factor: float = 1.0
 
     @classmethod
     def of(
-        cls, detectors: HandDetectors, scene: Scene, flows: Sequence[Flow], scale: float, corner: Floats | None = None,
+        cls,
+        detectors: HandDetectors,
+        scene: ImageEvidence,
+        flows: Sequence[Flow],
+        scale: float,
+        corner: F64 | None = None,
         factor: float = 1.0,
-    ) -> Self:  # fmt: skip
+    ) -> Self:
         """Maps of a scene; `flows` (H,W,2) lead away from its image, on its grid and in its pixels, as does `scale`."""
         fields = {"image": HandField.of_image(scene, scale)}
         if flows:
             fields["flow"] = HandField.of_flow(flows, scale)
         return cls(detectors, fields, scale, np.zeros(2) if corner is None else corner, factor)
 
-    def log_odds(self, kind: str, wrist: Floats, angle: Floats) -> Floats:
+    def log_odds(self, kind: str, wrist: F64, angle: F64) -> F64:
         """Log odds (N,) of hands at wrists (N,2) px along `angle` (N,), by one detector; 0 where it has no field."""
         if kind not in self.fields:
             return np.zeros(len(wrist))
         slope, offset = self.detectors.filters[kind].odds
         return slope * self._margin(kind, wrist, angle) + offset
 
-    def score(self, wrist: Floats, angle: Floats) -> Floats:
+    def score(self, wrist: F64, angle: F64) -> F64:
         """Log odds (N,) of hands by both detectors together."""
         if "flow" not in self.fields:
             return self.log_odds("image", wrist, angle)
         image, flow, bias = self.detectors.joint
         return image * self._margin("image", wrist, angle) + flow * self._margin("flow", wrist, angle) + bias
 
-    def _margin(self, kind: str, wrist: Floats, angle: Floats) -> Floats:
+    def _margin(self, kind: str, wrist: F64, angle: F64) -> F64:
         inside = (np.asarray(wrist, np.float64) - self.corner) * self.factor
         described = self.fields[kind].describe(inside, angle, CELL_METRES * self.scale)
         return self.detectors.filters[kind].margin(described)
 
-    def best_orientation(self, kind: str, places: Floats) -> tuple[Floats, Floats]:
+    def best_orientation(self, kind: str, places: F64) -> tuple[F64, F64]:
         """Largest log odds (N,) over the orientations of a box at places (N,2) px, and the orientation (N,)."""
         turns = np.arange(ORIENTATIONS) * (2 * np.pi / ORIENTATIONS)
         odds = np.stack([self.log_odds(kind, places, np.full(len(places), turn)) for turn in turns])
         return odds.max(axis=0), np.asarray(turns[odds.argmax(axis=0)], np.float64)
 
 
-def hand_score(maps: HandMaps, wrist: Floats, elbow: Floats, scale: float) -> Floats:
+def hand_score(maps: HandMaps, wrist: F64, elbow: F64, scale: float) -> F64:
     """Log odds (N,) that the hands of forearms from `elbow` (N,2) to `wrist` (N,2) px are there; `scale` px/m.
 
     The log odds are those against random places near a person, one for one. A forearm that points at the camera may

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-type Floats = NDArray[np.float32]
+from flowing_puppet_ros.arrays import F32, U8
 
 SIGNED = 18  # orientations that tell dark-to-bright from bright-to-dark
 UNSIGNED = 9
@@ -27,7 +26,7 @@ TEXTURE = 0.2357  # weight of the four gradient energies
 LEAST_ENERGY = 1e-4
 
 
-def hog(image: NDArray[np.uint8], cell: int) -> Floats:
+def hog(image: U8, cell: int) -> F32:
     """HOG (H // cell, W // cell, 32) of `image` (H, W, 3) or (H, W); `cell` in px, what is over is left out.
 
     The gradient of the strongest channel votes at its orientation, linearly shared by the four nearest cells.
@@ -38,12 +37,12 @@ def hog(image: NDArray[np.uint8], cell: int) -> Floats:
         return np.zeros((rows, columns, DIMENSIONS), np.float32)
     orientation, magnitude = _gradient_table()
     histogram = _histograms(pixels, cell, rows, columns, orientation, magnitude)
-    features: Floats = _normalise(histogram)
+    features: F32 = _normalise(histogram)
     return features
 
 
 @cache
-def _gradient_table() -> tuple[NDArray[np.uint8], Floats]:
+def _gradient_table() -> tuple[U8, F32]:
     """Orientation bin and magnitude of the gradient (dx, dy), both at [dy + 255, dx + 255]."""
     dy, dx = np.mgrid[-255:256, -255:256].astype(np.float64)
     angles = np.arange(SIGNED) * (2 * math.pi / SIGNED)
@@ -52,9 +51,7 @@ def _gradient_table() -> tuple[NDArray[np.uint8], Floats]:
 
 
 @njit(cache=True, nogil=True)
-def _histograms(
-    pixels: NDArray[np.uint8], cell: int, rows: int, columns: int, orientation: NDArray[np.uint8], magnitude: Floats
-) -> Any:
+def _histograms(pixels: U8, cell: int, rows: int, columns: int, orientation: U8, magnitude: F32) -> Any:
     """Votes (rows, columns, 18) of the pixels of whole cells, without the image's outermost pixels."""
     votes = np.zeros((rows + 2, columns + 2, SIGNED), np.float32)
     height, width, channels = pixels.shape
@@ -83,7 +80,7 @@ def _histograms(
 
 
 @njit(cache=True, nogil=True)
-def _normalise(histogram: Floats) -> Any:
+def _normalise(histogram: F32) -> Any:
     """Features (rows, columns, 32): 18 signed, 9 unsigned orientations, 4 gradient energies, and 0."""
     rows, columns = histogram.shape[:2]
     energy = np.zeros((rows + 2, columns + 2), np.float32)

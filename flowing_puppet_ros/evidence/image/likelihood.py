@@ -5,12 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Self
+from typing import Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8, Array
 from flowing_puppet_ros.evidence.image.colour import ColourImage, SkinColour, torso_map
 from flowing_puppet_ros.evidence.image.contour import ContourFilter, ContourLikelihood, kind_of
 from flowing_puppet_ros.evidence.image.features import ImageFeatures
@@ -19,8 +19,6 @@ from flowing_puppet_ros.evidence.image.region import RegionMap, ratio
 from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.model.ds.joints import part_tree
 from flowing_puppet_ros.model.ds.render import render_labels
-
-Array = np.ndarray[Any, Any]
 
 TERMS = ("contour", "skin", "skin_around", "hand", "torso", "torso_around")
 """Terms of a part: log phi_contour (Eq. 21); mean log ratio of skin, and of the torso's colours, inside it; how much
@@ -76,14 +74,14 @@ class PartLikelihood:
             arrays |= self.contour.filters[kind].to_arrays(kind) | {f"{kind}_terms": np.asarray(weight, np.float32)}
         return arrays
 
-    def scene(self, image: NDArray[np.uint8]) -> Scene:
+    def scene(self, image: U8) -> ImageEvidence:
         """Make ready to ask about an RGB (H,W,3) or grey (H,W) uint8 image in which no torso is known yet."""
         features, colours = ImageFeatures.of(image), ColourImage.of(image)
-        return Scene(self, part_tree(self.parts).names, features, colours, self.skin.map(colours), None, None)
+        return ImageEvidence(self, part_tree(self.parts).names, features, colours, self.skin.map(colours), None, None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+class ImageEvidence:
     """One image, and what is known of the colours of the person in it. Scenes of one image share its features."""
 
     likelihood: PartLikelihood
@@ -94,12 +92,12 @@ class Scene:
     torso: RegionMap | None
     head: Array | None
 
-    def with_torso(self, torso: Array, head: Array) -> Scene:
+    def with_torso(self, torso: Array, head: Array) -> ImageEvidence:
         """Take the colours of sleeves and skin from the person with the contours `torso` and `head` (K,2) px."""
         skin = self.likelihood.skin.map(self.colours, head)
         return replace(self, skin=skin, torso=torso_map(self.colours, torso, head), head=np.array(head))
 
-    def log_likelihood(self, part: int, contours: Array, scale: Array | float) -> NDArray[np.float64]:
+    def log_likelihood(self, part: int, contours: Array, scale: Array | float) -> F64:
         """Weighted sum (P,) of the terms of Eq. 20 for contours (P,K,2) px of part index `part`; higher is likelier.
 
         `scale` is px/m, (P,) or one. What lies outside the image says nothing for or against; contours that are not
@@ -110,15 +108,13 @@ class Scene:
         weight = self.likelihood.terms.get(kind_of(self.names[part]), np.zeros(1))
         return np.where(usable, np.einsum("pt,t->p", np.where(usable[:, None], terms, 0.0), weight), -np.inf)
 
-    def contour_and_colour(
-        self, part: int, contours: Array, scale: Array | float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def contour_and_colour(self, part: int, contours: Array, scale: Array | float) -> tuple[F64, F64]:
         """The weighted terms of `log_likelihood` in two sums, each (P,): contour, and all that is of colour."""
         weighted = self.terms(part, contours, scale) * self.likelihood.terms.get(kind_of(self.names[part]), np.zeros(1))
         usable = np.isfinite(weighted).all(axis=1)
         return np.where(usable, weighted[:, 0], -np.inf), np.where(usable, weighted[:, 1:].sum(axis=1), 0.0)
 
-    def terms(self, part: int, contours: Array, scale: Array | float) -> NDArray[np.float64]:
+    def terms(self, part: int, contours: Array, scale: Array | float) -> F64:
         """The terms (P,T) that TERMS_OF names for the part, before they are weighted; only the contour's for others."""
         name = self.names[part]
         scale = np.broadcast_to(np.asarray(scale, np.float64), len(contours))
@@ -134,7 +130,7 @@ class Scene:
             columns["torso"], columns["torso_around"] = known
         return np.stack([columns[term] for term in wanted], axis=1)
 
-    def hand_map(self, scale: float) -> NDArray[np.float64]:
+    def hand_map(self, scale: float) -> F64:
         """Where hands may be (H,W), summing to 1: spots of a hand's size that are skin, more than what is around.
 
         `scale` in px/m. When the head is known, only around it within REACH and not on it. Even where no skin is seen.
@@ -150,7 +146,7 @@ class Scene:
         return np.asarray(likely / total if total > 0.0 else np.full(likely.shape, 1.0 / likely.size))
 
 
-def _smooth(values: Array, deviation: float) -> NDArray[np.float64]:
+def _smooth(values: Array, deviation: float) -> F64:
     """Gaussian blur of a map (H,W); the larger the standard deviation in px, the coarser the map that is blurred."""
     shrink = max(1.0, deviation / _COARSEST)
     size = [max(1, round(side / shrink)) for side in values.shape[::-1]]

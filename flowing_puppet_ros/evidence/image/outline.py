@@ -3,19 +3,16 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-Array = np.ndarray[Any, Any]
+from flowing_puppet_ros.arrays import F64, Array
 
 FARTHEST = 1e7  # px; coordinates beyond are moved here, where no image is
 _REACH = 2  # points on either side that tell the direction of a contour
 
 
-def checked(contours: Array) -> NDArray[np.float64]:
+def checked(contours: Array) -> F64:
     """Contours (P,K,2) as contiguous float64 whose products cannot overflow; what is NaN stays NaN."""
     return np.ascontiguousarray(np.clip(np.asarray(contours, np.float64), -FARTHEST, FARTHEST))
 
@@ -25,7 +22,7 @@ def mirrored_order(contours: Array) -> Array:
     return contours[..., -np.arange(contours.shape[-2]) % contours.shape[-2], :]
 
 
-def grown(contours: Array, distance: Array) -> NDArray[np.float64]:
+def grown(contours: Array, distance: Array) -> F64:
     """Contours (P,K,2) whose points are moved outward by `distance` (P,) px along their normals."""
     moved = checked(contours).copy()
     _grow(checked(contours), np.ascontiguousarray(distance, np.float64), moved)

@@ -4,23 +4,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.evidence.image.outline import checked
-
-Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegionMap:
     """A map over the image, made ready for sums over regions. `values` (H,W), `along` (H,W+1) sums of its rows."""
 
-    values: NDArray[np.float64]
-    along: NDArray[np.float64]
+    values: F64
+    along: F64
 
     @classmethod
     def of(cls, values: Array) -> RegionMap:
@@ -28,7 +25,7 @@ class RegionMap:
         values = np.ascontiguousarray(values, np.float64)
         return cls(values, np.pad(np.cumsum(values, axis=1), ((0, 0), (1, 0))))
 
-    def sums(self, contours: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def sums(self, contours: Array) -> tuple[F64, F64]:
         """Sum (P,) over the pixels whose centres lie in closed contours (P,K,2) px, and how many those are (P,).
 
         NaN where a contour is not finite.
@@ -37,12 +34,12 @@ class RegionMap:
         _sums(self.along, checked(contours), total, area)
         return total, area
 
-    def mean(self, contours: Array) -> NDArray[np.float64]:
+    def mean(self, contours: Array) -> F64:
         """Mean (P,) over the regions of contours (P,K,2) px: 0 where none is in the image, NaN where not finite."""
         return ratio(*self.sums(contours))
 
 
-def ratio(total: Array, count: Array) -> NDArray[np.float64]:
+def ratio(total: Array, count: Array) -> F64:
     """Divide sums by counts; 0 where there is nothing."""
     return np.where(count == 0.0, 0.0, total / np.where(count == 0.0, 1.0, count))
 

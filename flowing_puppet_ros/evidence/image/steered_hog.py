@@ -7,24 +7,18 @@ turned or mirrored together with the image keeps its descriptors.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, Array, Bools
 from flowing_puppet_ros.evidence.image.features import CHANNELS, ORDERS, OrientationMap
 from flowing_puppet_ros.evidence.image.outline import checked, direction, winding
-
-Array = np.ndarray[Any, Any]
 
 SIDES = 3
 """Descriptors at a place: inside the contour, on it, outside."""
 
 
-def descriptors(
-    level: OrientationMap, contours: Array, places: Array, offset: Array
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def descriptors(level: OrientationMap, contours: Array, places: Array, offset: Array) -> tuple[F32, Bools]:
     """Steered descriptors (P,n,SIDES,CHANNELS) of contours (P,K,2) px at the point indices `places` (n,).
 
     `offset` (P,) px is how far inside and outside. The second array (P,n,SIDES) tells which lie in the image; the

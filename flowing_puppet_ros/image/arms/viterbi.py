@@ -12,11 +12,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.settings import Settings, setting
-
-type Floats = NDArray[np.float64]
 
 JOINT_SHARE = np.array([0.4, 1.0])  # of elbow and wrist in a step's cost: the wrist moves more and is known less
 
@@ -41,12 +39,12 @@ class ArmHypotheses:
     the flow takes elbow and wrist to the next image.
     """
 
-    places: Floats
-    score: Floats
-    motion: Floats
+    places: F64
+    score: F64
+    motion: F64
 
 
-def best_path(arms: Sequence[ArmHypotheses], width: float, settings: PathSettings) -> list[Floats]:
+def max_marginals(arms: Sequence[ArmHypotheses], width: float, settings: PathSettings) -> list[F64]:
     """Cost (K,) of the best path through each hypothesis, for each of the T images: max-marginals, lower is better.
 
     The path of least cost goes through the least of each image. `width` is the shoulder width in pixels.
@@ -61,7 +59,7 @@ def best_path(arms: Sequence[ArmHypotheses], width: float, settings: PathSetting
     return [there + back for there, back in zip(forward, backward[::-1], strict=True)]
 
 
-def step_costs(before: ArmHypotheses, after: ArmHypotheses, width: float, settings: PathSettings) -> Floats:
+def step_costs(before: ArmHypotheses, after: ArmHypotheses, width: float, settings: PathSettings) -> F64:
     """Costs (K, K') of the steps between the hypotheses of two images."""
     expected = before.places + before.motion
     distance = np.linalg.norm(expected[:, None] - after.places[None], axis=3) @ (JOINT_SHARE / JOINT_SHARE.sum())

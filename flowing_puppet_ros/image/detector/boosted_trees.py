@@ -13,12 +13,9 @@ from typing import Any
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, I32, U8
 from flowing_puppet_ros.evidence.image.hog import DIMENSIONS
-
-type Floats = NDArray[np.float32]
-type Codes = NDArray[np.uint8]
 
 SIDE = 16  # cells
 ABOVE, ASIDE = 1, 2  # cells that the window reaches beyond the head-and-shoulders filters' at the top and the left
@@ -30,23 +27,23 @@ COLOUR_RANGE = 0.3  # of +-1; the same for colours
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Forest:
+class BoostedTrees:
     """T complete trees of depth D: go right where code > threshold; the leaves' sum is the score.
 
     `feature` (T, 2**D - 1) int32 and `threshold` (T, 2**D - 1) uint8 of the inner nodes, breadth first, and
     `leaves` (T, 2**D).
     """
 
-    feature: NDArray[np.int32]
-    threshold: Codes
-    leaves: Floats
+    feature: I32
+    threshold: U8
+    leaves: F32
 
-    def scores(self, codes: Codes) -> Floats:
+    def scores(self, codes: U8) -> F32:
         """Scores (N,) of windows (N, FEATURES)."""
         return np.asarray(_scores(codes, self.feature, self.threshold, self.leaves), np.float32)
 
 
-def colours_of(image: NDArray[np.uint8], rows: int, columns: int) -> Floats:
+def cell_colours(image: U8, rows: int, columns: int) -> F32:
     """CIE L*a*b* (rows, columns, 3), each divided by 255, averaged over the cells that cover the image."""
     coloured = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
     means = cv2.resize(coloured, (columns, rows), interpolation=cv2.INTER_AREA)
@@ -55,7 +52,7 @@ def colours_of(image: NDArray[np.uint8], rows: int, columns: int) -> Floats:
     return colours
 
 
-def codes_of(features: Floats, colours: Floats, row: int, column: int) -> Codes:
+def quantise_features(features: F32, colours: F32, row: int, column: int) -> U8:
     """Codes (FEATURES,) of the window whose filters start at (row, column) of a level (R, C, 32) and (R, C, 3).
 
     Beyond the level its border is repeated.
@@ -70,7 +67,7 @@ def codes_of(features: Floats, colours: Floats, row: int, column: int) -> Codes:
 
 
 @njit(cache=True, nogil=True)
-def _scores(codes: Codes, feature: NDArray[np.int32], threshold: Codes, leaves: Floats) -> Any:
+def _scores(codes: U8, feature: I32, threshold: U8, leaves: F32) -> Any:
     inner = feature.shape[1]
     out = np.zeros(len(codes), np.float32)
     for i in range(len(codes)):

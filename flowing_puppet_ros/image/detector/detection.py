@@ -8,15 +8,12 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from flowing_puppet_ros.image.detector.part_filters import CELLS_PER_SCALE, PARTS, PartFilters, Window
-from flowing_puppet_ros.image.detector.pictorial_structure import Beliefs, best_placement, downward
+from flowing_puppet_ros.arrays import F32, F64, I64
+from flowing_puppet_ros.image.detector.part_filters import CELLS_PER_SCALE, PARTS, FeatureWindow, PartFilters
+from flowing_puppet_ros.image.detector.pictorial_structure import MaxMarginals, best_placement, pass_down
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.formats.stickmen import sticks_of
-
-type Floats = NDArray[np.float32]
-type Doubles = NDArray[np.float64]
+from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints
 
 JOINTS = tuple(name for name in PARTS if not name.endswith("arm"))
 ARM = ("shoulder", "upper_arm", "elbow", "forearm", "wrist")
@@ -28,13 +25,13 @@ OTHER_SIDE = {"left": "right", "right": "left"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FoundPose:
+class PoseHypothesis:
     """The best placement (P, 3) in a window, the upward beliefs, and the MEASURES of how sure it is."""
 
-    window: Window
-    beliefs: Beliefs
-    placement: NDArray[np.int64]
-    measures: Doubles
+    window: FeatureWindow
+    beliefs: MaxMarginals
+    placement: I64
+    features: F64
 
     @property
     def scale(self) -> float:
@@ -47,45 +44,45 @@ class FoundPose:
         layer, x, y = self.placement[0]
         return float(self.beliefs.up[layer, y, x])
 
-    def mirrored(self, width: int) -> FoundPose:
+    def mirror(self, width: int) -> PoseHypothesis:
         """The pose in an image of `width` px in whose mirror image it was found; its parts' sides stay swapped."""
         return replace(self, window=replace(self.window, mirror=width))
 
     @property
-    def points(self) -> Doubles:
+    def points(self) -> F64:
         """The parts (P, 2) px of the image that was looked at."""
         return self.window.points_of(self.placement[:, 1:].astype(np.float64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Place:
+class PersonCandidate:
     """Where a person may stand: `neck` and `face` (2,) px of the given image, scale S in px, log-odds that one does.
 
     `score` is the pose's that was found there. Of a place that is only supposed, `least` is the score that a pose must
     have there for anybody to be seen.
     """
 
-    neck: Doubles
-    face: Doubles
+    neck: F64
+    face: F64
     scale: float
     log_odds: float
     score: float = 0.0
-    least: float = -np.inf
+    min_score: float = -np.inf
 
     @property
     def probability(self) -> float:
         """Probability that somebody stands there."""
         return 1 / (1 + float(np.exp(-self.log_odds)))
 
-    def apart(self, other: Place) -> float:
+    def neck_distance(self, other: PersonCandidate) -> float:
         """Distance of the necks in units of the larger S."""
         return float(np.hypot(*(self.neck - other.neck))) / max(self.scale, other.scale)
 
-    def resized(self, scale: float) -> Place:
+    def with_scale(self, scale: float) -> PersonCandidate:
         """The same neck at another scale."""
         return replace(self, face=self.neck + (self.face - self.neck) * (scale / self.scale), scale=scale)
 
-    def mixed(self, other: Place, share: float) -> Place:
+    def interpolate(self, other: PersonCandidate, share: float) -> PersonCandidate:
         """A place between two: 0 this one, 1 the other."""
         neck, face = ((1 - share) * a + share * b for a, b in ((self.neck, other.neck), (self.face, other.face)))
         return replace(self, neck=neck, face=face, scale=self.scale ** (1 - share) * other.scale**share)
@@ -99,7 +96,7 @@ class PersonDetection:
     """
 
     filters: PartFilters
-    pose: FoundPose
+    pose: PoseHypothesis
     confidence: float
     factor: float
     """Size of the image that was looked at, in units of the given one."""
@@ -115,9 +112,9 @@ class PersonDetection:
         return self.pose.score
 
     @property
-    def neck(self) -> Doubles:
+    def neck(self) -> F64:
         """Where the neck is, (2,)."""
-        neck: Doubles = self._points(self.pose.placement[:1, 1:].astype(np.float64))[0]
+        neck: F64 = self._points(self.pose.placement[:1, 1:].astype(np.float64))[0]
         return neck
 
     def _part(self, name: str) -> int:
@@ -128,11 +125,11 @@ class PersonDetection:
         return PARTS.index(name)
 
     @property
-    def place(self) -> Place:
+    def place(self) -> PersonCandidate:
         """Where the person stands, and how surely."""
         neck, face = self._points(self.pose.placement[[0, PARTS.index("face")], 1:].astype(np.float64))
         odds = np.clip(self.confidence, LEAST_ODDS, 1 - LEAST_ODDS)
-        return Place(neck, face, self.scale, float(np.log(odds / (1 - odds))))
+        return PersonCandidate(neck, face, self.scale, float(np.log(odds / (1 - odds))))
 
     @cached_property
     def keypoints(self) -> Keypoints:
@@ -143,11 +140,11 @@ class PersonDetection:
         return self._keypoints(self._refined(self.pose.placement))
 
     @property
-    def sticks(self) -> Doubles:
+    def sticks(self) -> F64:
         """Sticks (6, 2, 2) in the order of `sticks.STICKS`."""
-        return sticks_of(self.keypoints.names, self.keypoints.xy)
+        return sticks_from_joints(self.keypoints.names, self.keypoints.xy)
 
-    def joint_score(self, joint: str, xy: Doubles) -> Doubles:
+    def joint_score(self, joint: str, xy: F64) -> F64:
         """Score (K,) of the best pose that has a joint at each of the places xy (K, 2), less that of the best pose.
 
         In units of the margin: one part clearly misplaced costs about 1. Outside of the window the border's score.
@@ -178,19 +175,19 @@ class PersonDetection:
             found.append((self._keypoints(self._refined(placement)), score))
         return found
 
-    def arms(self, side: str, count: int) -> Doubles:
+    def arms(self, side: str, count: int) -> F64:
         """Elbow and wrist (K, 2, 2) px of up to `count` poses of the arm of a side, best first."""
         rows = [self._part(f"{side}_{joint}") for joint in ("elbow", "wrist")]
         placements = np.array([placement for _, placement in self._arm_modes(side, count)])
         return self._points(self._refined(placements)[:, rows])
 
     @cached_property
-    def _both_ways(self) -> Beliefs:
+    def _both_ways(self) -> MaxMarginals:
         """Beliefs with the downward pass."""
-        return downward(self.filters.tree, self.pose.beliefs)
+        return pass_down(self.filters.tree, self.pose.beliefs)
 
     @cached_property
-    def _maps(self) -> Floats:
+    def _maps(self) -> F32:
         """Max-marginals (P, H, W) of all types, less the best pose's score."""
         beliefs, first = self._both_ways, self.filters.tree.first
         assert beliefs.down is not None
@@ -198,7 +195,7 @@ class PersonDetection:
         maps = np.stack([total[first[part] : first[part + 1]].max(axis=0) for part in range(len(PARTS))])
         return np.ascontiguousarray(maps - maps[0].max())
 
-    def _arm_modes(self, side: str, count: int) -> list[tuple[float, NDArray[np.int64]]]:
+    def _arm_modes(self, side: str, count: int) -> list[tuple[float, I64]]:
         """Peaks of one wrist's map with the best placement (P, 3) for each; the first is that of the best pose."""
         tree, beliefs = self.filters.tree, self._both_ways
         assert beliefs.down is not None
@@ -219,7 +216,7 @@ class PersonDetection:
             modes.append((score, best_placement(tree, beliefs, (wrist, layer, int(column), int(row)))))
         return modes
 
-    def _refined(self, placement: NDArray[np.int64]) -> Doubles:
+    def _refined(self, placement: I64) -> F64:
         """Grid coordinates (..., P, 2) of placements (..., P, 3), moved to the tops of parabolas through the scores."""
         up, down = self._both_ways.up, self._both_ways.down
         assert down is not None
@@ -228,7 +225,7 @@ class PersonDetection:
         inside = (x > 0) & (x < width - 1) & (y > 0) & (y < height - 1)
         x_in, y_in = np.clip(x, 1, width - 2), np.clip(y, 1, height - 2)
 
-        def near(right: int, below: int) -> Doubles:
+        def near(right: int, below: int) -> F64:
             at = layer, y_in + below, x_in + right
             return np.asarray(up[at] + down[at], np.float64)
 
@@ -236,17 +233,17 @@ class PersonDetection:
         peak = np.stack([_peak(near(-1, 0), middle, near(1, 0)), _peak(near(0, -1), middle, near(0, 1))], axis=-1)
         return np.asarray(placement[..., 1:] + np.where(inside[..., None], peak, 0.0), np.float64)
 
-    def _points(self, cells: Doubles) -> Doubles:
+    def _points(self, cells: F64) -> F64:
         """Grid coordinates (..., 2) in px of the given image."""
         return (self.pose.window.points_of(cells) + 0.5) / self.factor - 0.5
 
-    def _keypoints(self, cells: Doubles) -> Keypoints:
+    def _keypoints(self, cells: F64) -> Keypoints:
         points = self._points(cells)
         chosen = [self._part(name) for name in JOINTS]
         confidence = [self.confidence * self._certainty(part, cells[part]) for part in chosen]
         return Keypoints(JOINTS, points[chosen], np.array(confidence))
 
-    def _certainty(self, part: int, at: Doubles) -> float:
+    def _certainty(self, part: int, at: F64) -> float:
         """How much worse (0 to 1) the best pose with this part elsewhere is; a half where it is better."""
         score = self._maps[part]
         y, x = np.indices(score.shape)
@@ -255,7 +252,7 @@ class PersonDetection:
         return float(np.clip(0.5 + 0.5 * margin / CERTAIN_MARGIN, 0.5, 1.0))
 
 
-def _peak(low: Doubles, middle: Doubles, high: Doubles) -> Doubles:
+def _peak(low: F64, middle: F64, high: F64) -> F64:
     """Tops of the parabolas through three values, from the middle ones, at most half a step away."""
     bend = low - 2 * middle + high
     bent = bend < 0

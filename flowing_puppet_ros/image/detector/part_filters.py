@@ -13,14 +13,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, F64, I32, I64, U8, Bools
 from flowing_puppet_ros.evidence.image.hog import DIMENSIONS, OUTSIDE, hog
-from flowing_puppet_ros.image.detector.pictorial_structure import PartTree
-from flowing_puppet_ros.image.detector.root_filters import pad, respond
-
-type Floats = NDArray[np.float32]
-type Doubles = NDArray[np.float64]
+from flowing_puppet_ros.image.detector.pictorial_structure import FilterTree
+from flowing_puppet_ros.image.detector.root_filters import correlate, pad
 
 CELLS_PER_SCALE = 10
 CELL = 6  # px of a cell in the resized window
@@ -45,13 +42,13 @@ PARENTS = (-1, 0, 0, 2, 2, 0, 5, 6, 7, 8, 0, 10, 11, 12, 13)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Window:
+class FeatureWindow:
     """`features` (ROWS, COLUMNS, 36) around a neck; cell (x, y) has its centre at `origin` + `cell` * (x, y) px.
 
     `mirror` is the image's width where that place is one of its mirror image.
     """
 
-    features: Floats
+    features: F32
     origin: tuple[float, float]
     cell: float
     mirror: int | None = None
@@ -61,17 +58,17 @@ class Window:
         """Share of the window that lies outside of the image."""
         return float(np.mean(self.features[..., OUTSIDE] > 0))
 
-    def cells_of(self, points: Doubles) -> Doubles:
+    def cells_of(self, points: F64) -> F64:
         """Grid coordinates (..., 2) of image points (..., 2)."""
-        cells: Doubles = (self._turned(np.asarray(points, np.float64)) - self.origin) / self.cell
+        cells: F64 = (self._turned(np.asarray(points, np.float64)) - self.origin) / self.cell
         return cells
 
-    def points_of(self, cells: Doubles) -> Doubles:
+    def points_of(self, cells: F64) -> F64:
         """Image points (..., 2) of grid coordinates (..., 2)."""
-        points: Doubles = np.asarray(cells, np.float64) * self.cell + self.origin
+        points: F64 = np.asarray(cells, np.float64) * self.cell + self.origin
         return self._turned(points)
 
-    def _turned(self, points: Doubles) -> Doubles:
+    def _turned(self, points: F64) -> F64:
         """Points (..., 2) of the image in its mirror image, or the other way round, if that was looked at."""
         if self.mirror is None:
             return points
@@ -82,26 +79,26 @@ class Window:
 class PartFilters:
     """`filters` (L, 5, 5, 36), one a layer of `tree`."""
 
-    filters: Floats
-    tree: PartTree
+    filters: F32
+    tree: FilterTree
 
-    def unary(self, window: Window) -> Floats:
+    def unary(self, window: FeatureWindow) -> F32:
         """Responses (L, ROWS, COLUMNS) of all layers."""
         return responses(window.features, self.filters)
 
 
-def responses(features: Floats, filters: Floats) -> Floats:
+def responses(features: F32, filters: F32) -> F32:
     """Responses (L, ROWS, COLUMNS) of filters (L, 5, 5, D), each centred on the cell that it scores."""
     framed = pad_window(features)
-    return np.ascontiguousarray(respond(framed, filters).transpose(2, 0, 1))
+    return np.ascontiguousarray(correlate(framed, filters).transpose(2, 0, 1))
 
 
-def pad_window(features: Floats) -> Floats:
+def pad_window(features: F32) -> F32:
     """The features with a frame of half a filter that is marked as outside."""
     return pad(features, FILTER // 2)
 
 
-def window_at(image: NDArray[np.uint8], neck: tuple[float, float], face: tuple[float, float], scale: float) -> Window:
+def window_at(image: U8, neck: tuple[float, float], face: tuple[float, float], scale: float) -> FeatureWindow:
     """Look at an image (H, W, 3) or (H, W) around a neck, with the face and the scale S given, all in px."""
     step = scale / CELLS_PER_SCALE
     corner = np.array([neck[0] + 0.5 - (LEFT + 0.5) * step, neck[1] + 0.5 - (UP + 0.5) * step])
@@ -119,17 +116,17 @@ def window_at(image: NDArray[np.uint8], neck: tuple[float, float], face: tuple[f
         if crop.size:
             inside = _look(crop, cells, begin, np.array(neck), np.array(face), scale)
             features[skipped[1] : skipped[1] + cells[1], skipped[0] : skipped[0] + cells[0]] = inside
-    return Window(features, origin, step)
+    return FeatureWindow(features, origin, step)
 
 
 def _look(
-    crop: NDArray[np.uint8],
-    cells: NDArray[np.int64],
-    begin: NDArray[np.int64],
-    neck: Doubles,
-    face: Doubles,
+    crop: U8,
+    cells: I64,
+    begin: I64,
+    neck: F64,
+    face: F64,
     scale: float,
-) -> Floats:
+) -> F32:
     """Features (rows, columns, 36) of a crop that holds `cells` (columns, rows) cells."""
     size = int(cells[0]) * CELL, int(cells[1]) * CELL
     method = cv2.INTER_AREA if crop.shape[1] > size[0] else cv2.INTER_LINEAR
@@ -142,7 +139,7 @@ def _look(
     return features
 
 
-def _colours(image: NDArray[np.uint8], places: list[Doubles], cells: tuple[int, int]) -> Floats:
+def _colours(image: U8, places: list[F64], cells: tuple[int, int]) -> F32:
     """Means (rows, columns, 4) over cells: hue like the face, lightness like it, hue and lightness like the chest."""
     coloured = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
     lab = cv2.cvtColor(coloured, cv2.COLOR_RGB2LAB)
@@ -163,18 +160,18 @@ def _colours(image: NDArray[np.uint8], places: list[Doubles], cells: tuple[int, 
     return out
 
 
-def _log_ratio(code: NDArray[np.int32], mask: NDArray[np.bool_], shape: tuple[int, int]) -> Floats:
+def _log_ratio(code: I32, mask: Bools, shape: tuple[int, int]) -> F32:
     """Logarithm of how much more frequent each code is inside the mask than everywhere, at most RATIO_LIMIT."""
     bins = shape[0] * shape[1]
     inside, whole = (
         _smooth(np.bincount(values, minlength=bins).reshape(shape)) for values in (code[mask], code.ravel())
     )
-    ratio: Floats = np.clip(np.log(inside / whole), -RATIO_LIMIT, RATIO_LIMIT).astype(np.float32).ravel()
+    ratio: F32 = np.clip(np.log(inside / whole), -RATIO_LIMIT, RATIO_LIMIT).astype(np.float32).ravel()
     return ratio
 
 
-def _smooth(counts: NDArray[np.int64]) -> Doubles:
+def _smooth(counts: I64) -> F64:
     """Blurred shares of the bins, never 0."""
     blurred = cv2.GaussianBlur(counts.astype(np.float64), (5, 5), 1.0, borderType=cv2.BORDER_REPLICATE)
-    share: Doubles = blurred / blurred.sum() + 0.1 / blurred.size
+    share: F64 = blurred / blurred.sum() + 0.1 / blurred.size
     return share

@@ -14,16 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
-type Floats = NDArray[np.float32]
-type Integers = NDArray[np.int64]
+from flowing_puppet_ros.arrays import F32, I64
 
 NOWHERE = np.float32(-1e9)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PartTree:
+class FilterTree:
     """P parts with L layers in all.
 
     `parents` (P,), -1 for the root, which is part 0; `first` (P + 1,); `anchor` (L, 2) where a part of this type
@@ -32,43 +30,43 @@ class PartTree:
     bias of the root's layers.
     """
 
-    parents: Integers
-    first: Integers
-    anchor: Floats
-    spring: Floats
-    bias: Floats
+    parents: I64
+    first: I64
+    anchor: F32
+    spring: F32
+    bias: F32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Beliefs:
+class MaxMarginals:
     """What the passes leave.
 
     `up` (L, H, W) are the unary scores with the messages of the children, `message` (P, T, H, W) is that of each part
     to its parent's types, `down` (L, H, W) that from the parents, None before the downward pass.
     """
 
-    up: Floats
-    message: Floats
-    down: Floats | None
+    up: F32
+    message: F32
+    down: F32 | None
 
 
-def upward(tree: PartTree, unary: Floats) -> Beliefs:
+def pass_up(tree: FilterTree, unary: F32) -> MaxMarginals:
     """Messages from the leaves to the root for the layers' scores `unary` (L, H, W)."""
     up = unary.copy()
     types = tree.bias.shape[1]
     message = np.full((len(tree.parents), types, *unary.shape[1:]), NOWHERE, np.float32)
     _upward(tree.parents, tree.first, tree.anchor, tree.spring, tree.bias, up, message)
-    return Beliefs(up, message, None)
+    return MaxMarginals(up, message, None)
 
 
-def downward(tree: PartTree, beliefs: Beliefs) -> Beliefs:
+def pass_down(tree: FilterTree, beliefs: MaxMarginals) -> MaxMarginals:
     """Add the messages from the root to the leaves; `up + down` are then the max-marginals of every layer."""
     down = np.zeros_like(beliefs.up)
     _downward(tree.parents, tree.first, tree.anchor, tree.spring, tree.bias, beliefs.up, beliefs.message, down)
-    return Beliefs(beliefs.up, beliefs.message, down)
+    return MaxMarginals(beliefs.up, beliefs.message, down)
 
 
-def best_placement(tree: PartTree, beliefs: Beliefs, fixed: tuple[int, int, int, int] | None = None) -> Integers:
+def best_placement(tree: FilterTree, beliefs: MaxMarginals, fixed: tuple[int, int, int, int] | None = None) -> I64:
     """The best placement (P, 3): layer, x, y of every part.
 
     With `fixed` (part, layer, x, y) the best one in which that part is so; this needs the downward pass.
@@ -97,7 +95,7 @@ def best_placement(tree: PartTree, beliefs: Beliefs, fixed: tuple[int, int, int,
     return placement
 
 
-def score_of(tree: PartTree, unary: Floats, placement: Integers) -> float:
+def score_of(tree: FilterTree, unary: F32, placement: I64) -> float:
     """Score of a placement (P, 3)."""
     layer, x, y = placement.T
     total = float(unary[layer, y, x].sum())
@@ -111,7 +109,7 @@ def score_of(tree: PartTree, unary: Floats, placement: Integers) -> float:
 
 
 @njit(cache=True, nogil=True)
-def transform(scores: Floats, anchor: Floats, spring: Floats, out: Floats) -> None:
+def distance_transform(scores: F32, anchor: F32, spring: F32, out: F32) -> None:
     """Set out[y, x] to the maximum over (v, u) of scores[v, u] - sx (u - x - ax)^2 - sy (v - y - ay)^2.
 
     `scores` and `out` (H, W); `anchor` a and `spring` s (2,), along x and y. All shifts are tried, whole images at a
@@ -131,7 +129,7 @@ def transform(scores: Floats, anchor: Floats, spring: Floats, out: Floats) -> No
 
 
 @njit(cache=True, nogil=True)
-def _transform_rows(values: Floats, anchor: float, spring: float, out: Floats) -> None:
+def _transform_rows(values: F32, anchor: float, spring: float, out: F32) -> None:
     """Set out[y] to the maximum over v of values[v] - spring (v - y - anchor)^2, for whole rows."""
     height, width = values.shape
     flat, target = values.reshape(-1), out.reshape(-1)
@@ -156,9 +154,7 @@ def _transform_rows(values: Floats, anchor: float, spring: float, out: Floats) -
 
 
 @njit(cache=True, nogil=True)
-def _upward(
-    parents: Integers, first: Integers, anchor: Floats, spring: Floats, bias: Floats, up: Floats, message: Floats
-) -> None:
+def _upward(parents: I64, first: I64, anchor: F32, spring: F32, bias: F32, up: F32, message: F32) -> None:
     height, width = up.shape[1:]
     moved = np.empty((height, width), np.float32)
     for layer in range(first[1]):
@@ -166,7 +162,7 @@ def _upward(
     for part in range(len(parents) - 1, 0, -1):
         parent = parents[part]
         for layer in range(first[part], first[part + 1]):
-            transform(up[layer], anchor[layer], spring[layer], moved)
+            distance_transform(up[layer], anchor[layer], spring[layer], moved)
             for type_ in range(first[parent + 1] - first[parent]):
                 _keep_larger(message[part, type_].reshape(-1), moved.reshape(-1), bias[layer, type_])
         for type_ in range(first[parent + 1] - first[parent]):
@@ -174,7 +170,7 @@ def _upward(
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
-def _keep_larger(target: Floats, values: Floats, add: float) -> None:
+def _keep_larger(target: F32, values: F32, add: float) -> None:
     more = np.float32(add)
     for i in range(target.size):
         value, kept = values[i] + more, target[i]
@@ -183,14 +179,14 @@ def _keep_larger(target: Floats, values: Floats, add: float) -> None:
 
 @njit(cache=True, nogil=True)
 def _downward(
-    parents: Integers,
-    first: Integers,
-    anchor: Floats,
-    spring: Floats,
-    bias: Floats,
-    up: Floats,
-    message: Floats,
-    down: Floats,
+    parents: I64,
+    first: I64,
+    anchor: F32,
+    spring: F32,
+    bias: F32,
+    up: F32,
+    message: F32,
+    down: F32,
 ) -> None:
     height, width = up.shape[1:]
     for part in range(1, len(parents)):
@@ -202,21 +198,21 @@ def _downward(
             best[:] = NOWHERE
             for type_ in range(count):
                 _keep_larger(best.reshape(-1), rest[type_].reshape(-1), bias[layer, type_])
-            transform(best, -anchor[layer], spring[layer], down[layer])
+            distance_transform(best, -anchor[layer], spring[layer], down[layer])
 
 
 @njit(cache=True, nogil=True)
 def _trace_up(
     start: int,
-    parents: Integers,
-    first: Integers,
-    anchor: Floats,
-    spring: Floats,
-    bias: Floats,
-    up: Floats,
-    message: Floats,
-    down: Floats,
-    placement: Integers,
+    parents: I64,
+    first: I64,
+    anchor: F32,
+    spring: F32,
+    bias: F32,
+    up: F32,
+    message: F32,
+    down: F32,
+    placement: I64,
 ) -> None:
     """Place the ancestors of a placed part, each the best given its placed child."""
     part = start
@@ -236,9 +232,7 @@ def _trace_up(
 
 
 @njit(cache=True, nogil=True)
-def _trace_down(
-    parents: Integers, first: Integers, anchor: Floats, spring: Floats, bias: Floats, up: Floats, placement: Integers
-) -> None:
+def _trace_down(parents: I64, first: I64, anchor: F32, spring: F32, bias: F32, up: F32, placement: I64) -> None:
     """Place every part that has no place yet, the best given its parent."""
     for part in range(1, len(parents)):
         if placement[part, 0] >= 0:
@@ -256,7 +250,7 @@ def _trace_down(
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})
-def _best_cell(scores: Floats, x: float, y: float, spring: Floats) -> tuple[np.float32, int, int]:
+def _best_cell(scores: F32, x: float, y: float, spring: F32) -> tuple[np.float32, int, int]:
     """The best of scores[v, u] - sx (u - x)^2 - sy (v - y)^2, and its v and u."""
     height, width = scores.shape
     line, along = np.empty(width, np.float32), np.empty(width, np.float32)

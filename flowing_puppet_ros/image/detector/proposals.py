@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowing_puppet_ros.image.detector.boosted_trees import Forest
-from flowing_puppet_ros.image.detector.root_filters import Candidate, RootFilters, find
-
-type Doubles = NDArray[np.float64]
+from flowing_puppet_ros.arrays import U8
+from flowing_puppet_ros.image.detector.boosted_trees import BoostedTrees
+from flowing_puppet_ros.image.detector.root_filters import RootCandidate, RootFilters, scan
 
 WINDOWS = 80  # places that the rigid filters propose
 LEAST = -2.0
@@ -17,13 +15,13 @@ SCALE_PRIOR = 0.3  # score of the rigid filters per logarithm of S: small window
 FOREST_SHARE = 0.33  # units of the rigid filters' score per log-odds of the trees
 
 
-def propose(image: NDArray[np.uint8], root: RootFilters, smallest: float) -> list[Candidate]:
+def propose(image: U8, root: RootFilters, smallest: float) -> list[RootCandidate]:
     """Places of people with shoulders from `smallest` px, those that the rigid filters prefer first."""
-    found = find(image, root, smallest, WINDOWS, LEAST)
+    found = scan(image, root, smallest, WINDOWS, LEAST)
     return sorted(found, key=lambda one: -(one.score + SCALE_PRIOR * np.log(one.scale)))
 
 
-def choose(candidates: list[Candidate], forest: Forest, count: int) -> list[tuple[Candidate, float]]:
+def rescore(candidates: list[RootCandidate], forest: BoostedTrees, count: int) -> list[tuple[RootCandidate, float]]:
     """The `count` most promising candidates with the trees' score of each, best first."""
     if not candidates:
         return []

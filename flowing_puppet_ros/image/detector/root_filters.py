@@ -13,13 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, U8
 from flowing_puppet_ros.evidence.image.hog import OUTSIDE, hog
-from flowing_puppet_ros.image.detector.boosted_trees import COLOURS, codes_of, colours_of
-
-type Floats = NDArray[np.float32]
-type Doubles = NDArray[np.float64]
+from flowing_puppet_ros.image.detector.boosted_trees import COLOURS, cell_colours, quantise_features
 
 ROWS, COLUMNS = 11, 12  # cells of a filter
 CELLS_PER_SCALE = 7
@@ -38,17 +35,17 @@ class RootFilters:
     the mean neck and face from the window's centre, in units of S, x right, y down.
     """
 
-    filters: Floats
-    bias: Floats
-    offsets: Floats
+    filters: F32
+    bias: F32
+    offsets: F32
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Level:
     """One pyramid level: HOG (R, C, 32) and colours (R, C, 3), padded by PAD cells of `cell` px of the input image."""
 
-    features: Floats
-    colours: Floats
+    features: F32
+    colours: F32
     cell: float
 
     @property
@@ -62,7 +59,7 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Candidate:
+class RootCandidate:
     """A window that may show a person: its score, level and first cell, and where neck and face (x, y) px would be."""
 
     score: float
@@ -83,22 +80,22 @@ class Candidate:
         return self.level.center(self.row, self.column)
 
     @property
-    def codes(self) -> NDArray[np.uint8]:
+    def codes(self) -> U8:
         """What the second look sees of the window."""
-        return codes_of(self.level.features, self.level.colours, self.row, self.column)
+        return quantise_features(self.level.features, self.level.colours, self.row, self.column)
 
 
-def pyramid(image: NDArray[np.uint8], smallest: float) -> Iterator[Level]:
+def pyramid(image: U8, smallest: float) -> Iterator[Level]:
     """Levels for S from `smallest` px until the whole image is less wide than shoulders, finest first."""
     scale = smallest
     while True:
-        yield level(image, scale)
+        yield make_level(image, scale)
         scale *= STEP
         if scale > max(image.shape[:2]):
             return
 
 
-def level(image: NDArray[np.uint8], scale: float) -> Level:
+def make_level(image: U8, scale: float) -> Level:
     """The level that shows people of the given S, for an image (H, W, 3) or (H, W)."""
     factor = CELL * CELLS_PER_SCALE / scale
     resized = resize(image, factor)
@@ -106,12 +103,12 @@ def level(image: NDArray[np.uint8], scale: float) -> Level:
     rows, columns = features.shape[:2]
     colours = np.zeros((rows + 2 * PAD, columns + 2 * PAD, COLOURS), np.float32)
     if rows and columns:
-        inside = colours_of(resized[: rows * CELL, : columns * CELL], rows, columns)
+        inside = cell_colours(resized[: rows * CELL, : columns * CELL], rows, columns)
         colours = np.pad(inside, ((PAD, PAD), (PAD, PAD), (0, 0)), mode="edge")
     return Level(pad(features, PAD), colours, CELL / factor)
 
 
-def resize(image: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
+def resize(image: U8, factor: float) -> U8:
     """The image `factor` times as large, with averaging when it shrinks; at least one pixel."""
     height, width = image.shape[:2]
     size = max(1, round(width * factor)), max(1, round(height * factor))
@@ -119,7 +116,7 @@ def resize(image: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, size, interpolation=method), dtype=np.uint8)
 
 
-def pad(features: Floats, cells: int) -> Floats:
+def pad(features: F32, cells: int) -> F32:
     """`features` (R, C, 32) with a frame of cells that are marked to lie outside the image."""
     rows, columns, dimensions = features.shape
     padded = np.zeros((rows + 2 * cells, columns + 2 * cells, dimensions), np.float32)
@@ -128,7 +125,7 @@ def pad(features: Floats, cells: int) -> Floats:
     return padded
 
 
-def respond(features: Floats, filters: Floats) -> Floats:
+def correlate(features: F32, filters: F32) -> F32:
     """Correlate `features` (R, C, D) with `filters` (K, r, c, D): (R - r + 1, C - c + 1, K), where they fit inside."""
     count, rows, columns, dimensions = filters.shape
     height, width = features.shape[0] - rows + 1, features.shape[1] - columns + 1
@@ -144,15 +141,15 @@ def respond(features: Floats, filters: Floats) -> Floats:
     return total
 
 
-def find(image: NDArray[np.uint8], root: RootFilters, smallest: float, count: int, least: float) -> list[Candidate]:
+def scan(image: U8, root: RootFilters, smallest: float, count: int, least: float) -> list[RootCandidate]:
     """The `count` best windows whose log-odds reach `least`, best first, without those that overlap a better one."""
-    found: list[Candidate] = []
+    found: list[RootCandidate] = []
     for at in pyramid(image, smallest):
-        found += _peaks(at, respond(at.features, root.filters) + root.bias, root, least)
-    return suppress(found, count)
+        found += _peaks(at, correlate(at.features, root.filters) + root.bias, root, least)
+    return non_max_suppression(found, count)
 
 
-def _peaks(at: Level, scores: Floats, root: RootFilters, least: float) -> list[Candidate]:
+def _peaks(at: Level, scores: F32, root: RootFilters, least: float) -> list[RootCandidate]:
     """Windows of one level that are better than their eight neighbours."""
     component = scores.argmax(axis=2)
     best = np.ascontiguousarray(scores.max(axis=2))
@@ -167,25 +164,25 @@ def _peaks(at: Level, scores: Floats, root: RootFilters, least: float) -> list[C
     ]
 
 
-def candidate(at: Level, row: int, column: int, component: int, score: float, root: RootFilters) -> Candidate:
+def candidate(at: Level, row: int, column: int, component: int, score: float, root: RootFilters) -> RootCandidate:
     """The person that the window at (row, column) of a level shows when `component` is right."""
     x, y = at.center(row, column)
     neck, face = (np.array([x, y]) + at.scale * root.offsets[component].astype(np.float64)).tolist()
-    return Candidate(score, at, row, column, (neck[0], neck[1]), (face[0], face[1]))
+    return RootCandidate(score, at, row, column, (neck[0], neck[1]), (face[0], face[1]))
 
 
-def suppress(candidates: list[Candidate], count: int) -> list[Candidate]:
+def non_max_suppression(candidates: list[RootCandidate], count: int) -> list[RootCandidate]:
     """The `count` best, each of which overlaps no better one by more than OVERLAP."""
-    kept: list[Candidate] = []
+    kept: list[RootCandidate] = []
     for one in sorted(candidates, key=lambda c: -c.score):
-        if all(overlap(one, other) < OVERLAP for other in kept):
+        if all(window_iou(one, other) < OVERLAP for other in kept):
             kept.append(one)
             if len(kept) == count:
                 break
     return kept
 
 
-def overlap(a: Candidate, b: Candidate) -> float:
+def window_iou(a: RootCandidate, b: RootCandidate) -> float:
     """Intersection over union of two windows."""
     area = 1.0
     for axis, cells in enumerate((COLUMNS, ROWS)):

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import U8
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.video_reader import open_frames
@@ -55,9 +55,9 @@ class AnnotatedFrame:
 
     file: str
     index: int
-    image: NDArray[np.uint8]
+    image: U8
     people: tuple[AnnotatedPerson, ...]
-    before: NDArray[np.uint8] | None = None
+    before: U8 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

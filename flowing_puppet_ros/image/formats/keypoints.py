@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
 
-type Floats = NDArray[np.float64]
 type Point = tuple[float, float, float]  # x, y, confidence
 
 MIDLINE = {
@@ -56,7 +55,7 @@ class JointModel(Protocol):
         """Names of the joints."""
         ...
 
-    def mean_joints(self) -> Floats:
+    def mean_joints(self) -> F64:
         """Joints (J, 2) of the average person seen from the front, metres, x right, y down."""
         ...
 
@@ -66,8 +65,8 @@ class Keypoints:
     """One detected person: `names` (K), `xy` (K, 2) px with NaN where unknown, `confidence` (K,) in [0, 1]."""
 
     names: tuple[str, ...]
-    xy: Floats
-    confidence: Floats
+    xy: F64
+    confidence: F64
 
     def __post_init__(self) -> None:
         """Convert to float64; refuse arrays whose lengths disagree."""
@@ -113,7 +112,7 @@ def normalise_name(name: str) -> str | None:
     return SPELLINGS.get(re.sub("[^a-z0-9]", "", name.lower()))
 
 
-def joints_from_keypoints(model: JointModel, keypoints: Keypoints) -> tuple[Floats, Floats]:
+def joints_from_keypoints(model: JointModel, keypoints: Keypoints) -> tuple[F64, F64]:
     """Puppet joints (J, 2) px, NaN where nothing tells them, and their confidence (J,), 0 where unknown.
 
     A skeleton that has a belly is taken as it is: its joints are a puppet's own. Detectors have none; of theirs,
@@ -156,7 +155,7 @@ def _place_face(found: dict[str, Point]) -> None:
         found["face"] = singles[0]
 
 
-def _place_trunk(found: dict[str, Point], mean: dict[str, Floats]) -> None:
+def _place_trunk(found: dict[str, Point], mean: dict[str, F64]) -> None:
     """Move shoulders and hips, and put neck and belly on the line from mid-hip to mid-shoulder as in the mean puppet.
 
     A detector's neck is the middle of its shoulders, which tells nothing; an upper neck is the puppet's neck.

@@ -9,16 +9,14 @@ the regression is the mean of that Gaussian given the sticks: the least squares 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import SHOULDER_OUTWARDS, TRUNK_LOWERED, Keypoints
-from flowing_puppet_ros.image.formats.stickmen import STICKS, sticks_of
+from flowing_puppet_ros.image.formats.stickmen import STICKS, sticks_from_joints
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-
-Array = np.ndarray[Any, Any]
 
 NOISE = 0.03
 """Standard deviation in metres of a stick's end that somebody marked, or a detector found."""
@@ -40,7 +38,7 @@ class StickRegression:
         """Write the sticks as a matrix (24, 2J) of the joints."""
         count = len(self.model.joint_names)
         units = np.eye(2 * count).reshape(-1, count, 2)
-        ends = [sticks_of(self.model.joint_names, unit).ravel() for unit in units]
+        ends = [sticks_from_joints(self.model.joint_names, unit).ravel() for unit in units]
         object.__setattr__(self, "_ends", np.array(ends).T)
 
     def keypoints(self, sticks: Array, confidence: float = 1.0) -> Keypoints:

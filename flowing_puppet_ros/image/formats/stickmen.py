@@ -11,19 +11,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import EARS_HEIGHT
-
-type Floats = NDArray[np.float64]
 
 STICKS = ("torso", "left_upper_arm", "right_upper_arm", "left_lower_arm", "right_lower_arm", "head")
 NUMBERS_A_PERSON = 1 + 4 * len(STICKS)
 MOST_BYTES = 100_000_000
 
 
-def sticks_of(joint_names: Sequence[str], joints: Floats) -> Floats:
+def sticks_from_joints(joint_names: Sequence[str], joints: F64) -> F64:
     """Sticks (6, 2, 2) px of a puppet's joints (J, 2): first the end nearer to the neck; NaN where a joint is unknown.
 
     The torso runs from the middle of the shoulders to that of the hips, the head from the neck to its top.
@@ -37,7 +35,7 @@ def sticks_of(joint_names: Sequence[str], joints: Floats) -> Floats:
     return np.array([(shoulders, hips), *arms, (place["neck"], top)])
 
 
-def write_sticks(path: Path, frames: Mapping[int, Sequence[Floats]]) -> None:
+def write_sticks(path: Path, frames: Mapping[int, Sequence[F64]]) -> None:
     """Write sticks (6, 2, 2) by frame number, a line of 25 numbers a person; unknown ends are written as nan."""
     lines = [
         " ".join([str(number), *(f"{value:.2f}" for value in person.ravel())])
@@ -47,7 +45,7 @@ def write_sticks(path: Path, frames: Mapping[int, Sequence[Floats]]) -> None:
     path.write_text("".join(line + "\n" for line in lines))
 
 
-def read_sticks(path: Path) -> dict[int, list[Floats]]:
+def read_sticks(path: Path) -> dict[int, list[F64]]:
     """Sticks (6, 2, 2) of the people of each frame, wherever the lines break; InputError when it is no such file."""
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -61,7 +59,7 @@ def read_sticks(path: Path) -> dict[int, list[Floats]]:
         raise InputError(
             f"{path} has {len(numbers)} numbers; a person has {NUMBERS_A_PERSON} there: the frame and 6 x (x1 y1 x2 y2)"
         )
-    people: dict[int, list[Floats]] = {}
+    people: dict[int, list[F64]] = {}
     for row in numbers.reshape(-1, NUMBERS_A_PERSON):
         if not (row[0] >= 0 and row[0].is_integer()):
             raise InputError(f"{path} has a person in frame {row[0]:g}; frames are counted in whole numbers")

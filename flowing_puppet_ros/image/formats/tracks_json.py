@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, normalise_name
 from flowing_puppet_ros.image.formats.stick_regression import StickRegression
@@ -26,13 +26,11 @@ from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
 from flowing_puppet_ros.model.tree import PartTree
 
-type Floats = NDArray[np.float64]
-
 DECIMALS = 2  # of a pixel
 MOST_DIGITS = 18  # of a frame's index
 
 
-class Puppet(Protocol):
+class PuppetLike(Protocol):
     """What the files say of one person in one image, see `tracker.TrackedPuppet`."""
 
     @property
@@ -56,17 +54,17 @@ class Puppet(Protocol):
         ...
 
     @property
-    def joints(self) -> Floats:
+    def joints(self) -> F64:
         """Joints (J, 2) px."""
         ...
 
     @property
-    def confidence(self) -> Floats:
+    def confidence(self) -> F64:
         """Confidence (J,) in [0, 1]."""
         ...
 
     @property
-    def contours(self) -> tuple[Floats, ...]:
+    def contours(self) -> tuple[F64, ...]:
         """Outline (K_i, 2) px of each part."""
         ...
 
@@ -121,7 +119,7 @@ def _person(names: tuple[str, ...], rows: Any, where: str) -> Keypoints:
     return Keypoints(names, values[:, :2], np.nan_to_num(values[:, 2]))
 
 
-def puppet_entry(puppet: Puppet, tree: PartTree) -> dict[str, Any]:
+def puppet_entry(puppet: PuppetLike, tree: PartTree) -> dict[str, Any]:
     """The JSON object of one puppet."""
     joints = [
         [_number(x), _number(y), _number(confidence, 3)]

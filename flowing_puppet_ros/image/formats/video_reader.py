@@ -10,8 +10,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import U8
 from flowing_puppet_ros.errors import InputError
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm", ".pgm"})
@@ -20,12 +20,12 @@ MOST_BROKEN = 100  # frames of a video in a row that cannot be decoded before it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+class VideoFrame:
     """One image (H, W, 3) RGB uint8, its index, its time since the start, and its file in a folder ("" in a video)."""
 
     index: int
     stamp_ns: int
-    image: NDArray[np.uint8]
+    image: U8
     path: str
 
 
@@ -42,17 +42,17 @@ class FrameSource:
     files: tuple[Path, ...]
     warn: Callable[[str], None] | None = None
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[VideoFrame]:
         """Yield the frames in order; InputError when there is none, or at the first that cannot be read."""
         images = self._images() if self.files else self._video()
         index = -1
         for index, image, path in images:
             rgb = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-            yield Frame(index, round(index * 1e9 / self.fps), rgb, path)
+            yield VideoFrame(index, round(index * 1e9 / self.fps), rgb, path)
         if index < 0:
             raise InputError(f"{self.path} has no frame that can be decoded; it is broken or of an unknown codec")
 
-    def _images(self) -> Iterator[tuple[int, NDArray[np.uint8], str]]:
+    def _images(self) -> Iterator[tuple[int, U8, str]]:
         for index, path in enumerate(self.files):
             image = cv2.imread(str(path), cv2.IMREAD_COLOR)
             if image is not None:
@@ -62,7 +62,7 @@ class FrameSource:
             else:
                 self.warn(f"frame {index}: {path} is no readable image and is left out")
 
-    def _video(self) -> Iterator[tuple[int, NDArray[np.uint8], str]]:
+    def _video(self) -> Iterator[tuple[int, U8, str]]:
         capture = cv2.VideoCapture(str(self.path))
         index, broken = 0, 0
         try:

@@ -9,26 +9,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import cv2
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.ids import letters
+from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
-from flowing_puppet_ros.image.pose.evidence import Found, GivenPerson, Likelihood, Window
-from flowing_puppet_ros.image.pose.modes import joint_confidence, searched_parts, solutions_of
-from flowing_puppet_ros.image.pose.particle_search import Person, PoseSearch
-from flowing_puppet_ros.image.pose.particles import Particles, limited, particles_of
-from flowing_puppet_ros.image.pose.result import Outcome, PosedPuppet, Seen, completed
+from flowing_puppet_ros.image.pose.evidence import KeypointPerson, LikelihoodLike, PersonHypotheses, PersonWindow
+from flowing_puppet_ros.image.pose.modes import extract_modes, joint_confidence, searched_parts
+from flowing_puppet_ros.image.pose.particle_search import PoseSearch, SearchTarget
+from flowing_puppet_ros.image.pose.particles import Particles, clip_shape, particles_of
+from flowing_puppet_ros.image.pose.result import PosedPuppet, SearchResult, ViewHypothesis, completed
 from flowing_puppet_ros.image.pose.settings import PoseSettings
 from flowing_puppet_ros.model.ds.multiview import VIEW_HEADINGS, VIEW_NAMES, MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
-
-Array = np.ndarray[Any, Any]
 
 SURELY_SIDEWAYS = 0.97
 """Probability of not facing the camera from which a model of another view is taken."""
@@ -39,10 +38,10 @@ DETECTION_TRUST = 0.3
 LEAST_KEYPOINTS = 3
 
 
-class Detector(Protocol):
+class PoseDetectorLike(Protocol):
     """What finds people in an image (H,W,3) RGB uint8, the surest first."""
 
-    def detect(self, image: Array) -> Sequence[Found]:
+    def detect(self, image: Array) -> Sequence[PersonHypotheses]:
         """The people."""
         ...
 
@@ -53,8 +52,8 @@ class PoseEstimator:
     def __init__(
         self,
         models: Sequence[DeformableStructures],
-        detector: Detector | None,
-        likelihood: Likelihood | None,
+        detector: PoseDetectorLike | None,
+        likelihood: LikelihoodLike | None,
         settings: PoseSettings | None = None,
         sides: Sequence[MultiViewStructures] = (),
         drawn: Sequence[MultiViewStructures] = (),
@@ -98,13 +97,13 @@ class PoseEstimator:
             posed = [self._pose(colour, one, index, factor) for index, one in enumerate(found)]
         return [one for one in posed if one is not None]
 
-    def _found(self, image: Array, keypoints: Sequence[Keypoints] | None, factor: float) -> Sequence[Found]:
+    def _found(self, image: Array, keypoints: Sequence[Keypoints] | None, factor: float) -> Sequence[PersonHypotheses]:
         if keypoints is None:
             assert self._detector is not None
             found = self._detector.detect(np.ascontiguousarray(image))
             return [one for turn, one in enumerate(found) if turn == 0 or one.confidence >= self._settings.others]
         model = self._front[0]
-        people: list[Found] = []
+        people: list[PersonHypotheses] = []
         for one in keypoints:
             placed = replace(one, xy=(one.xy + 0.5) * factor - 0.5)
             joints, confidence = joints_from_keypoints(model, placed)
@@ -114,10 +113,12 @@ class PoseEstimator:
                 scale = model.estimate_scale(joints, confidence)
             except InputError:
                 continue
-            people.append(GivenPerson(Keypoints(model.joint_names, joints, confidence), model.shoulder_width * scale))
+            people.append(
+                KeypointPerson(Keypoints(model.joint_names, joints, confidence), model.shoulder_width * scale)
+            )
         return people
 
-    def _pose(self, image: Array, found: Found, index: int, factor: float) -> PosedPuppet | None:
+    def _pose(self, image: Array, found: PersonHypotheses, index: int, factor: float) -> PosedPuppet | None:
         """The pose of one person, or None when the detection tells no scale; `factor` is that of the shrunk image."""
         rng = np.random.default_rng([self._settings.seed, index])
         try:
@@ -128,20 +129,20 @@ class PoseEstimator:
         except InputError:
             return None
         model = models[0]
-        scene = None if self._likelihood is None else Window.around(self._likelihood, image, joints, scale)
-        person = Person(scene, found, scale, np.array([1.0 if view == "front" else -1.0, 1.0]))
+        scene = None if self._likelihood is None else PersonWindow.around(self._likelihood, image, joints, scale)
+        person = SearchTarget(scene, found, scale, np.array([1.0 if view == "front" else -1.0, 1.0]))
         heading = 0.0 if side is None else VIEW_HEADINGS[side]
-        seen = Seen(models, view, heading, side, searched_parts(model, np.isfinite(joints).all(axis=1)))
+        seen = ViewHypothesis(models, view, heading, side, searched_parts(model, np.isfinite(joints).all(axis=1)))
         search = self._search(model, seen.parts)
         start = self._start(model, search, person, view, rng)
         person = self._coloured(search, start, person)
         judged, result = search.run(start, person, rng)
-        solutions = solutions_of(model, search, judged, person, self._settings.solutions)
+        solutions = extract_modes(model, search, judged, person, self._settings.solutions)
         sure = joint_confidence(model, search, judged, result, person, solutions[0].joints)
-        outcome = Outcome(solutions, sure, person, seen, (image.shape[1], image.shape[0]), factor)
-        return self._answer(outcome, letters(self._settings.seed) + str(index + 1))
+        outcome = SearchResult(solutions, sure, person, seen, (image.shape[1], image.shape[0]), factor)
+        return self._answer(outcome, letters_of_seed(self._settings.seed) + str(index + 1))
 
-    def _answer(self, outcome: Outcome, identity: str) -> PosedPuppet:
+    def _answer(self, outcome: SearchResult, identity: str) -> PosedPuppet:
         """The puppet of the most probable gender."""
         seen = outcome.seen
         probability = self._genders(outcome)
@@ -152,7 +153,7 @@ class PoseEstimator:
         genders = {one.gender: float(value) for one, value in zip(seen.models, probability, strict=True)}
         return outcome.drawn(identity, drawing, genders)
 
-    def _genders(self, outcome: Outcome) -> Array:
+    def _genders(self, outcome: SearchResult) -> Array:
         """Probability of each model, by the energy of its puppet on the best pose."""
         seen, person = outcome.seen, outcome.person
         energies = np.zeros(len(seen.models))
@@ -186,7 +187,12 @@ class PoseEstimator:
         return self._searches[key]
 
     def _start(
-        self, model: DeformableStructures, search: PoseSearch, person: Person, view: View, rng: np.random.Generator
+        self,
+        model: DeformableStructures,
+        search: PoseSearch,
+        person: SearchTarget,
+        view: View,
+        rng: np.random.Generator,
     ) -> list[Particles]:
         """First particles: the detector's poses with their likely shapes, and copies of them with random shapes."""
         puppets = []
@@ -197,13 +203,13 @@ class PoseEstimator:
         groups = []
         for part in search.parts:
             likely = everything[part]
-            likely = Particles(likely.center, likely.angle, likely.scale, limited(likely.shape))
+            likely = Particles(likely.center, likely.angle, likely.scale, clip_shape(likely.shape))
             copies = likely.take(rng.integers(len(likely), size=self._settings.particles))
-            drawn = limited(copies.shape + 0.5 * rng.standard_normal(copies.shape.shape))
+            drawn = clip_shape(copies.shape + 0.5 * rng.standard_normal(copies.shape.shape))
             groups.append(Particles.join([likely, Particles(copies.center, copies.angle, copies.scale, drawn)]))
         return groups
 
-    def _coloured(self, search: PoseSearch, start: list[Particles], person: Person) -> Person:
+    def _coloured(self, search: PoseSearch, start: list[Particles], person: SearchTarget) -> SearchTarget:
         """The person whose evidence also knows the colours of the torso and the head that a first max-product finds."""
         if person.scene is None or "head" not in search.tree.names or not self._settings.likelihood:
             return person

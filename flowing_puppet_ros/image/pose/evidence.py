@@ -4,14 +4,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Protocol, Self
 
 import cv2
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, normalise_name
-
-Array = np.ndarray[Any, Any]
 
 CERTAIN_KEYPOINT = 0.04
 """Deviation in shares of a person's shoulder width with which a keypoint of confidence 1 binds a joint."""
@@ -25,7 +24,7 @@ DOUBT = 3.0
 """Deviations beyond which a keypoint is held for wrong: its score falls no further."""
 
 
-class Scene(Protocol):
+class ImageEvidenceLike(Protocol):
     """The evidence of one image, see `evidence.image.likelihood`."""
 
     def log_likelihood(self, part: int, contours: Array, scale: Array) -> Array:
@@ -41,24 +40,24 @@ class Scene(Protocol):
         ...
 
 
-class Likelihood(Protocol):
+class LikelihoodLike(Protocol):
     """What makes the evidence of an image."""
 
-    def scene(self, image: Array) -> Scene:
+    def scene(self, image: Array) -> ImageEvidenceLike:
         """The evidence of an image (H,W,3) RGB uint8."""
         ...
 
 
-class Window:
+class PersonWindow:
     """The evidence around one person: a piece of the image, shrunk where it is larger than the evidence needs."""
 
-    def __init__(self, scene: Scene, corner: Array, factor: float) -> None:
+    def __init__(self, scene: ImageEvidenceLike, corner: Array, factor: float) -> None:
         """`corner` (x, y) of the piece in the image and its pixels per pixel of the image."""
         self._scene, self._corner, self._factor = scene, corner, factor
         self._hands: tuple[float, Array] | None = None
 
     @classmethod
-    def around(cls, likelihood: Likelihood, image: Array, joints: Array, scale: float) -> Window | None:
+    def around(cls, likelihood: LikelihoodLike, image: Array, joints: Array, scale: float) -> PersonWindow | None:
         """The piece of an image that the arms of a person with these joints (J,2) reach; None when it is outside."""
         known = joints[np.isfinite(joints).all(axis=1)]
         size = np.array(image.shape[1::-1])
@@ -74,7 +73,7 @@ class Window:
         return cls(likelihood.scene(piece), low.astype(float), factor)
 
     @property
-    def scene(self) -> Scene:
+    def scene(self) -> ImageEvidenceLike:
         """The evidence of the piece, in its own pixels."""
         return self._scene
 
@@ -92,10 +91,10 @@ class Window:
         """Log likelihood (P,) of a part with contours (P,K,2) in pixels of the image at scale (P,) px/m."""
         return self._scene.log_likelihood(part, self.inside(contours), scale * self._factor)
 
-    def with_torso(self, torso: Array, head: Array) -> Window:
+    def with_torso(self, torso: Array, head: Array) -> PersonWindow:
         """The window that also knows the colours inside the contours (K,2) of a torso and a head."""
         scene = self._scene.with_torso(self.inside(torso), self.inside(head))
-        return Window(scene, self._corner, self._factor)
+        return PersonWindow(scene, self._corner, self._factor)
 
     def hands(self, places: Array, scale: float) -> Array:
         """How likely places (K,2) in pixels of the image are hands, in (0, 1] relative to the most likely pixel."""
@@ -112,7 +111,7 @@ class Window:
         return np.ascontiguousarray((points - self._corner) * self._factor)
 
 
-class Found(Protocol):
+class PersonHypotheses(Protocol):
     """One person whom the detector, or the user's keypoints, found."""
 
     @property
@@ -135,7 +134,7 @@ class Found(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GivenPerson:
+class KeypointPerson:
     """A person known by keypoints alone, for example those of `--init`; `width` is a shoulder width in pixels."""
 
     keypoints: Keypoints

@@ -4,16 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.image.pose.particle_search import Judged, Person, PoseSearch
+from flowing_puppet_ros.arrays import Array
+from flowing_puppet_ros.image.pose.particle_search import PoseSearch, ScoredParticles, SearchTarget
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product
 from flowing_puppet_ros.model.ds.joints import PART_JOINTS
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-
-Array = np.ndarray[Any, Any]
 
 APART = 0.15
 """Distance in metres at which two hypotheses of a wrist are different ones."""
@@ -31,7 +29,7 @@ _FORBIDDEN = 1e9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Solution:
+class PoseMode:
     """One pose: joints (J,2) px, NaN where nothing was searched, its energy in nats, and scale px/m."""
 
     joints: Array
@@ -39,9 +37,9 @@ class Solution:
     scale: float
 
 
-def solutions_of(
-    model: DeformableStructures, search: PoseSearch, judged: list[Judged], person: Person, count: int
-) -> list[Solution]:
+def extract_modes(
+    model: DeformableStructures, search: PoseSearch, judged: list[ScoredParticles], person: SearchTarget, count: int
+) -> list[PoseMode]:
     """Up to `count` poses that differ in their arms: the best of all first, then in the order of their energy.
 
     The k-th hypothesis of the right wrist goes with the k-th of the left one; the rest is the best for both.
@@ -62,7 +60,12 @@ def solutions_of(
 
 
 def joint_confidence(
-    model: DeformableStructures, search: PoseSearch, judged: list[Judged], result: MaxProduct, person: Person, at: Array
+    model: DeformableStructures,
+    search: PoseSearch,
+    judged: list[ScoredParticles],
+    result: MaxProduct,
+    person: SearchTarget,
+    at: Array,
 ) -> Array:
     """Share (J,) of the particles' weight, by max-marginal, whose joint lies near that of `at` (J,2); 0 unsearched."""
     confidence = np.zeros(len(model.joint_names))
@@ -77,7 +80,7 @@ def joint_confidence(
 
 
 def _hypotheses(
-    search: PoseSearch, k: int, judged: Judged, result: MaxProduct, person: Person, count: int
+    search: PoseSearch, k: int, judged: ScoredParticles, result: MaxProduct, person: SearchTarget, count: int
 ) -> list[int]:
     """Particles of a lower arm whose wrists together lie near most of the weight; that of the best pose first."""
     wrist = search.joints(k, judged.particles, person.mirror)[:, 1]
@@ -97,11 +100,11 @@ def _hypotheses(
 def _solution(
     model: DeformableStructures,
     search: PoseSearch,
-    judged: list[Judged],
+    judged: list[ScoredParticles],
     assignment: Array,
     cost: float,
-    person: Person,
-) -> Solution:
+    person: SearchTarget,
+) -> PoseMode:
     """Joints of the chosen particles; where two parts meet, the middle of their ends."""
     total, count = np.zeros((len(model.joint_names), 2)), np.zeros(len(model.joint_names))
     scales = []
@@ -113,7 +116,7 @@ def _solution(
         scales.append(float(chosen.scale[0]))
     joints = np.full_like(total, np.nan)
     joints[count > 0] = total[count > 0] / count[count > 0, None]
-    return Solution(joints, cost, float(np.exp(np.mean(np.log(scales)))))
+    return PoseMode(joints, cost, float(np.exp(np.mean(np.log(scales)))))
 
 
 def searched_parts(model: DeformableStructures, known: Array) -> tuple[int, ...]:

@@ -9,20 +9,18 @@ the best pose alone is refined by plain particle max-product.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.image.pose.evidence import Found, Window
-from flowing_puppet_ros.image.pose.particles import Edge, Particles, joint_rows, limited, points_of
+from flowing_puppet_ros.arrays import Array
+from flowing_puppet_ros.image.pose.evidence import PersonHypotheses, PersonWindow
+from flowing_puppet_ros.image.pose.particles import PairwiseGaussian, Particles, clip_shape, joint_rows, world_points
 from flowing_puppet_ros.image.pose.settings import PoseSettings
 from flowing_puppet_ros.inference.diverse import select_diverse
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product, message_foundation
 from flowing_puppet_ros.model.ds.joints import PART_JOINTS
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.tree import PartTree
-
-Array = np.ndarray[Any, Any]
 
 SHIFT, TURN, GROW, DEFORM = 0.02, 0.12, 0.03, 0.35
 """Deviations of a step of the random walk: metres, radians, share of the scale, shape coefficients."""
@@ -38,23 +36,23 @@ REACH = 0.8  # metres from the shoulder
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class ScoredParticles:
     """Particles of one part with their own cost (P,): evidence and, for the torso, prior."""
 
     particles: Particles
     cost: Array
 
-    def take(self, chosen: Array) -> Judged:
+    def take(self, chosen: Array) -> ScoredParticles:
         """The particles with these indices."""
-        return Judged(self.particles.take(chosen), self.cost[chosen])
+        return ScoredParticles(self.particles.take(chosen), self.cost[chosen])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Person:
+class SearchTarget:
     """What is searched for: evidence `scene`, detection `found`, `scale` px/m and signs `mirror` (2,) of the axes."""
 
-    scene: Window | None
-    found: Found
+    scene: PersonWindow | None
+    found: PersonHypotheses
     scale: float
     mirror: Array
 
@@ -75,12 +73,14 @@ class PoseSearch:
             shared = PART_JOINTS[names[i]].index(PART_JOINTS[names[j]][0])
             row = int(joint_rows(self.shapes[i])[shared])
             pair = model.pairwise[parts[j] - 1]
-            self._edges.append(Edge(pair, self.shapes[i], self.shapes[j], row, settings.spring))
+            self._edges.append(PairwiseGaussian(pair, self.shapes[i], self.shapes[j], row, settings.spring))
         self._joints = [PART_JOINTS[name] if name == "torso" else PART_JOINTS[name][1:2] for name in names]
 
-    def run(self, start: list[Particles], person: Person, rng: np.random.Generator) -> tuple[list[Judged], MaxProduct]:
+    def run(
+        self, start: list[Particles], person: SearchTarget, rng: np.random.Generator
+    ) -> tuple[list[ScoredParticles], MaxProduct]:
         """Improve the particles `start` of every part; returns the last ones and max-product over them."""
-        judged = [self._judge(k, self._flattened(group), person) for k, group in enumerate(start)]
+        judged = [self._score(k, self._flattened(group), person) for k, group in enumerate(start)]
         settings = self._settings
         judged = self._improve(judged, person, rng, settings.iterations, settings.diverse)
         # Particles spread over many poses leave few for the best one: it is refined apart, and no other pose is lost.
@@ -89,22 +89,22 @@ class PoseSearch:
         judged = [_joined(judged[k], fine[k].take(best[k : k + 1])) for k in range(len(judged))]
         return judged, self.solve(judged)[0]
 
-    def best_contours(self, start: list[Particles], person: Person, names: tuple[str, ...]) -> list[Array]:
+    def best_contours(self, start: list[Particles], person: SearchTarget, names: tuple[str, ...]) -> list[Array]:
         """Contours (K,2) px of the parts `names` in the best configuration of some particles."""
-        judged = [self._judge(k, self._flattened(group), person) for k, group in enumerate(start)]
+        judged = [self._score(k, self._flattened(group), person) for k, group in enumerate(start)]
         result, _ = self.solve(judged)
         best = []
         for name in names:
             k = self.tree.index(name)
             chosen = judged[k].particles.take(result.assignment[k : k + 1])
-            best.append(points_of(self.shapes[k], chosen)[0, : -self.shapes[k].joint_count] * person.mirror)
+            best.append(world_points(self.shapes[k], chosen)[0, : -self.shapes[k].joint_count] * person.mirror)
         return best
 
-    def energy(self, puppet: list[Particles], person: Person) -> float:
+    def energy(self, puppet: list[Particles], person: SearchTarget) -> float:
         """Energy in nats of one puppet, given as one particle for every part of the model."""
-        return self.solve([self._judge(k, puppet[part], person) for k, part in enumerate(self.parts)])[0].cost
+        return self.solve([self._score(k, puppet[part], person) for k, part in enumerate(self.parts)])[0].cost
 
-    def solve(self, judged: list[Judged]) -> tuple[MaxProduct, list[Array]]:
+    def solve(self, judged: list[ScoredParticles]) -> tuple[MaxProduct, list[Array]]:
         """Max-product over the particles, and the costs of the edges."""
         spread = self._settings.scale_deviation
         edges = [
@@ -115,18 +115,18 @@ class PoseSearch:
 
     def joints(self, k: int, particles: Particles, mirror: Array) -> Array:
         """Joint points (P,M,2) px of part `k`, in the image."""
-        return points_of(self.shapes[k], particles, joint_rows(self.shapes[k])) * mirror
+        return world_points(self.shapes[k], particles, joint_rows(self.shapes[k])) * mirror
 
-    def _judge(self, k: int, particles: Particles, person: Person) -> Judged:
+    def _score(self, k: int, particles: Particles, person: SearchTarget) -> ScoredParticles:
         cost = np.zeros(len(particles))
         if k == 0:
             ratio = np.log(particles.scale / person.scale) / PERSON_SCALE
             cost += 0.5 * (particles.shape**2).sum(axis=1) + 0.5 * ratio**2
         settings = self._settings
         if not settings.likelihood:
-            return Judged(particles, cost)
+            return ScoredParticles(particles, cost)
         if person.scene is not None:
-            contours = points_of(self.shapes[k], particles)[:, : -self.shapes[k].joint_count] * person.mirror
+            contours = world_points(self.shapes[k], particles)[:, : -self.shapes[k].joint_count] * person.mirror
             likelihood = person.scene.log_likelihood(self.parts[k], np.ascontiguousarray(contours), particles.scale)
             cost -= settings.evidence_weight * likelihood
         places = self.joints(k, particles, person.mirror)[:, -len(self._joints[k]) :]
@@ -134,15 +134,15 @@ class PoseSearch:
             score = person.found.joint_score(name, np.ascontiguousarray(places[:, index]))
             weight = settings.detector_weight * (WRIST_WEIGHT if name.endswith("wrist") else 1.0)
             cost -= weight / len(self._joints[k]) * score
-        return Judged(particles, cost)
+        return ScoredParticles(particles, cost)
 
     def _improve(
-        self, judged: list[Judged], person: Person, rng: np.random.Generator, rounds: int, diverse: bool
-    ) -> list[Judged]:
+        self, judged: list[ScoredParticles], person: SearchTarget, rng: np.random.Generator, rounds: int, diverse: bool
+    ) -> list[ScoredParticles]:
         """The particles that are left after so many rounds of proposing and selecting."""
         for _ in range(rounds):
             proposed = self._propose(judged, person, rng)
-            new = [self._judge(k, self._flattened(group), person) for k, group in enumerate(proposed)]
+            new = [self._score(k, self._flattened(group), person) for k, group in enumerate(proposed)]
             judged = [_joined(*pair) for pair in zip(judged, new, strict=True)]
             result, edges = self.solve(judged)
             judged = [group.take(self._select(k, result, edges, diverse)) for k, group in enumerate(judged)]
@@ -163,32 +163,36 @@ class PoseSearch:
         order = np.argsort(result.marginals[k], kind="stable")
         return np.concatenate([[kept], order[order != kept][: count - 1]])
 
-    def _propose(self, judged: list[Judged], person: Person, rng: np.random.Generator) -> list[Particles]:
+    def _propose(
+        self, judged: list[ScoredParticles], person: SearchTarget, rng: np.random.Generator
+    ) -> list[Particles]:
         count = self._settings.particles
         groups = [[self._walk(k, judged[k].particles, count // 3, rng)] for k in range(len(judged))]
         for k in range(len(judged)):
             groups[k] += self._from_neighbours(k, judged, count // 3, rng)
         for side in ("right", "left"):
             if f"{side}_lower_arm" in self.tree.names:
-                self._lay_arms(side, groups, judged, person, count // 3, rng)
+                self._propose_arms_from_wrists(side, groups, judged, person, count // 3, rng)
         return [Particles.join(group) for group in groups]
 
     def _walk(self, k: int, particles: Particles, count: int, rng: np.random.Generator) -> Particles:
         """Steps of the random walk; limbs turn about the joint they hang from."""
         old = particles.take(rng.integers(len(particles), size=count))
         row = joint_rows(self.shapes[k])[:1]
-        pivot = points_of(self.shapes[k], old, row)[:, 0]
+        pivot = world_points(self.shapes[k], old, row)[:, 0]
         step = rng.standard_normal((count, 4))
         # Half of the steps change the shape alone, so that a good place is not lost with it.
         moves = (np.arange(count) % 2).astype(float)
-        shape = limited(old.shape + DEFORM * rng.standard_normal(old.shape.shape))
+        shape = clip_shape(old.shape + DEFORM * rng.standard_normal(old.shape.shape))
         scale = old.scale * np.exp(GROW * step[:, 2] * moves)
         moved = Particles(old.center, old.angle + TURN * step[:, 3] * moves, scale, shape)
-        drift = pivot - points_of(self.shapes[k], moved, row)[:, 0]
+        drift = pivot - world_points(self.shapes[k], moved, row)[:, 0]
         drift += SHIFT * (scale * moves)[:, None] * step[:, :2]
         return Particles(moved.center + drift, moved.angle, moved.scale, moved.shape)
 
-    def _from_neighbours(self, k: int, judged: list[Judged], count: int, rng: np.random.Generator) -> list[Particles]:
+    def _from_neighbours(
+        self, k: int, judged: list[ScoredParticles], count: int, rng: np.random.Generator
+    ) -> list[Particles]:
         """Particles drawn given those of one neighbour, or of the parent and one child."""
         neighbours = self.tree.neighbours(k)
         groups = []
@@ -202,16 +206,16 @@ class PoseSearch:
             else:
                 above = judged[self.tree.parents[k]].particles
                 parents = above.take(rng.integers(len(above), size=share))
-                near = points_of(self.shapes[other], chosen, joint_rows(self.shapes[other])[:1])[:, 0]
+                near = world_points(self.shapes[other], chosen, joint_rows(self.shapes[other])[:1])[:, 0]
                 groups.append(self._edges[k - 1].propose_between(parents, near, rng))
         return groups
 
-    def _lay_arms(
+    def _propose_arms_from_wrists(
         self,
         side: str,
         groups: list[list[Particles]],
-        judged: list[Judged],
-        person: Person,
+        judged: list[ScoredParticles],
+        person: SearchTarget,
         count: int,
         rng: np.random.Generator,
     ) -> None:
@@ -219,7 +223,7 @@ class PoseSearch:
         upper, lower = self.tree.index(f"{side}_upper_arm"), self.tree.index(f"{side}_lower_arm")
         torsos = judged[0].particles.take(rng.integers(len(judged[0].particles), size=count))
         row = joint_rows(self.shapes[0])[PART_JOINTS["torso"].index(f"{side}_shoulder")]
-        shoulder = points_of(self.shapes[0], torsos, np.array([row]))[:, 0]
+        shoulder = world_points(self.shapes[0], torsos, np.array([row]))[:, 0]
         wrist = self._draw_wrists(side, shoulder[0], person, count, rng)
         lengths = [np.ptp(self.shapes[k].mean[joint_rows(self.shapes[k]), 0]) for k in (upper, lower)]
         elbow = elbows(shoulder, wrist, lengths[0] * torsos.scale, lengths[1] * torsos.scale, rng)
@@ -227,7 +231,9 @@ class PoseSearch:
         groups[upper].append(arms)
         groups[lower].append(self._edges[lower - 1].propose_between(arms, wrist, rng))
 
-    def _draw_wrists(self, side: str, shoulder: Array, person: Person, count: int, rng: np.random.Generator) -> Array:
+    def _draw_wrists(
+        self, side: str, shoulder: Array, person: SearchTarget, count: int, rng: np.random.Generator
+    ) -> Array:
         """Places (count,2) drawn in proportion to the likelihood of hands and to the detector's score of wrists."""
         ticks = np.arange(-REACH, REACH + GRID / 2, GRID) * person.scale
         grid = shoulder + np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
@@ -262,6 +268,6 @@ def elbows(shoulder: Array, wrist: Array, upper: Array, lower: Array, rng: np.ra
     return np.asarray(shoulder + axis * along[:, None] + sideways * (sign * across)[:, None])
 
 
-def _joined(first: Judged, second: Judged) -> Judged:
+def _joined(first: ScoredParticles, second: ScoredParticles) -> ScoredParticles:
     particles = Particles.join([first.particles, second.particles])
-    return Judged(particles, np.concatenate([first.cost, second.cost]))
+    return ScoredParticles(particles, np.concatenate([first.cost, second.cost]))

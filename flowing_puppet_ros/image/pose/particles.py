@@ -8,15 +8,13 @@ its own. Positions are pixels of the image, whose x is negated where the camera 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.model.ds.shape import PairLayout, PartShape, PuppetShape
 from flowing_puppet_ros.model.gaussian import Gaussian
-
-Array = np.ndarray[Any, Any]
 
 SHAPE_LIMIT = 2.5
 """Shape coefficients of particles are kept within this many standard deviations."""
@@ -47,7 +45,7 @@ class Particles:
         return cls(*(np.concatenate([getattr(group, name) for group in groups]) for name in fields))
 
 
-def points_of(shape: PartShape, particles: Particles, rows: Array | slice = slice(None)) -> Array:
+def world_points(shape: PartShape, particles: Particles, rows: Array | slice = slice(None)) -> Array:
     """Points (P,R,2) px of particles: the `rows` of `shape`, placed by Eqs. 6 and 7 and the particle's scale."""
     local = shape.mean[rows] + np.tensordot(particles.shape, shape.basis[rows], axes=(1, 2))
     sine, cosine = np.sin(particles.angle)[:, None], np.cos(particles.angle)[:, None]
@@ -78,7 +76,7 @@ def particles_of(puppets: list[PuppetShape], bone: Array, mirror: Array) -> list
     return groups
 
 
-def limited(shape: Array) -> Array:
+def clip_shape(shape: Array) -> Array:
     """Shape coefficients clipped to `SHAPE_LIMIT`."""
     return np.clip(shape, -SHAPE_LIMIT, SHAPE_LIMIT)
 
@@ -101,7 +99,7 @@ class Regression:
         return np.asarray(self.offset + given @ self.slope.T + drawn @ self.factor.T)
 
 
-class Edge:
+class PairwiseGaussian:
     """Potential and proposals between a parent and a child part; the springs q are loosened by `spring` metres.
 
     Parts that connect exactly would have no probability anywhere else ("loosely-connected" model of the thesis).
@@ -126,8 +124,8 @@ class Edge:
         size = self._size
         expected = self._whiten @ (self._law.offset[:, None] + self._law.slope @ parents.shape.T)
         own = self._whiten[:, :size] @ children.shape.T
-        hang = points_of(self._parent, parents, np.array([self._row]))[:, 0]
-        top = points_of(self._child, children, joint_rows(self._child)[:1])[:, 0]
+        hang = world_points(self._parent, parents, np.array([self._row]))[:, 0]
+        top = world_points(self._child, children, joint_rows(self._child)[:1])[:, 0]
         place = np.ascontiguousarray(self._whiten[:, size:])
         costs = _pair_costs(
             np.ascontiguousarray(expected.T), np.ascontiguousarray(own.T), place, hang, top,
@@ -139,29 +137,29 @@ class Edge:
     def propose_child(self, parents: Particles, rng: np.random.Generator) -> Particles:
         """A child drawn for each of some parents."""
         drawn = self._down.sample(parents.shape, rng)
-        shape, place = limited(drawn[:, : self._size]), drawn[:, self._size :]
+        shape, place = clip_shape(drawn[:, : self._size]), drawn[:, self._size :]
         angle = parents.angle + np.arctan2(place[:, 0], place[:, 1])
-        hang = points_of(self._parent, parents, np.array([self._row]))[:, 0]
+        hang = world_points(self._parent, parents, np.array([self._row]))[:, 0]
         top = hang + _turned(place[:, 2:], parents.angle) * parents.scale[:, None]
         return _hung(self._child, int(joint_rows(self._child)[0]), top, angle, parents.scale, shape)
 
     def propose_parent(self, children: Particles, rng: np.random.Generator) -> Particles:
         """A parent drawn for each of some children."""
         drawn = self._up.sample(children.shape, rng)
-        shape, place = limited(drawn[:, : self._size]), drawn[:, self._size :]
+        shape, place = clip_shape(drawn[:, : self._size]), drawn[:, self._size :]
         angle = children.angle - np.arctan2(place[:, 0], place[:, 1])
-        top = points_of(self._child, children, joint_rows(self._child)[:1])[:, 0]
+        top = world_points(self._child, children, joint_rows(self._child)[:1])[:, 0]
         hang = top - _turned(place[:, 2:], angle) * children.scale[:, None]
         return _hung(self._parent, self._row, hang, angle, children.scale, shape)
 
     def propose_between(self, parents: Particles, far: Array, rng: np.random.Generator) -> Particles:
         """A child for each of some parents that reaches from its joint there to the places `far` (P,2) px."""
-        near = points_of(self._parent, parents, np.array([self._row]))[:, 0]
+        near = world_points(self._parent, parents, np.array([self._row]))[:, 0]
         bone = far - near
         angle = np.arctan2(bone[:, 1], bone[:, 0])
         length = np.hypot(bone[:, 0], bone[:, 1]) / parents.scale
         given = np.column_stack([parents.shape, np.sin(angle - parents.angle), np.cos(angle - parents.angle), length])
-        shape = limited(self._between.sample(given, rng))
+        shape = clip_shape(self._between.sample(given, rng))
         return Particles((near + far) / 2, angle, parents.scale, shape)
 
 
@@ -174,7 +172,7 @@ def _turned(vectors: Array, angle: Array) -> Array:
 def _hung(shape: PartShape, row: int, place: Array, angle: Array, scale: Array, coefficients: Array) -> Particles:
     """Particles whose point `row` lies at `place` (P,2)."""
     at_origin = Particles(np.zeros_like(place), angle, scale, coefficients)
-    return Particles(place - points_of(shape, at_origin, np.array([row]))[:, 0], angle, scale, coefficients)
+    return Particles(place - world_points(shape, at_origin, np.array([row]))[:, 0], angle, scale, coefficients)
 
 
 @njit(cache=True, nogil=True)

@@ -4,17 +4,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.image.pose.modes import Solution
-from flowing_puppet_ros.image.pose.particle_search import Person
+from flowing_puppet_ros.arrays import Array
+from flowing_puppet_ros.image.pose.modes import PoseMode
+from flowing_puppet_ros.image.pose.particle_search import SearchTarget
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order
 from flowing_puppet_ros.model.ds.shape import PuppetShape, View
-
-Array = np.ndarray[Any, Any]
 
 OUTSIDE = 0.1
 """Factor of a joint's confidence where the joint lies outside of the image."""
@@ -42,12 +40,12 @@ class PosedPuppet:
     energy: float
     contours: tuple[Array, ...]
     depth: tuple[int, ...]
-    solutions: tuple[Solution, ...]
+    solutions: tuple[PoseMode, ...]
     gender_probability: dict[str, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class ViewHypothesis:
     """How a person is seen: the models of each gender, front or back, the heading in radians, the parts in search.
 
     The heading is that of the mirror image where the camera sees the back; `side` is the index of the view where one
@@ -62,7 +60,7 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
+class SearchResult:
     """What a search found.
 
     `solutions` are in pixels of the image that was searched, the best first; `sure` (J,) is the confidence of the
@@ -70,10 +68,10 @@ class Outcome:
     given image, in whose pixels the answer is.
     """
 
-    solutions: list[Solution]
+    solutions: list[PoseMode]
     sure: Array
-    person: Person
-    seen: Seen
+    person: SearchTarget
+    seen: ViewHypothesis
     size: tuple[int, int]
     factor: float
 
@@ -96,7 +94,7 @@ class Outcome:
             best.energy, placed.contours, tuple(int(rank) for rank in depth), others, genders,
         )  # fmt: skip
 
-    def puppet(self, model: DeformableStructures, solution: Solution) -> PuppetShape:
+    def puppet(self, model: DeformableStructures, solution: PoseMode) -> PuppetShape:
         """The likely puppet of a model on the joints of a solution, in pixels of the image that was searched."""
         return completed(model, solution.joints, (self.sure > 0).astype(float), solution.scale, self.seen.view)
 

@@ -11,70 +11,68 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8
 from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.evidence.image.hands import HandDetectors
 from flowing_puppet_ros.flow.estimate import FlowPair
-from flowing_puppet_ros.image.arms.evidence import window_of
+from flowing_puppet_ros.image.arms.evidence import person_window
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.pose.evidence import Found, GivenPerson, Likelihood, Window
+from flowing_puppet_ros.image.pose.evidence import KeypointPerson, LikelihoodLike, PersonHypotheses, PersonWindow
 from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FrameEvidence
 from flowing_puppet_ros.image.thesis_loop.flow_moments import FlowMoments
 from flowing_puppet_ros.image.thesis_loop.hand_maps import hand_maps
-from flowing_puppet_ros.image.thesis_loop.loop import LoopSettings, Start, ThesisLoop
-from flowing_puppet_ros.image.tracking.propagation import Grid
+from flowing_puppet_ros.image.thesis_loop.loop import InitialPose, LoopSettings, ThesisLoop
+from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
-
-type Floats = NDArray[np.float64]
 
 LONGEST = 100
 """Images of one person that are searched together; the evidence of an image takes about 5 MB."""
 
 
-class Seen(Protocol):
+class EvidenceLike(Protocol):
     """A person in one image: the evidence around them, and who was detected; `arms.Sight` is one."""
 
     @property
-    def detection(self) -> Found | None:
+    def detection(self) -> PersonHypotheses | None:
         """The detection or the given keypoints; None where there are none."""
         ...
 
     @property
-    def window(self) -> Window | None:
+    def window(self) -> PersonWindow | None:
         """The evidence around the person; None outside of the image."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GivenSight:
+class KeypointEvidence:
     """A person in one image who was started from given keypoints."""
 
-    detection: GivenPerson | None
-    window: Window | None
+    detection: KeypointPerson | None
+    window: PersonWindow | None
 
 
-def given_sights(
+def evidence_from_keypoints(
     model: DeformableStructures,
-    likelihood: Likelihood,
-    image: NDArray[np.uint8],
+    likelihood: LikelihoodLike,
+    image: U8,
     result: TrackResult,
     given: Sequence[Keypoints] | None,
-) -> dict[str, GivenSight]:
+) -> dict[str, KeypointEvidence]:
     """How the people of a step that took `given` keypoints are seen in its image (H, W, 3), by id."""
     sights = {}
     with one_blas_thread():
         for puppet in result.puppets:
             known = None if puppet.detection is None or given is None else given[puppet.detection]
-            found = None if known is None else GivenPerson(known, model.shoulder_width * puppet.scale)
-            sights[puppet.id] = GivenSight(found, window_of(model, likelihood, image, puppet))
+            found = None if known is None else KeypointPerson(known, model.shoulder_width * puppet.scale)
+            sights[puppet.id] = KeypointEvidence(found, person_window(model, likelihood, image, puppet))
     return sights
 
 
 @dataclass(slots=True, eq=False)
-class _Piece:
+class _Segment:
     """Consecutive images of one person: the tracked puppets and the evidence of each."""
 
     first: int
@@ -83,7 +81,7 @@ class _Piece:
 
 
 @dataclass(slots=True, eq=False)
-class FlowingClip:
+class ThesisClip:
     """Collects the tracker's results of consecutive images and searches the people of all of them."""
 
     model: DeformableStructures
@@ -91,10 +89,10 @@ class FlowingClip:
     loop: LoopSettings = field(default_factory=LoopSettings)
     energy: EnergySettings = field(default_factory=EnergySettings)
     images: int = 0
-    _pieces: dict[str, _Piece] = field(default_factory=dict)
+    _pieces: dict[str, _Segment] = field(default_factory=dict)
     _done: dict[int, dict[str, TrackedPuppet]] = field(default_factory=dict)
 
-    def add(self, result: TrackResult, sights: Mapping[str, Seen]) -> None:
+    def add(self, result: TrackResult, sights: Mapping[str, EvidenceLike]) -> None:
         """Take the result of the next image, and how its people are seen."""
         for puppet in result.puppets:
             piece = self._pieces.get(puppet.id)
@@ -102,11 +100,13 @@ class FlowingClip:
                 self._search(self._pieces.pop(puppet.id))
                 piece = None
             if piece is None:
-                piece = self._pieces[puppet.id] = _Piece(self.images)
+                piece = self._pieces[puppet.id] = _Segment(self.images)
             self._extend(piece, puppet, sights[puppet.id], result.flow, result.grid)
         self.images += 1
 
-    def _extend(self, piece: _Piece, puppet: TrackedPuppet, seen: Seen, flow: FlowPair | None, grid: Grid) -> None:
+    def _extend(
+        self, piece: _Segment, puppet: TrackedPuppet, seen: EvidenceLike, flow: FlowPair | None, grid: ImageScale
+    ) -> None:
         frame = FrameEvidence(seen.window, None, seen.detection)
         if seen.window is not None and self.energy.hand_weight > 0:
             # A piece that goes on begins with an image whose flow leads out of it, and keeps its hands.
@@ -126,11 +126,11 @@ class FlowingClip:
         for image in range(self.images):
             yield list(self._done.get(image, {}).values())
 
-    def _search(self, piece: _Piece) -> None:
+    def _search(self, piece: _Segment) -> None:
         views = [puppet.view for puppet in piece.puppets]
         view: View = "back" if views.count("back") > len(views) / 2 else "front"
         loop = ThesisLoop(self.model, view, self.loop, self.energy)
-        starts = [Start(puppet.joints, puppet.scale) for puppet in piece.puppets]
+        starts = [InitialPose(puppet.joints, puppet.scale) for puppet in piece.puppets]
         with one_blas_thread():
             joints, agreed, energy = loop.run(starts, piece.frames)
         for k, puppet in enumerate(piece.puppets):
@@ -147,7 +147,7 @@ class FlowingClip:
             )
 
 
-def _extent(*puppets: TrackedPuppet) -> tuple[Floats, Floats]:
+def _extent(*puppets: TrackedPuppet) -> tuple[F64, F64]:
     """Corners (2,) px of what the arms of puppets can reach."""
     joints = np.concatenate([puppet.joints for puppet in puppets])
     reach = 0.75 * max(puppet.scale for puppet in puppets)

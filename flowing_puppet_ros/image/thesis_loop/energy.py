@@ -11,17 +11,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.evidence.image.hands import HandMaps, hand_score
-from flowing_puppet_ros.evidence.image.likelihood import Scene
-from flowing_puppet_ros.image.pose.evidence import Found, Window
+from flowing_puppet_ros.evidence.image.likelihood import ImageEvidence
+from flowing_puppet_ros.image.pose.evidence import PersonHypotheses, PersonWindow
 from flowing_puppet_ros.image.thesis_loop.flow_moments import FlowMoments
-from flowing_puppet_ros.image.thesis_loop.upper_body import UpperBody
+from flowing_puppet_ros.image.thesis_loop.upper_body import UpperBodyParameters
 from flowing_puppet_ros.image.tracking.propagation import membership
 from flowing_puppet_ros.settings import Settings, setting
-
-type Floats = NDArray[np.float64]
 
 TERMS = ("contour", "colour", "hands", "detector")
 SCORED = tuple(f"{side}_{name}" for name in ("shoulder", "elbow", "wrist") for side in ("right", "left"))
@@ -44,7 +42,7 @@ class EnergySettings(Settings):
     steps: int = setting(1, "images that the flow carries a puppet for its evidence", low=1, high=10)
 
     @property
-    def weights(self) -> Floats:
+    def weights(self) -> F64:
         """(4,) of TERMS."""
         return np.array([self.contour_weight, self.colour_weight, self.hand_weight, self.score_weight])
 
@@ -57,17 +55,17 @@ class FrameEvidence:
     `after` the flow to the neighbouring images; None where there is none.
     """
 
-    window: Window | None
+    window: PersonWindow | None
     hands: HandMaps | None
-    found: Found | None
+    found: PersonHypotheses | None
     before: FlowMoments | None = None
     after: FlowMoments | None = None
 
-    def terms(self, body: UpperBody, joints: Floats, scale: Floats, contours: Sequence[Floats]) -> Floats:
+    def terms(self, body: UpperBodyParameters, joints: F64, scale: F64, contours: Sequence[F64]) -> F64:
         """Log likelihoods (P,4) of TERMS for joints (P,J,2) px and contours (P,K_i,2) of every part of the model."""
         terms = np.zeros((len(joints), len(TERMS)))
         scene = None if self.window is None else self.window.scene
-        if self.window is not None and isinstance(scene, Scene):
+        if self.window is not None and isinstance(scene, ImageEvidence):
             size = scale * self.window.factor
             for part in body.parts:
                 contour, colour = scene.contour_and_colour(part, self.window.inside(contours[part]), size)
@@ -84,7 +82,7 @@ class FrameEvidence:
         return terms
 
 
-def carried(body: UpperBody, flow: FlowMoments, joints: Floats, contours: Sequence[Floats]) -> Floats:
+def propagate_joints(body: UpperBodyParameters, flow: FlowMoments, joints: F64, contours: Sequence[F64]) -> F64:
     """Joints (P,J,2) px where the flow takes those of puppets: the flowing puppets of thesis section 2.
 
     A joint moves as the mean of its parts' motions, by the weight of their pixels.
@@ -102,36 +100,34 @@ def carried(body: UpperBody, flow: FlowMoments, joints: Floats, contours: Sequen
 class FlowingEnergy:
     """Energies of puppets in the images of a clip; `frames` are those of one person, one after the other."""
 
-    def __init__(self, body: UpperBody, frames: Sequence[FrameEvidence], settings: EnergySettings) -> None:
+    def __init__(self, body: UpperBodyParameters, frames: Sequence[FrameEvidence], settings: EnergySettings) -> None:
         """The flow leads from each of the frames to the next."""
         self.body, self.frames, self.settings = body, frames, settings
 
-    def at(self, frame: int, vectors: Floats, legs: Floats) -> Floats:
+    def at(self, frame: int, vectors: F64, legs: F64) -> F64:
         """Energies (P,) of Eq. 35 of vectors (P,D) in one frame; `legs` (J,2) as `UpperBody.joints` takes them."""
         joints, scale = self.body.joints(vectors, legs)
         prior, own, elsewhere = self.terms(frame, joints, scale)
         weights = self.settings.weights
         return np.asarray(self.settings.prior_weight * prior - (own + elsewhere) @ weights, dtype=np.float64)
 
-    def terms(self, frame: int, joints: Floats, scale: Floats) -> tuple[Floats, Floats, Floats]:
+    def terms(self, frame: int, joints: F64, scale: F64) -> tuple[F64, F64, F64]:
         """Prior energy (P,), evidence (P,4) in the frame, and the sum (P,4) of that in its neighbours."""
         contours, prior = self.body.model.puppets_from_joints(joints, scale, self.body.view, self.body.edges)
         own = self.frames[frame].terms(self.body, joints, scale, contours)
         elsewhere = np.zeros_like(own)
         for step, wanted in ((1, self.settings.forward), (-1, self.settings.backward)):
             if wanted:
-                elsewhere += self._carried_terms(frame, step, joints, scale, contours)
+                elsewhere += self._propagated_terms(frame, step, joints, scale, contours)
         return prior, own, elsewhere
 
-    def _carried_terms(
-        self, frame: int, step: int, joints: Floats, scale: Floats, contours: Sequence[Floats]
-    ) -> Floats:
+    def _propagated_terms(self, frame: int, step: int, joints: F64, scale: F64, contours: Sequence[F64]) -> F64:
         terms = np.zeros((len(joints), len(TERMS)))
         for _ in range(self.settings.steps):
             flow = self.flow(frame, step)
             if flow is None:
                 break
-            joints = carried(self.body, flow, joints, contours)
+            joints = propagate_joints(self.body, flow, joints, contours)
             contours, _ = self.body.model.puppets_from_joints(joints, scale, self.body.view, [])
             frame += step
             terms += self.frames[frame].terms(self.body, joints, scale, contours)

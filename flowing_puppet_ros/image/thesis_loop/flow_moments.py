@@ -13,8 +13,8 @@ from typing import Self
 
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, F64
 from flowing_puppet_ros.flow.affine import (
     BACKGROUND_SHARE,
     CORRELATED_PIXELS,
@@ -24,9 +24,7 @@ from flowing_puppet_ros.flow.affine import (
     round_trip_weight,
 )
 from flowing_puppet_ros.flow.estimate import FlowPair
-from flowing_puppet_ros.image.tracking.propagation import Grid
-
-type Floats = NDArray[np.float64]
+from flowing_puppet_ros.image.tracking.propagation import ImageScale
 
 SUMS = 12
 """Sums over weights w: w times 1, x, y, xx, xy, yy, then w times u, v, ux, uy, vx, vy."""
@@ -36,25 +34,25 @@ SUMS = 12
 class FlowMoments:
     """Sums of one flow field around a person: `along` (h,w+1,12) from pixel `corner` (x, y) of the flow's grid on."""
 
-    along: Floats
-    corner: Floats
-    grid: Grid
+    along: F64
+    corner: F64
+    grid: ImageScale
 
     @classmethod
-    def of(cls, flow: FlowPair, grid: Grid, low: Floats, high: Floats) -> Self:
+    def of(cls, flow: FlowPair, grid: ImageScale, low: F64, high: F64) -> Self:
         """Of the flow (there, back) on the working grid, within image pixels `low` to `high` (2,)."""
-        first = np.clip(np.floor(grid.reduced(low)), 0, np.array(grid.work) - 1).astype(int)
-        last = np.clip(np.ceil(grid.reduced(high)), first + 1, grid.work).astype(int)
+        first = np.clip(np.floor(grid.to_work(low)), 0, np.array(grid.work) - 1).astype(int)
+        last = np.clip(np.ceil(grid.to_work(high)), first + 1, grid.work).astype(int)
         there, back = (np.ascontiguousarray(field, np.float32) for field in flow)
         background = fit_regions(np.zeros(there.shape[:2], np.uint16), 1, there, back).affine[0]
         return cls(_prepare(there, back, background, *first, *last), first.astype(np.float64), grid)
 
-    def affine(self, contours: Floats) -> tuple[Floats, Floats]:
+    def affine(self, contours: F64) -> tuple[F64, F64]:
         """Motions (P,2,3) of regions with contours (P,K,2), in image pixels, and the weight (P,) of their pixels.
 
         Regions that weigh next to nothing stay where they are.
         """
-        local = np.ascontiguousarray(self.grid.reduced(contours) - self.corner, np.float64)
+        local = np.ascontiguousarray(self.grid.to_work(contours) - self.corner, np.float64)
         sums = np.zeros((len(contours), SUMS))
         _gather(self.along, local, sums)
         weight = np.maximum(sums[:, 0], 1e-9)
@@ -71,9 +69,9 @@ class FlowMoments:
         linear[~known], flow[~known] = 0.0, 0.0
         return self._enlarged(linear, flow, mean), np.where(known, weight, 0.0)
 
-    def _enlarged(self, linear: Floats, flow: Floats, mean: Floats) -> Floats:
+    def _enlarged(self, linear: F64, flow: F64, mean: F64) -> F64:
         """Motions of the grid around `mean`, relative to the corner, as motions of the image."""
-        center = self.grid.enlarged(mean + self.corner)
+        center = self.grid.to_image(mean + self.corner)
         ratio = self.grid.factor
         turned = linear * ratio[None, None, :] / ratio[None, :, None] + np.eye(2)
         shift = flow / ratio + center - np.einsum("pij,pj->pi", turned, center)
@@ -82,9 +80,9 @@ class FlowMoments:
 
 @njit(cache=True, nogil=True)
 def _prepare(
-    there: NDArray[np.float32], back: NDArray[np.float32], background: Floats, left: int, top: int, right: int,
+    there: F32, back: F32, background: F64, left: int, top: int, right: int,
     bottom: int,
-) -> Floats:  # fmt: skip
+) -> F64:  # fmt: skip
     along = np.zeros((bottom - top, right - left + 1, 12))
     a = background
     for y in range(bottom - top):
@@ -116,7 +114,7 @@ def _prepare(
 
 
 @njit(cache=True, nogil=True)
-def _gather(along: Floats, contours: Floats, sums: Floats) -> None:
+def _gather(along: F64, contours: F64, sums: F64) -> None:
     """Green's theorem by rows, see `evidence.image.region`."""
     height, width = along.shape[0], along.shape[1] - 1
     for p in range(contours.shape[0]):

@@ -7,26 +7,27 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Flow
 from flowing_puppet_ros.evidence.image.hands import HandDetectors, HandMaps
-from flowing_puppet_ros.evidence.image.likelihood import Scene
-from flowing_puppet_ros.flow.estimate import Flow, resize_flow
-from flowing_puppet_ros.image.pose.evidence import Window
-from flowing_puppet_ros.image.tracking.propagation import Grid
+from flowing_puppet_ros.evidence.image.likelihood import ImageEvidence
+from flowing_puppet_ros.flow.estimate import resize_flow
+from flowing_puppet_ros.image.pose.evidence import PersonWindow
+from flowing_puppet_ros.image.tracking.propagation import ImageScale
 
 
 def hand_maps(
-    detectors: HandDetectors, window: Window, flows: Sequence[Flow], grid: Grid, scale: float
+    detectors: HandDetectors, window: PersonWindow, flows: Sequence[Flow], grid: ImageScale, scale: float
 ) -> HandMaps | None:
     """Maps of the hands of a person of `scale` px/m; places are asked for in pixels of the image.
 
     `flows` lead away from the image, on the working grid of `grid`. None where the window's evidence knows no skin.
     """
     scene = window.scene
-    if not isinstance(scene, Scene):
+    if not isinstance(scene, ImageEvidence):
         return None
     size = np.array(scene.features.image.shape[1::-1])
-    low = np.clip(np.rint(grid.reduced(window.corner)), 0, np.array(grid.work) - 1).astype(int)
-    high = np.clip(np.rint(grid.reduced(window.corner + size / window.factor)), low + 1, grid.work).astype(int)
+    low = np.clip(np.rint(grid.to_work(window.corner)), 0, np.array(grid.work) - 1).astype(int)
+    high = np.clip(np.rint(grid.to_work(window.corner + size / window.factor)), low + 1, grid.work).astype(int)
     width, height = (int(side) for side in size)
     pieces = [
         resize_flow(np.ascontiguousarray(flow[low[1] : high[1], low[0] : high[0]]), (width, height)) for flow in flows

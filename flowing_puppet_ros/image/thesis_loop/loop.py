@@ -12,18 +12,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
-from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FlowingEnergy, FrameEvidence, carried
-from flowing_puppet_ros.image.thesis_loop.upper_body import PARTS, UpperBody
-from flowing_puppet_ros.image.thesis_loop.wrist_proposals import WristMoves
+from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FlowingEnergy, FrameEvidence, propagate_joints
+from flowing_puppet_ros.image.thesis_loop.upper_body import PARTS, UpperBodyParameters
+from flowing_puppet_ros.image.thesis_loop.wrist_proposals import WristProposals
 from flowing_puppet_ros.inference.swarm import Swarm, resampled, search
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
 from flowing_puppet_ros.settings import Settings, setting
-
-type Floats = NDArray[np.float64]
 
 STAGES: tuple[tuple[str, ...], ...] = (PARTS[:4], PARTS)
 """What moves in each stage of the hierarchical search: torso, head and right arm, then all."""
@@ -50,21 +48,21 @@ class LoopSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Start:
+class InitialPose:
     """Where the search begins in one image: `joints` (J,2) px as tracked, and `scale` px/m."""
 
-    joints: Floats
+    joints: F64
     scale: float
 
 
 @dataclass(slots=True, eq=False)
-class _Image:
+class _FrameParticles:
     """One image in a run: bounds, legs, the wrist move, and the particles (P,D) with their energies (P,)."""
 
     swarm: Swarm
-    legs: Floats
-    jump: WristMoves | None
-    start: Floats
+    legs: F64
+    jump: WristProposals | None
+    start: F64
 
 
 class ThesisLoop:
@@ -72,16 +70,16 @@ class ThesisLoop:
 
     def __init__(self, model: DeformableStructures, view: View, settings: LoopSettings, energy: EnergySettings) -> None:
         """`view` is the side of the person that the camera sees."""
-        self.body = UpperBody(model, view)
+        self.body = UpperBodyParameters(model, view)
         self.settings, self.energy_settings = settings, energy
 
-    def run(self, starts: Sequence[Start], frames: Sequence[FrameEvidence]) -> tuple[Floats, Floats, Floats]:
+    def run(self, starts: Sequence[InitialPose], frames: Sequence[FrameEvidence]) -> tuple[F64, F64, F64]:
         """Joints (T,J,2) px, how much the particles agree on each (T,J) in [0, 1], and the energy (T,).
 
         Of several seeds, those of the run of least total energy.
         """
         energy = FlowingEnergy(self.body, frames, self.energy_settings)
-        best: tuple[float, list[_Image]] | None = None
+        best: tuple[float, list[_FrameParticles]] | None = None
         for number in range(self.settings.seeds):
             rng = np.random.default_rng([self.settings.seed, number])
             images = [self._begin(t, start, energy, rng) for t, start in enumerate(starts)]
@@ -96,7 +94,7 @@ class ThesisLoop:
         assert best is not None
         return self._answer(best[1])
 
-    def _begin(self, t: int, start: Start, energy: FlowingEnergy, rng: np.random.Generator) -> _Image:
+    def _begin(self, t: int, start: InitialPose, energy: FlowingEnergy, rng: np.random.Generator) -> _FrameParticles:
         """First particles: the detector's poses with noise, half of them with a wrist drawn from the hand maps."""
         poses = self._poses(start, energy.frames[t])
         vectors = self.body.vectors(poses, np.full(len(poses), start.scale))
@@ -105,7 +103,7 @@ class ThesisLoop:
         neck = start.joints[self.body.model.joint_names.index("neck")]
         jump = None
         if hands is not None and self.energy_settings.hand_weight > 0:
-            jump = WristMoves.of(self.body, box, legs, hands, neck, start.scale)
+            jump = WristProposals.of(self.body, box, legs, hands, neck, start.scale)
         particles = vectors[np.arange(self.settings.particles) % len(vectors)]
         noise = np.concatenate(
             [np.full(part.stop - part.start, NOISE[name]) for name, part in self.body.slices().items()]
@@ -116,9 +114,9 @@ class ThesisLoop:
             drawn = slice((fresh.start + len(particles)) // 2, None)
             particles[drawn] = jump(particles[drawn], rng)
         particles = box.inside(particles)
-        return _Image(Swarm.of(particles, energy.at(t, particles, legs)), legs, jump, vectors[0])
+        return _FrameParticles(Swarm.of(particles, energy.at(t, particles, legs)), legs, jump, vectors[0])
 
-    def _poses(self, start: Start, evidence: FrameEvidence) -> Floats:
+    def _poses(self, start: InitialPose, evidence: FrameEvidence) -> F64:
         """Tracked joints first, then the detector's poses, (K,J,2) px; what a pose lacks is as tracked."""
         poses = [start.joints]
         for keypoints, _ in evidence.found.modes(MODES) if evidence.found is not None else ():
@@ -126,7 +124,7 @@ class ThesisLoop:
             poses.append(np.where(np.isfinite(joints), joints, start.joints))
         return np.array(poses)
 
-    def _search(self, t: int, image: _Image, energy: FlowingEnergy, rng: np.random.Generator) -> None:
+    def _search(self, t: int, image: _FrameParticles, energy: FlowingEnergy, rng: np.random.Generator) -> None:
         """Both stages of the swarm, then particles drawn by their energy; the best one stays."""
         box = self.body.box(image.start)
         judge = partial(energy.at, t, legs=image.legs)
@@ -142,16 +140,16 @@ class ThesisLoop:
         drawn.particles[worst], drawn.energy[worst] = swarm.best[best], swarm.best_energy[best]
         image.swarm = Swarm.of(drawn.particles, drawn.energy)
 
-    def _propagate(self, images: Sequence[_Image], energy: FlowingEnergy) -> None:
+    def _propagate(self, images: Sequence[_FrameParticles], energy: FlowingEnergy) -> None:
         """Carry the best particles of each image forward through the clip, then backward; keep the best of all."""
         count = len(images)
         if self.settings.carried == 0:
             return
         for step, order in ((1, range(count - 1)), (-1, range(count - 1, 0, -1))):
             for t in order:
-                self._carry(t, step, images, energy)
+                self._warp(t, step, images, energy)
 
-    def _carry(self, t: int, step: int, images: Sequence[_Image], energy: FlowingEnergy) -> None:
+    def _warp(self, t: int, step: int, images: Sequence[_FrameParticles], energy: FlowingEnergy) -> None:
         flow = energy.flow(t, step)
         if flow is None:
             return
@@ -159,14 +157,14 @@ class ThesisLoop:
         chosen = here.swarm.particles[np.argsort(here.swarm.energy, kind="stable")[: self.settings.carried]]
         joints, scale = self.body.joints(chosen, here.legs)
         contours, _ = self.body.model.puppets_from_joints(joints, scale, self.body.view, [])
-        moved = self.body.vectors(carried(self.body, flow, joints, contours), scale)
+        moved = self.body.vectors(propagate_joints(self.body, flow, joints, contours), scale)
         moved = self.body.box(there.start).inside(moved)
         particles = np.concatenate([there.swarm.particles, moved])
         energies = np.concatenate([there.swarm.energy, energy.at(t + step, moved, there.legs)])
         kept = np.argsort(energies, kind="stable")[: self.settings.particles]
         there.swarm = Swarm.of(particles[kept], energies[kept])
 
-    def _answer(self, images: Sequence[_Image]) -> tuple[Floats, Floats, Floats]:
+    def _answer(self, images: Sequence[_FrameParticles]) -> tuple[F64, F64, F64]:
         joints, agreed, energies = [], [], []
         for image in images:
             swarm = image.swarm

@@ -9,13 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowing_puppet_ros.inference.swarm import Box
+from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.inference.swarm import Bounds
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View, rotate
-
-type Floats = NDArray[np.float64]
 
 PARTS = ("torso", "head", "right_upper_arm", "right_lower_arm", "left_upper_arm", "left_lower_arm")
 INERTIA = {"angle": 1.0, "length": 1.0, "shape": 0.5, "center": 0.1, "scale": 0.5}
@@ -31,7 +29,7 @@ _ALL_ROUND = 1.8 * np.pi  # a joint that reaches this far has no bounds
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class UpperBody:
+class UpperBodyParameters:
     """Maps vectors (P,D) to joints (P,J,2) px of a model and back, for one side that the camera sees.
 
     Order: 6 angles (the torso's, then those of PARTS relative to their parents), 6 bone lengths in metres, the torso's
@@ -41,7 +39,7 @@ class UpperBody:
     model: DeformableStructures
     view: View
     parts: tuple[int, ...] = field(init=False)
-    _bounds: tuple[Floats, Floats] = field(init=False, repr=False)
+    _bounds: tuple[F64, F64] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Find the parts and learn the bounds from bodies that the model draws."""
@@ -63,7 +61,7 @@ class UpperBody:
         ends = np.cumsum([0, len(PARTS), len(PARTS), self.shape_size, 2, 1])
         return {name: slice(int(a), int(b)) for name, a, b in zip(INERTIA, ends, ends[1:], strict=False)}
 
-    def free(self, parts: tuple[str, ...]) -> NDArray[np.bool_]:
+    def free(self, parts: tuple[str, ...]) -> Bools:
         """(D,) the values that place these parts; with the torso its shape, place and the scale too."""
         where, free = self.slices(), np.zeros(2 * len(PARTS) + self.shape_size + 3, dtype=bool)
         for name in parts:
@@ -74,16 +72,16 @@ class UpperBody:
                 free[where[name]] = True
         return free
 
-    def box(self, start: Floats) -> Box:
+    def box(self, start: F64) -> Bounds:
         """Bounds around a person who starts at a vector (D,): learned for limbs, near the start for the rest."""
         where, (low, high) = self.slices(), (bound.copy() for bound in self._bounds)
         for name, reach in (("center", SHIFT * np.exp(start[-1])), ("scale", GROWTH)):
             low[where[name]], high[where[name]] = start[where[name]] - reach, start[where[name]] + reach
         low[0], high[0] = start[0] - TURN, start[0] + TURN
         inertia = np.concatenate([np.full(part.stop - part.start, INERTIA[name]) for name, part in where.items()])
-        return Box(low, high, inertia)
+        return Bounds(low, high, inertia)
 
-    def joints(self, vectors: Floats, legs: Floats) -> tuple[Floats, Floats]:
+    def joints(self, vectors: F64, legs: F64) -> tuple[F64, F64]:
         """Joints (P,J,2) px and scales (P,) of vectors (P,D); `legs` (J,2) px as `legs_of` gives them."""
         where = self.slices()
         angle, length = vectors[:, where["angle"]], vectors[:, where["length"]]
@@ -110,7 +108,7 @@ class UpperBody:
                 joints[:, below] = joints[:, hip] + legs[below]
         return joints, scale
 
-    def vectors(self, joints: Floats, scale: Floats) -> Floats:
+    def vectors(self, joints: F64, scale: F64) -> F64:
         """Vectors (P,D) of joints (P,J,2) px at scales (P,): elbows, wrists, face stay, shoulders follow the torso."""
         vectors = self._measured(joints, scale)
         limbs = slice(1, len(PARTS))
@@ -118,7 +116,7 @@ class UpperBody:
         vectors[:, limbs] = (vectors[:, limbs] - middle + np.pi) % (2 * np.pi) - np.pi + middle
         return vectors
 
-    def _measured(self, joints: Floats, scale: Floats) -> Floats:
+    def _measured(self, joints: F64, scale: F64) -> F64:
         """Vectors as `vectors` gives them, with angles in any turn."""
         mirrored = joints * np.array([self._sign, 1.0])
         coefficients = self.model.shape_coefficients(joints, scale, self.view)
@@ -145,7 +143,7 @@ class UpperBody:
             vectors[:, len(PARTS) + k] = np.hypot(bone[:, 0], bone[:, 1]) / scale
         return vectors
 
-    def legs_of(self, joints: Floats) -> Floats:
+    def legs_of(self, joints: F64) -> F64:
         """Where knees, ankles and feet lie from their hip, (J,2) px, of joints (J,2); 0 of the others."""
         legs = np.zeros_like(joints)
         for side in ("right", "left"):
@@ -161,13 +159,13 @@ class UpperBody:
         names = (f"{side}_{name}" for name in ("knee", "ankle", "foot"))
         return [self.model.joint_names.index(name) for name in names if name in self.model.joint_names]
 
-    def _torso(self, shape: Floats) -> Floats:
+    def _torso(self, shape: F64) -> F64:
         """The torso's joints (P,M,2) in its bone frame, metres, for coefficients (P,Z)."""
         torso = self.model.shapes[0]
         count = torso.joint_count
         return np.asarray(torso.mean[-count:] + np.tensordot(shape, torso.basis[-count:], axes=(1, 2)))
 
-    def _learned_bounds(self) -> tuple[Floats, Floats]:
+    def _learned_bounds(self) -> tuple[F64, F64]:
         """Bounds (D,) of limb angles and lengths from bodies drawn from the model; none for what goes all round."""
         rng = np.random.default_rng(SEED)
         joints = np.array([self.model.sample(rng).joints for _ in range(DRAWN)]) * np.array([self._sign, 1.0])

@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.evidence.image.hands import HandMaps
-from flowing_puppet_ros.image.thesis_loop.upper_body import PARTS, UpperBody
-from flowing_puppet_ros.inference.swarm import Box
-
-type Floats = NDArray[np.float64]
+from flowing_puppet_ros.image.thesis_loop.upper_body import PARTS, UpperBodyParameters
+from flowing_puppet_ros.inference.swarm import Bounds
 
 GRID = 0.04  # m between the places at which hands are looked for
 REACH = 0.85  # m from the neck
@@ -21,17 +19,17 @@ SIDES = ("right", "left")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class WristMoves:
+class WristProposals:
     """Places (K,2) px where hands may be, and for each map the sums (K,) of their probabilities up to each place."""
 
-    body: UpperBody
-    box: Box
-    legs: Floats
-    places: Floats
-    sums: tuple[Floats, ...]
+    body: UpperBodyParameters
+    box: Bounds
+    legs: F64
+    places: F64
+    sums: tuple[F64, ...]
 
     @classmethod
-    def of(cls, body: UpperBody, box: Box, legs: Floats, maps: HandMaps, neck: Floats, scale: float) -> Self:
+    def of(cls, body: UpperBodyParameters, box: Bounds, legs: F64, maps: HandMaps, neck: F64, scale: float) -> Self:
         """Look for hands around a person with the neck at (2,) px; a map's probability is that of its log odds."""
         axis = np.arange(-REACH, REACH + GRID, GRID) * scale
         offsets = np.stack(np.meshgrid(axis, axis), axis=2).reshape(-1, 2)
@@ -42,7 +40,7 @@ class WristMoves:
             sums.append(np.cumsum(1 / (1 + np.exp(-np.clip(odds, -30, 30)))))
         return cls(body, box, legs, places, tuple(sums))
 
-    def __call__(self, vectors: Floats, rng: np.random.Generator) -> Floats:
+    def __call__(self, vectors: F64, rng: np.random.Generator) -> F64:
         """Vectors (P,D) with one wrist each at a place drawn from one of the maps, chosen at random."""
         moved = vectors.copy()
         which = rng.integers(0, len(self.sums), len(vectors))
@@ -60,7 +58,7 @@ class WristMoves:
             )
         return moved
 
-    def _laid(self, vectors: Floats, joints: Floats, scale: Floats, side: str, wrist: Floats, bend: Floats) -> Floats:
+    def _laid(self, vectors: F64, joints: F64, scale: F64, side: str, wrist: F64, bend: F64) -> F64:
         """Vectors (P,D) whose arm reaches for wrists (P,2) px, the elbow on the side `bend` (P,) if it may be there."""
         names = self.body.model.joint_names
         sign = np.array([1.0 if self.body.view == "front" else -1.0, 1.0])
@@ -86,6 +84,6 @@ class WristMoves:
         vectors[:, lower] = self._near_bounds(np.arctan2(rest[:, 1], rest[:, 0]) - angle, lower)
         return vectors
 
-    def _near_bounds(self, angle: Floats, part: int) -> Floats:
+    def _near_bounds(self, angle: F64, part: int) -> F64:
         middle = 0.5 * (self.box.low[part] + self.box.high[part])
         return np.asarray((angle - middle + np.pi) % (2 * np.pi) - np.pi + middle)

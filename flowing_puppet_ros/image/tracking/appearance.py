@@ -8,9 +8,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-type Floats = NDArray[np.float64]
+from flowing_puppet_ros.arrays import F64, U8
 
 CORNERS = ("right_shoulder", "left_shoulder", "left_hip", "right_hip")
 LEVELS, TINTS = 6, 20  # bins of lightness, and of each of a* and b* ...
@@ -22,14 +21,14 @@ MOST = 48  # px a side; larger torsos are asked in some pixels only
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Clothes:
+class TorsoAppearance:
     """Colours (LEVELS * TINTS^2,) of a torso that sum to 1, and whether nobody else's torso overlaps with it."""
 
-    colours: Floats
+    colours: F64
     alone: bool
 
 
-def clothes_of(names: Sequence[str], image: NDArray[np.uint8], people: Sequence[Floats]) -> list[Clothes | None]:
+def torso_appearances(names: Sequence[str], image: U8, people: Sequence[F64]) -> list[TorsoAppearance | None]:
     """What each of some people wears in an image (H, W, 3) RGB or (H, W) grey.
 
     `people` are joints (J, 2) px called `names`, NaN where unknown. None where a shoulder or a hip is unknown, or next
@@ -38,11 +37,11 @@ def clothes_of(names: Sequence[str], image: NDArray[np.uint8], people: Sequence[
     rows = [list(names).index(name) for name in CORNERS]
     torsos = [joints[rows] for joints in people]
     colours = [_colours(image, torso) if np.isfinite(torso).all() else None for torso in torsos]
-    met = meetings(names, people)
-    return [None if one is None else Clothes(one, not m) for one, m in zip(colours, met, strict=True)]
+    met = find_overlapping(names, people)
+    return [None if one is None else TorsoAppearance(one, not m) for one, m in zip(colours, met, strict=True)]
 
 
-def meetings(names: Sequence[str], people: Sequence[Floats]) -> list[bool]:
+def find_overlapping(names: Sequence[str], people: Sequence[F64]) -> list[bool]:
     """Whether the box round each one's torso overlaps with that of another; `people` as for `clothes_of`."""
     rows = [list(names).index(name) for name in CORNERS]
     boxes = [(joints[rows].min(axis=0), joints[rows].max(axis=0)) for joints in people]
@@ -54,12 +53,12 @@ def meetings(names: Sequence[str], people: Sequence[Floats]) -> list[bool]:
     return [any(over(k, other) for other in range(len(boxes)) if other != k) for k in range(len(boxes))]
 
 
-def unlike(one: Floats, other: Floats) -> float:
+def hellinger_distance(one: F64, other: F64) -> float:
     """How unlike two colour distributions are, in [0, 1]: their Hellinger distance."""
     return float(np.sqrt(max(0.0, 1.0 - np.sqrt(one * other).sum())))
 
 
-def _colours(image: NDArray[np.uint8], torso: Floats) -> Floats | None:
+def _colours(image: U8, torso: F64) -> F64 | None:
     """Smoothed histogram of the middle of a torso (4, 2), its corners one after the other round it."""
     middle = torso.mean(axis=0)
     corners = middle + INSIDE * (torso - middle)

@@ -7,17 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U16, Flow
 from flowing_puppet_ros.flow.affine import RegionMotions, transform
-from flowing_puppet_ros.flow.estimate import Flow, FlowPair
+from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.flow.puppet_flow import PuppetFlow, explained_fraction, motion_field, part_motions
-from flowing_puppet_ros.image.tracking.track import Person, TrackerSettings
+from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order, render_labels
 from flowing_puppet_ros.model.ds.shape import PuppetShape
-
-type Floats = NDArray[np.float64]
 
 MOTION_SHARE = 0.3  # error of a flow vector as a share of its length
 DOUBT = 0.03  # m; drift a step of a joint whose part has no supported motion
@@ -25,27 +23,27 @@ ENOUGH_PIXELS = 200.0  # a part's motion gains no weight from more
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class ImageScale:
     """The working grid of an image: sizes (width, height) of both; pixel (0, 0) is the centre of the first pixel."""
 
     image: tuple[int, int]
     work: tuple[int, int]
 
     @property
-    def factor(self) -> Floats:
+    def factor(self) -> F64:
         """(2,) working pixels per image pixel."""
         return np.asarray(np.array(self.work) / np.array(self.image), dtype=np.float64)
 
-    def reduced(self, points: Floats) -> Floats:
+    def to_work(self, points: F64) -> F64:
         """Image points (..., 2) in working pixels."""
         return np.asarray((points + 0.5) * self.factor - 0.5)
 
-    def enlarged(self, points: Floats) -> Floats:
+    def to_image(self, points: F64) -> F64:
         """Working points (..., 2) in image pixels."""
         return np.asarray((points + 0.5) / self.factor - 0.5)
 
 
-def paint_people(model: DeformableStructures, shapes: Sequence[PuppetShape], grid: Grid) -> NDArray[np.uint16]:
+def render_label_map(model: DeformableStructures, shapes: Sequence[PuppetShape], grid: ImageScale) -> U16:
     """Labels (h, w) on the working grid, P parts a person: part i of person k is k * P + i + 1, 0 background.
 
     Larger people are painted last: they are nearer.
@@ -53,19 +51,19 @@ def paint_people(model: DeformableStructures, shapes: Sequence[PuppetShape], gri
     width, height = grid.work
     labels = np.zeros((height, width), dtype=np.uint16)
     for k in sorted(range(len(shapes)), key=lambda k: shapes[k].scale):
-        contours = tuple(grid.reduced(contour) for contour in shapes[k].contours)
+        contours = tuple(grid.to_work(contour) for contour in shapes[k].contours)
         own = render_labels(contours, depth_order(model, shapes[k].view), (height, width))
         np.copyto(labels, own + np.uint16(k * len(model.tree)), where=own > 0)
     return labels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Carriage:
+class Propagation:
     """Layered motion from the previous image to this one: `labels` (h, w) of the previous, motions on its grid."""
 
-    labels: NDArray[np.uint16]
+    labels: U16
     motions: RegionMotions
-    background: Floats
+    background: F64
     forward: Flow
 
     def puppet_flow(self) -> PuppetFlow:
@@ -75,16 +73,16 @@ class Carriage:
         return PuppetFlow(self.motions.affine, self.background, field, explained)
 
 
-def carry_people(
-    model: DeformableStructures, people: Sequence[Person], flow: FlowPair, grid: Grid, settings: TrackerSettings
-) -> Carriage:
+def propagate_tracks(
+    model: DeformableStructures, people: Sequence[Track], flow: FlowPair, grid: ImageScale, settings: TrackerSettings
+) -> Propagation:
     """Move every person's joints with the affine motion of their parts; their variances grow with what speaks against.
 
     `flow` is the (forward, backward) pair on the working grid. Also sets each person's `flow_energy`, the mean over
     the visible parts of half the squared misfit in pixels, less by the parts' support.
     """
     count = len(model.tree)
-    labels = paint_people(model, [person.shape for person in people if person.shape is not None], grid)
+    labels = render_label_map(model, [person.shape for person in people if person.shape is not None], grid)
     forest = tuple(
         parent + k * count if parent >= 0 else -1 for k in range(len(people)) for parent in model.tree.parents
     )
@@ -92,14 +90,14 @@ def carry_people(
     for k, person in enumerate(people):
         own = slice(k * count, (k + 1) * count)
         mine = RegionMotions(motions.affine[own], motions.residual[own], motions.support[own], motions.pixels[own])
-        _carry_one(model, person, mine, grid, settings)
-    return Carriage(labels, motions, background, flow[0])
+        _propagate_one(model, person, mine, grid, settings)
+    return Propagation(labels, motions, background, flow[0])
 
 
-def _carry_one(
-    model: DeformableStructures, person: Person, motions: RegionMotions, grid: Grid, settings: TrackerSettings
+def _propagate_one(
+    model: DeformableStructures, person: Track, motions: RegionMotions, grid: ImageScale, settings: TrackerSettings
 ) -> None:
-    joints = grid.reduced(person.mean)
+    joints = grid.to_work(person.mean)
     moved = transform(motions.affine, joints[None])  # (P, J, 2)
     trust = np.minimum(motions.pixels, ENOUGH_PIXELS) / ENOUGH_PIXELS * motions.support + 1e-3
     weight = trust[:, None] * membership(model)
@@ -112,16 +110,16 @@ def _carry_one(
     length = ((mean - joints) ** 2).sum(axis=1)
     pixels = (spread + misfit / ENOUGH_PIXELS + MOTION_SHARE**2 * length) / np.mean(grid.factor) ** 2
     drift = (settings.flow_deviation * person.scale) ** 2 + (DOUBT * person.scale * (1 - support)) ** 2
-    person.mean = grid.enlarged(mean)
+    person.mean = grid.to_image(mean)
     person.variance = person.variance + drift + pixels
     person.age += 1
     # A refused detection is only comparable with the next one where it would be by now.
-    person.doubted = person.doubted + grid.enlarged(mean) - grid.enlarged(joints)
+    person.outlier_position = person.outlier_position + grid.to_image(mean) - grid.to_image(joints)
     disagreement = (0.5 * residual**2 + 1 - motions.support)[motions.known]
     person.flow_energy = float(disagreement.mean()) if len(disagreement) else 0.0
 
 
-def membership(model: DeformableStructures) -> Floats:
+def membership(model: DeformableStructures) -> F64:
     """(P, J) 1 where a joint belongs to a part, else 0."""
     member = np.zeros((len(model.tree), len(model.joint_names)))
     for part, joints in enumerate(model.part_joints):

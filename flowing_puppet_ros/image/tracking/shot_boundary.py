@@ -9,11 +9,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8
 from flowing_puppet_ros.flow.estimate import FlowPair
-
-type Floats = NDArray[np.float64]
 
 CELLS = (3, 2)  # columns and rows of the image whose colours are counted apart
 BINS = 8  # a channel
@@ -21,12 +19,12 @@ SMALL = (96, 64)  # px, width and height at which colours are counted
 # Of 207 pairs of consecutive images of 70 clips none reached 0.04 and 0.26; of 69 pairs across clips none stayed below
 # 0.16 and 0.89.
 COLOUR_CHANGE = 0.1  # share of the colours that are others after a cut, at least
-LOST_FLOW = 0.6  # share of the flow that does not lead back after a cut, at least
+INCONSISTENT_FLOW = 0.6  # share of the flow that does not lead back after a cut, at least
 RETURNS = 2.0  # px of the flow's grid, and a tenth of the motion, within which flow leads back
 STEP = 4  # of the flow's pixels in each direction one in so many is asked
 
 
-def colours_of(image: NDArray[np.uint8]) -> Floats:
+def colour_histogram(image: U8) -> F64:
     """Shares (cells, channels, BINS) of each channel's levels in the cells of an image (H, W, 3) or (H, W)."""
     small = cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA)
     levels = (np.asarray(small).reshape(SMALL[1], SMALL[0], -1) >> 5).astype(np.int64)
@@ -36,7 +34,7 @@ def colours_of(image: NDArray[np.uint8]) -> Floats:
     return np.stack([(flat == level).mean(axis=2) for level in range(BINS)], axis=2)
 
 
-def colour_change(before: Floats, after: Floats) -> float:
+def colour_change(before: F64, after: F64) -> float:
     """Share in [0, 1] of the colours that are others: half the distance of the histograms, the median over cells."""
     if before.shape != after.shape:
         return 1.0
@@ -46,7 +44,7 @@ def colour_change(before: Floats, after: Floats) -> float:
     return float(np.median(np.minimum(apart, coarse).mean(axis=1)))
 
 
-def lost_flow(flow: FlowPair) -> float:
+def flow_inconsistency(flow: FlowPair) -> float:
     """Share in [0, 1] of the forward flow that the backward flow does not lead back; 1 where nothing is known."""
     forward, backward = flow
     height, width = forward.shape[:2]
@@ -66,6 +64,6 @@ def lost_flow(flow: FlowPair) -> float:
     return float(1.0 - np.mean(returns & inside))
 
 
-def is_cut(before: Floats, after: Floats, flow: FlowPair) -> bool:
+def is_cut(before: F64, after: F64, flow: FlowPair) -> bool:
     """Whether a new shot begins between two images with colours as `colours_of` gives them and the flow between."""
-    return colour_change(before, after) >= COLOUR_CHANGE and lost_flow(flow) >= LOST_FLOW
+    return colour_change(before, after) >= COLOUR_CHANGE and flow_inconsistency(flow) >= INCONSISTENT_FLOW

@@ -15,14 +15,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
 
+from flowing_puppet_ros.arrays import F32, F64
 from flowing_puppet_ros.flow.estimate import FlowPair
-from flowing_puppet_ros.image.tracking.propagation import Grid
+from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.settings import Settings, setting
-
-type Floats = NDArray[np.float64]
 
 REWEIGHTINGS = 6
 DISAGREEMENT = 2.0  # px on the flow's grid; a flow that returns this far off counts half
@@ -40,23 +38,23 @@ class SmoothingSettings(Settings):
                                 low=0.0005, high=1.0)  # fmt: skip
 
 
-def joint_motion(flow: FlowPair, grid: Grid, before: Floats, after: Floats) -> tuple[Floats, Floats]:
+def flow_at_joints(flow: FlowPair, grid: ImageScale, before: F64, after: F64) -> tuple[F64, F64]:
     """Motion (J, 2) px of joints at `before` (J, 2) in one image and `after` in the next, and its trust (J,) in [0, 1].
 
     The mean of the forward flow at the one place and the reversed backward flow at the other; 0 trust where a place or
     its flow is unknown. `flow` is on the working grid of `grid`.
     """
-    forth, back = (sampled(field, grid.reduced(at)) for field, at in zip(flow, (before, after), strict=True))
+    forth, back = (sample_flow(field, grid.to_work(at)) for field, at in zip(flow, (before, after), strict=True))
     motion = 0.5 * (forth - back)
     known = np.isfinite(motion).all(axis=1)
     gap = np.where(known, ((forth + back) ** 2).sum(axis=1), np.inf)
     return np.where(known[:, None], motion, 0.0) / grid.factor, 1 / (1 + gap / DISAGREEMENT**2)
 
 
-def smoothed(
-    places: Floats, confidence: Floats, motion: Floats, trust: Floats, start: Floats, scale: float,
+def smooth_joints(
+    places: F64, confidence: F64, motion: F64, trust: F64, start: F64, scale: float,
     settings: SmoothingSettings,
-) -> Floats:  # fmt: skip
+) -> F64:  # fmt: skip
     """Smooth joints over T images.
 
     Args:
@@ -84,7 +82,7 @@ def smoothed(
     return joints
 
 
-def _chain(target: Floats, hold: Floats, motion: Floats, tie: Floats) -> Floats:
+def _chain(target: F64, hold: F64, motion: F64, tie: F64) -> F64:
     """Places (T, 2) of one joint: minimum of hold |x - target|^2 + tie |x' - x - motion|^2."""
     bands = np.zeros((2, len(hold)))
     bands[1] = hold
@@ -97,11 +95,11 @@ def _chain(target: Floats, hold: Floats, motion: Floats, tie: Floats) -> Floats:
     return np.asarray(solveh_banded(bands, right), dtype=np.float64)
 
 
-def _huber(distance: Floats, width: float) -> Floats:
+def _huber(distance: F64, width: float) -> F64:
     return np.minimum(1.0, width / np.maximum(distance, 1e-9))
 
 
-def sampled(field: NDArray[np.float32], points: Floats) -> Floats:
+def sample_flow(field: F32, points: F64) -> F64:
     """Flow (J, 2) at points (J, 2) of its grid, between pixels; NaN outside the grid."""
     height, width = field.shape[:2]
     inside = ((points >= -0.5) & (points <= np.array([width, height]) - 0.5)).all(axis=1)

@@ -6,13 +6,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PuppetShape, View
 from flowing_puppet_ros.settings import Settings, setting
-
-type Floats = NDArray[np.float64]
 
 UNKNOWN_DEVIATION = 0.25  # m; a joint this uncertain is placed by the body model instead
 CONFIDENT_DEVIATION = 0.1  # m; confidence halves at this standard deviation
@@ -20,7 +18,7 @@ VIEW_VOTES = 5.0  # the view's evidence saturates here ...
 VIEW_TURNS = 3.0  # ... and must reach this on the other side to turn the puppet round
 SCALE_GAIN = 0.1  # share of the new scale estimate taken at each detection
 ELSEWHERE = 0.06  # m; a joint that is known to be farther off than this is moved at once
-CLOTHES_GAIN = 0.2  # share of the newly seen colours taken at each detection
+APPEARANCE_GAIN = 0.2  # share of the newly seen colours taken at each detection
 LONG_AGO = 1_000  # images; a joint that was not detected for so long goes to where it is
 
 
@@ -47,7 +45,7 @@ class TrackerSettings(Settings):
 
 
 @dataclass(slots=True, eq=False)
-class Person:
+class Track:
     """State of one track; joints in pixels of the image.
 
     `mean` (J, 2), isotropic `variance` (J,) px^2, `quality` (J,) of the detections behind each joint, `doubted`
@@ -58,15 +56,15 @@ class Person:
     """
 
     id: str
-    mean: Floats
-    variance: Floats
-    quality: Floats
-    doubted: Floats
-    doubts: NDArray[np.int64]
-    age: NDArray[np.int64]
+    mean: F64
+    variance: F64
+    quality: F64
+    outlier_position: F64
+    outlier_count: I64
+    age: I64
     scale: float
     view: View
-    detected: Floats | None = None
+    detected: F64 | None = None
     detection: int | None = None
     votes: float = 0.0
     unseen: int = 0
@@ -74,13 +72,13 @@ class Person:
     flow_energy: float = 0.0
     detection_energy: float = 0.0
     shape: PuppetShape | None = None
-    clothes: Floats | None = None
-    met: bool = False
+    appearance: F64 | None = None
+    overlapped: bool = False
 
     @classmethod
     def start(
-        cls, identity: str, model: DeformableStructures, joints: Floats, confidence: Floats, settings: TrackerSettings
-    ) -> Person:
+        cls, identity: str, model: DeformableStructures, joints: F64, confidence: F64, settings: TrackerSettings
+    ) -> Track:
         """Begin a track at a detection: `joints` (J, 2) px with NaN where unknown, `confidence` (J,)."""
         scale = model.estimate_scale(joints, confidence)
         view = model.estimate_view(joints, confidence)
@@ -94,27 +92,27 @@ class Person:
         detected = np.column_stack([joints, confidence])
         state = identity, joints.copy(), variance, confidence.copy(), nowhere, doubts, age, scale, view
         person = cls(*state, detected=detected, votes=votes)
-        person.settle(model)
+        person.complete_and_redraw(model)
         return person
 
     @property
-    def unknown(self) -> NDArray[np.bool_]:
+    def unknown(self) -> Bools:
         """(J,) whether a joint is so uncertain that the body model places it."""
-        unknown: NDArray[np.bool_] = ~(np.sqrt(self.variance) < UNKNOWN_DEVIATION * self.scale)
+        unknown: Bools = ~(np.sqrt(self.variance) < UNKNOWN_DEVIATION * self.scale)
         return unknown
 
     @property
-    def confidence(self) -> Floats:
+    def confidence(self) -> F64:
         """(J,) in [0, 1], of joints that can be seen: falls with the joint's variance."""
         spread = self.variance / (CONFIDENT_DEVIATION * self.scale) ** 2
-        confidence: Floats = np.clip(self.quality / (1 + spread), 0, 1)
+        confidence: F64 = np.clip(self.quality / (1 + spread), 0, 1)
         return confidence
 
-    def outside(self, image_size: tuple[int, int]) -> NDArray[np.bool_]:
+    def outside(self, image_size: tuple[int, int]) -> Bools:
         """(J,) whether a joint lies outside of the image (width, height)."""
         return ((self.mean < -0.5) | (self.mean > np.array(image_size) - 0.5)).any(axis=1)
 
-    def settle(self, model: DeformableStructures) -> None:
+    def complete_and_redraw(self, model: DeformableStructures) -> None:
         """Place the unknown joints by the body model and draw the puppet for the joints, scale and view."""
         unknown = self.unknown
         weight = np.where(unknown, 0.0, np.maximum(self.quality, 0.05))
@@ -136,7 +134,7 @@ class Person:
         elif self.votes <= -VIEW_TURNS:
             self.view = "back"
 
-    def redirect(self, joint: int, place: Floats, confidence: float, settings: TrackerSettings) -> None:
+    def override_joint(self, joint: int, place: F64, confidence: float, settings: TrackerSettings) -> None:
         """Move a joint to where it is known to be, (2,) px, unless it is about there; NaN: as sure as before."""
         if np.isfinite(confidence):
             self.quality[joint] = confidence
@@ -144,19 +142,21 @@ class Person:
             return
         self.mean[joint] = place
         self.variance[joint] = float(detection_variance(self.quality[joint], self.scale, settings))
-        self.age[joint] = self.doubts[joint] = 0
-        self.doubted[joint] = np.nan
+        self.age[joint] = self.outlier_count[joint] = 0
+        self.outlier_position[joint] = np.nan
 
-    def wear(self, colours: Floats) -> None:
+    def update_appearance(self, colours: F64) -> None:
         """Follow the colours of the torso slowly."""
-        seen = colours if self.clothes is None else (1 - CLOTHES_GAIN) * self.clothes + CLOTHES_GAIN * colours
-        self.clothes = np.asarray(seen)
+        seen = (
+            colours if self.appearance is None else (1 - APPEARANCE_GAIN) * self.appearance + APPEARANCE_GAIN * colours
+        )
+        self.appearance = np.asarray(seen)
 
-    def found_again(self) -> None:
+    def reset_gate(self) -> None:
         """Let the next detection, far away, be believed at once."""
         self.age[:] = LONG_AGO
 
-    def fuse(self, joints: Floats, confidence: Floats, settings: TrackerSettings) -> None:
+    def fuse(self, joints: F64, confidence: F64, settings: TrackerSettings) -> None:
         """Fuse detected joints (J, 2), NaN unknown: precision-weighted means, behind a gate with patience.
 
         A detected joint farther than `gate` deviations from the carried one is left out, until `patience` detections
@@ -171,27 +171,29 @@ class Person:
         total = self.variance + noise
         distance = np.where(seen, _squared(joints - self.mean) / total, 0.0)
         doubtful = seen & (distance > settings.gate**2)
-        again = doubtful & (_squared(joints - self.doubted) <= settings.gate**2 * total)
-        self.doubts = np.where(seen, np.where(again, self.doubts + 1, doubtful.astype(np.int64)), self.doubts)
-        self.doubted[seen] = np.where(doubtful[:, None], joints, np.nan)[seen]
-        jump = doubtful & ((self.doubts >= settings.patience) | (distance <= (settings.gate * self.age) ** 2))
+        again = doubtful & (_squared(joints - self.outlier_position) <= settings.gate**2 * total)
+        self.outlier_count = np.where(
+            seen, np.where(again, self.outlier_count + 1, doubtful.astype(np.int64)), self.outlier_count
+        )
+        self.outlier_position[seen] = np.where(doubtful[:, None], joints, np.nan)[seen]
+        jump = doubtful & ((self.outlier_count >= settings.patience) | (distance <= (settings.gate * self.age) ** 2))
         good = seen & ~doubtful
         gain = np.where(jump, 1.0, np.where(good, self.variance / total, 0.0))
         self.mean = self.mean + gain[:, None] * np.where(seen[:, None], joints - self.mean, 0.0)
         self.variance = np.where(jump, noise, (1 - gain) * self.variance)
         self.quality = self.quality + gain * (confidence - self.quality)
         self.age[good | jump] = 0
-        self.doubts[jump] = 0
-        self.doubted[jump] = np.nan
+        self.outlier_count[jump] = 0
+        self.outlier_position[jump] = np.nan
         self.detection_energy = 0.5 * float(distance[good].sum() + settings.gate**2 * np.count_nonzero(doubtful))
 
 
-def detection_variance(confidence: Floats, scale: float, settings: TrackerSettings) -> Floats:
+def detection_variance(confidence: F64, scale: float, settings: TrackerSettings) -> F64:
     """Variance in px^2 of detected joints of given `confidence` (J,) on a person of `scale` px/m."""
-    variance: Floats = (settings.detection_deviation * scale) ** 2 / np.clip(confidence, 0.05, 1.0)
+    variance: F64 = (settings.detection_deviation * scale) ** 2 / np.clip(confidence, 0.05, 1.0)
     return variance
 
 
-def _squared(vectors: Floats) -> Floats:
-    squares: Floats = np.einsum("ni,ni->n", vectors, vectors)
+def _squared(vectors: F64) -> F64:
+    squares: F64 = np.einsum("ni,ni->n", vectors, vectors)
     return squares

@@ -11,8 +11,8 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8, Bools
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import (
     FlowPair,
@@ -23,18 +23,16 @@ from flowing_puppet_ros.flow.estimate import (
     working_size,
 )
 from flowing_puppet_ros.flow.puppet_flow import PuppetFlow
-from flowing_puppet_ros.ids import letters
+from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
-from flowing_puppet_ros.image.tracking.appearance import clothes_of, meetings
+from flowing_puppet_ros.image.tracking.appearance import find_overlapping, torso_appearances
 from flowing_puppet_ros.image.tracking.association import Detection, associate, joint_distance
-from flowing_puppet_ros.image.tracking.propagation import Carriage, Grid, carry_people, paint_people
-from flowing_puppet_ros.image.tracking.shot_boundary import colours_of, is_cut
-from flowing_puppet_ros.image.tracking.track import Person, TrackerSettings
+from flowing_puppet_ros.image.tracking.propagation import ImageScale, Propagation, propagate_tracks, render_label_map
+from flowing_puppet_ros.image.tracking.shot_boundary import colour_histogram, is_cut
+from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order
 from flowing_puppet_ros.model.ds.shape import PuppetShape, View
-
-type Floats = NDArray[np.float64]
 
 LEAST_KNOWN = 3  # a person of whom fewer joints are known is lost
 HIDDEN, OUTSIDE = 0.3, 0.1  # share of the confidence that is left of a joint behind somebody nearer, out of the image
@@ -53,16 +51,16 @@ class TrackedPuppet:
 
     id: str
     model: str
-    joints: Floats
-    confidence: Floats
-    visible: Floats
+    joints: F64
+    confidence: F64
+    visible: F64
     scale: float
     view: View
     energy: float
-    contours: tuple[Floats, ...]
+    contours: tuple[F64, ...]
     depth: tuple[int, ...]
     shape: PuppetShape
-    detected: Floats | None
+    detected: F64 | None
     detection: int | None
 
 
@@ -78,21 +76,21 @@ class TrackResult:
     flow: FlowPair | None
     warnings: list[str]
     _model: DeformableStructures
-    grid: Grid
-    _carriage: Carriage | None
+    grid: ImageScale
+    _propagation: Propagation | None
     restarted: bool = False
 
-    def labels(self, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    def labels(self, shape: tuple[int, int] | None = None) -> U8:
         """Part labels (H, W) uint8 of all people, part index + 1, 0 background; `shape` is the image's if not given."""
         height, width = shape or (self.grid.image[1], self.grid.image[0])
-        grid = Grid(self.grid.image, (width, height))
-        labels = paint_people(self._model, [puppet.shape for puppet in self.puppets], grid)
+        grid = ImageScale(self.grid.image, (width, height))
+        labels = render_label_map(self._model, [puppet.shape for puppet in self.puppets], grid)
         parts = len(self._model.tree)
         return np.where(labels > 0, (labels - 1) % parts + 1, 0).astype(np.uint8)
 
     def puppet_flow(self) -> PuppetFlow | None:
         """The puppet flow from the previous image to this one, on the grid of `flow`; None where that is None."""
-        return self._carriage.puppet_flow() if self._carriage else None
+        return self._propagation.puppet_flow() if self._propagation else None
 
 
 @dataclass(slots=True, eq=False)
@@ -100,9 +98,9 @@ class _Previous:
     """What the next step needs of an image: its stamp, the grid, the small grey picture and its colours."""
 
     stamp_ns: int
-    grid: Grid
-    grey: NDArray[np.uint8]
-    colours: Floats
+    grid: ImageScale
+    grey: U8
+    colours: F64
 
 
 class FlowingPuppetTracker:
@@ -117,7 +115,7 @@ class FlowingPuppetTracker:
         self.model = model
         self.settings = settings or TrackerSettings()
         self.optical_flow = OpticalFlow(flow_settings)
-        self.people: list[Person] = []
+        self.people: list[Track] = []
         self._previous: _Previous | None = None
         self._started = 0
 
@@ -128,7 +126,7 @@ class FlowingPuppetTracker:
 
     def step(
         self,
-        image: NDArray[np.uint8],
+        image: U8,
         stamp_ns: int,
         detections: Sequence[Keypoints] | None = None,
         flow: FlowPair | None = None,
@@ -144,11 +142,11 @@ class FlowingPuppetTracker:
         """
         image = as_image(image)
         size = (image.shape[1], image.shape[0])
-        grid = Grid(size, working_size(image.shape, self.optical_flow.settings.max_side))
+        grid = ImageScale(size, working_size(image.shape, self.optical_flow.settings.max_side))
         began = self._previous is not None
         warnings = self._restart_if_broken(stamp_ns, size)
         previous = self._previous
-        self._previous = _Previous(stamp_ns, grid, self.optical_flow.prepare(image), colours_of(image))
+        self._previous = _Previous(stamp_ns, grid, self.optical_flow.prepare(image), colour_histogram(image))
         carriage, pair, restarted = None, None, began and previous is None
         if previous is not None and self.people:
             pair = self._flow(previous, flow, warnings)
@@ -156,20 +154,22 @@ class FlowingPuppetTracker:
                 warnings.append("the picture changes as at a cut between shots: tracking starts anew")
                 self.people, pair, restarted = [], None, True
             else:
-                carriage = carry_people(self.model, self.people, pair, grid, self.settings)
-        self._take(image, detections, looked_for, warnings)
-        self.people = [person for person in self.people if self._lives(person, size)]
+                carriage = propagate_tracks(self.model, self.people, pair, grid, self.settings)
+        self._fuse_detections(image, detections, looked_for, warnings)
+        self.people = [person for person in self.people if self._is_alive(person, size)]
         for person in self.people:
-            person.settle(self.model)
+            person.complete_and_redraw(self.model)
         return TrackResult(self._puppets(grid), pair, warnings, self.model, grid, carriage, restarted)
 
-    def redirected(self, result: TrackResult, places: Mapping[str, Mapping[int, tuple[Floats, float]]]) -> TrackResult:
+    def override_joints(
+        self, result: TrackResult, places: Mapping[str, Mapping[int, tuple[F64, float]]]
+    ) -> TrackResult:
         """The last result with some joints moved: by id and joint the place (2,) px and how sure it is (0 to 1)."""
         for person in self.people:
             for joint, (place, confidence) in places.get(person.id, {}).items():
-                person.redirect(joint, place, confidence, self.settings)
+                person.override_joint(joint, place, confidence, self.settings)
             if places.get(person.id):
-                person.settle(self.model)
+                person.complete_and_redraw(self.model)
         return replace(result, puppets=self._puppets(result.grid))
 
     def _restart_if_broken(self, stamp_ns: int, size: tuple[int, int]) -> list[str]:
@@ -195,9 +195,9 @@ class FlowingPuppetTracker:
         assert self._previous is not None
         return self.optical_flow.between(previous.grey, self._previous.grey)
 
-    def _take(
+    def _fuse_detections(
         self,
-        image: NDArray[np.uint8],
+        image: U8,
         detections: Sequence[Keypoints] | None,
         looked_for: Collection[str] | None,
         warnings: list[str],
@@ -207,26 +207,26 @@ class FlowingPuppetTracker:
             person.unseen += 1
             person.detection_energy = 0.0
             person.detected = person.detection = None
-        met = meetings(self.model.joint_names, [person.mean for person in self.people])
+        met = find_overlapping(self.model.joint_names, [person.mean for person in self.people])
         for person, meets in zip(self.people, met, strict=True):
-            person.met |= meets
+            person.overlapped |= meets
         if detections is None:
             return
         found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
         several = max(len(self.people), len(found)) > 1
-        worn = clothes_of(self.model.joint_names, image, [joints for joints, _ in found]) if several else None
+        worn = torso_appearances(self.model.joint_names, image, [joints for joints, _ in found]) if several else None
         matched, free = associate(self.people, found, self.settings.match_distance, worn)
         for index, person in enumerate(self.people):
             person.missed += looked_for is None or person.id in looked_for
             if index in matched:
                 if joint_distance(person, found[matched[index]]) > self.settings.match_distance:
-                    person.found_again()
+                    person.reset_gate()
                 person.fuse(*found[matched[index]], self.settings)
                 person.update_scale_and_view(self.model)
                 person.unseen = person.missed = 0
-                person.detection, person.met = matched[index], False
+                person.detection, person.overlapped = matched[index], False
                 if worn and (clothes := worn[matched[index]]) is not None and clothes.alone:
-                    person.wear(clothes.colours)
+                    person.update_appearance(clothes.colours)
         # The surest new person comes first: it gets the lower id, and a place when there is only one left.
         for index in sorted(free, key=lambda k: -found[k][1].sum()):
             self._start(index, found[index], warnings)
@@ -241,16 +241,16 @@ class FlowingPuppetTracker:
         if len(self.people) >= self.settings.most_people:
             warnings.append(f"more than {self.settings.most_people} people: the others are left out")
             return
-        identity = letters(self.settings.seed) + str(self._started + 1)
+        identity = letters_of_seed(self.settings.seed) + str(self._started + 1)
         try:
-            self.people.append(Person.start(identity, self.model, joints, confidence, self.settings))
+            self.people.append(Track.start(identity, self.model, joints, confidence, self.settings))
         except InputError as error:
             warnings.append(f"a detected person is left out: {error}")
             return
         self.people[-1].detection = index
         self._started += 1
 
-    def _lives(self, person: Person, size: tuple[int, int]) -> bool:
+    def _is_alive(self, person: Track, size: tuple[int, int]) -> bool:
         if person.unseen > self.settings.unseen_images or person.missed > self.settings.missed_detections:
             return False
         known = person.mean[~person.unknown]
@@ -259,11 +259,11 @@ class FlowingPuppetTracker:
         low, high = known.min(axis=0), known.max(axis=0)
         return not ((high < 0).any() or (low > np.array(size) - 1).any())
 
-    def _puppets(self, grid: Grid) -> list[TrackedPuppet]:
-        hidden = hidden_joints(self.model, self.people, grid)
+    def _puppets(self, grid: ImageScale) -> list[TrackedPuppet]:
+        hidden = find_hidden_joints(self.model, self.people, grid)
         return [self._puppet(one, grid.image, covered) for one, covered in zip(self.people, hidden, strict=True)]
 
-    def _puppet(self, person: Person, size: tuple[int, int], hidden: NDArray[np.bool_]) -> TrackedPuppet:
+    def _puppet(self, person: Track, size: tuple[int, int], hidden: Bools) -> TrackedPuppet:
         shape = person.shape
         assert shape is not None
         order = depth_order(self.model, person.view)
@@ -287,15 +287,15 @@ class FlowingPuppetTracker:
         )
 
 
-def hidden_joints(model: DeformableStructures, people: Sequence[Person], grid: Grid) -> list[NDArray[np.bool_]]:
+def find_hidden_joints(model: DeformableStructures, people: Sequence[Track], grid: ImageScale) -> list[Bools]:
     """Which joints (J,) of each person lie behind the puppet of somebody nearer."""
     if len(people) < 2:
         return [np.zeros(len(model.joint_names), dtype=bool) for _ in people]
-    labels = paint_people(model, [person.shape for person in people if person.shape is not None], grid)
+    labels = render_label_map(model, [person.shape for person in people if person.shape is not None], grid)
     height, width = labels.shape
     hidden = []
     for k, person in enumerate(people):
-        x, y = np.rint(grid.reduced(person.mean)).astype(np.int64).T
+        x, y = np.rint(grid.to_work(person.mean)).astype(np.int64).T
         inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
         owner = (labels[np.where(inside, y, 0), np.where(inside, x, 0)].astype(np.int64) - 1) // len(model.tree)
         hidden.append(inside & (owner >= 0) & (owner != k))

@@ -11,28 +11,26 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from flowing_puppet_ros.image.arms.evidence import Eyes
+from flowing_puppet_ros.arrays import F64, Image
+from flowing_puppet_ros.image.arms.evidence import ArmEvidenceModel
 from flowing_puppet_ros.image.arms.hypotheses import ArmFilter
 from flowing_puppet_ros.image.arms.viterbi import PathSettings
-from flowing_puppet_ros.image.detector.detection import PersonDetection, Place
+from flowing_puppet_ros.image.detector.detection import PersonCandidate, PersonDetection
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
-from flowing_puppet_ros.image.video.detection_memory import Watch
-from flowing_puppet_ros.image.video.tracking_by_detection import Detector
+from flowing_puppet_ros.image.video.detection_memory import KnownPeople
+from flowing_puppet_ros.image.video.tracking_by_detection import DetectorLike
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
-type Floats = NDArray[np.float64]
-type Image = NDArray[np.uint8]
-type Ends = dict[int, tuple[Floats, float]]
+type Ends = dict[int, tuple[F64, float]]
 """Of joints, by their index in the model: the place (2,) px, and the probability that it is right."""
 
 SAME = 0.5  # shoulder widths between the necks of one person, as detected and as tracked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class DetectedPerson:
     """Whom a look saw: `keypoints` of the `detection`, and of a tracked person the `identity` and the `arms`' ends."""
 
     detection: PersonDetection
@@ -41,12 +39,12 @@ class Seen:
     arms: Ends = field(default_factory=dict)
 
     @property
-    def place(self) -> Place:
+    def candidate(self) -> PersonCandidate:
         """Where the person stands in the image that the keypoints are of."""
         neck, face = (self.keypoints.xy[self.keypoints.names.index(name)] for name in ("neck", "face"))
         return replace(self.detection.place, neck=neck, face=face)
 
-    def moved(self, move: Callable[[Floats], Floats]) -> Seen:
+    def move(self, move: Callable[[F64], F64]) -> DetectedPerson:
         """The same in another image, to which `move` takes places (K, 2) px; NaN where it does not know."""
         joints = list(self.arms)
         places = move(np.array([self.arms[joint][0] for joint in joints]).reshape(-1, 2))
@@ -57,39 +55,43 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Looker:
+class DetectionWorker:
     """The detector, and what judges the arms of the people that it finds."""
 
-    detector: Detector
-    eyes: Eyes
+    detector: DetectorLike
+    evidence_model: ArmEvidenceModel
     path: PathSettings = field(default_factory=PathSettings)
 
-    def search(self, image: Image, watch: Watch, number: int) -> list[Seen]:
+    def detect_full_frame(self, image: Image, watch: KnownPeople, number: int) -> list[DetectedPerson]:
         """Look for people all over an image (H, W, 3); `watch` takes the search as its image `number`."""
         # Results may depend on the number of threads otherwise.
         cv2.setNumThreads(1)
-        found = self.detector.at(image, watch.search(number, self.detector.candidates(image)))
-        return [Seen(detection, detection.keypoints) for detection in found]
+        found = self.detector.detect_at(image, watch.search(number, self.detector.propose(image)))
+        return [DetectedPerson(detection, detection.keypoints) for detection in found]
 
-    def glance(
-        self, image: Image, places: Sequence[Place], puppets: Sequence[TrackedPuppet], arms: Mapping[str, ArmFilter]
-    ) -> list[Seen]:
+    def detect_in_rois(
+        self,
+        image: Image,
+        places: Sequence[PersonCandidate],
+        puppets: Sequence[TrackedPuppet],
+        arms: Mapping[str, ArmFilter],
+    ) -> list[DetectedPerson]:
         """Look only at some places of an image in which `puppets` are tracked, whose `arms` by id take the look."""
         cv2.setNumThreads(1)
-        found = self.detector.at(image, places)
-        owners = owners_of([detection.place for detection in found], puppets, self.eyes.model)
+        found = self.detector.detect_at(image, places)
+        owners = match_to_tracks([detection.place for detection in found], puppets, self.evidence_model.model)
         seen = []
         for index, detection in enumerate(found):
             if (puppet := owners.get(index)) is None:
-                seen.append(Seen(detection, detection.keypoints))
+                seen.append(DetectedPerson(detection, detection.keypoints))
                 continue
-            ends = arms[puppet.id].joints(self.eyes.sight(image, puppet, detection))
-            seen.append(Seen(detection, detection.keypoints, puppet.id, ends))
+            ends = arms[puppet.id].joints(self.evidence_model.evidence(image, puppet, detection))
+            seen.append(DetectedPerson(detection, detection.keypoints, puppet.id, ends))
         return seen
 
 
-def owners_of(
-    places: Sequence[Place], puppets: Sequence[TrackedPuppet], model: DeformableStructures
+def match_to_tracks(
+    places: Sequence[PersonCandidate], puppets: Sequence[TrackedPuppet], model: DeformableStructures
 ) -> dict[int, TrackedPuppet]:
     """The tracked puppet that stands at each place, by the place's index; each puppet stands at one at most."""
     neck = model.joint_names.index("neck")

@@ -6,30 +6,28 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.image.detector.detection import PersonCandidate
+from flowing_puppet_ros.image.video.tracklets import TrackletLinker
 
-from flowing_puppet_ros.image.detector.detection import Place
-from flowing_puppet_ros.image.video.tracklets import ClipPeople
-
-SURE_LOOKS = 5  # searches that must have found a person before only their place is looked at
+CONFIRMING_DETECTIONS = 5  # searches that must have found a person before only their place is looked at
 MEMORY = 20  # searches that are remembered
 
 
 @dataclass(slots=True, eq=False)
-class Watch:
+class KnownPeople:
     """Remembers what searches of whole images found; `searches` tells from all of them who is there."""
 
-    searches: ClipPeople
+    searches: TrackletLinker
     _known: dict[str, tuple[float, float, int]] = field(default_factory=dict)
 
-    def search(self, number: int, candidates: Sequence[Place]) -> list[Place]:
+    def search(self, number: int, candidates: Sequence[PersonCandidate]) -> list[PersonCandidate]:
         """Take the candidates of image `number`, and tell from all searches up to now where people are in it."""
         self.searches.add(number, candidates)
         self.searches.keep(MEMORY)
         return [place for path in self.searches.paths() if (place := path.at(number)) is not None]
 
-    def learn(self, found: Mapping[str, Place]) -> None:
+    def update(self, found: Mapping[str, PersonCandidate]) -> None:
         """Remember how large the people of a search are, by id, and how surely; forget whom it did not find.
 
         They are carried by the flow until another search finds them or the tracker gives them up.
@@ -37,7 +35,7 @@ class Watch:
         looks = {identity: self._known[identity][2] + 1 if identity in self._known else 1 for identity in found}
         self._known = {identity: (place.scale, place.log_odds, looks[identity]) for identity, place in found.items()}
 
-    def meet(self, found: Mapping[str, Place]) -> None:
+    def add(self, found: Mapping[str, PersonCandidate]) -> None:
         """Remember people who are new here as if a search had found them."""
         for identity, place in found.items():
             self._known.setdefault(identity, (place.scale, place.log_odds, 1))
@@ -46,16 +44,16 @@ class Watch:
         """Whether one of these people is known."""
         return any(identity in self._known for identity in people)
 
-    def sure(self, people: Iterable[str]) -> bool:
+    def is_confirmed(self, people: Iterable[str]) -> bool:
         """Whether some of these people are known, and each of them from enough searches."""
         looks = [self._known[identity][2] for identity in people if identity in self._known]
-        return min(looks, default=0) >= SURE_LOOKS
+        return min(looks, default=0) >= CONFIRMING_DETECTIONS
 
-    def places(self, joint_names: Sequence[str], people: Mapping[str, NDArray[np.float64]]) -> dict[str, Place]:
+    def places(self, joint_names: Sequence[str], people: Mapping[str, F64]) -> dict[str, PersonCandidate]:
         """Where the known ones of these people are, whose joints (J, 2) px are given by id."""
         neck, face = (joint_names.index(name) for name in ("neck", "face"))
         return {
-            identity: Place(joints[neck], joints[face], *self._known[identity][:2])
+            identity: PersonCandidate(joints[neck], joints[face], *self._known[identity][:2])
             for identity, joints in people.items()
             if identity in self._known
         }

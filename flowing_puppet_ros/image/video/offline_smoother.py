@@ -13,44 +13,42 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flowing_puppet_ros.image.arms.evidence import ENDS, Sight
-from flowing_puppet_ros.image.arms.hypotheses import ArmHistory
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.image.arms.evidence import ARM_JOINTS, ArmEvidence
+from flowing_puppet_ros.image.arms.hypotheses import ArmSmoother
 from flowing_puppet_ros.image.arms.viterbi import PathSettings
-from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings, joint_motion, smoothed
+from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings, flow_at_joints, smooth_joints
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-
-type Floats = NDArray[np.float64]
 
 DETECTOR_TRUST = 1 / 8
 """Weight of a joint of our detector against one of given keypoints: it errs more, and the flow must hold against it."""
 
 
 @dataclass(slots=True, eq=False)
-class _Moment:
+class _Observation:
     """A person in one image: the tracked `puppet` without its outlines, and its motion from the image before."""
 
     image: int
     puppet: TrackedPuppet
     body_energy: float
-    motion: Floats
-    trust: Floats
+    motion: F64
+    trust: F64
 
 
 @dataclass(slots=True, eq=False)
-class Clip:
+class OfflineSmoother:
     """Collects the tracker's results of consecutive images and gives the smoothed people of each."""
 
     model: DeformableStructures
     settings: SmoothingSettings
     path: PathSettings = field(default_factory=PathSettings)
     images: int = 0
-    _tracks: dict[str, list[_Moment]] = field(default_factory=lambda: defaultdict(list))
-    _arms: dict[str, ArmHistory] = field(default_factory=dict)
+    _tracks: dict[str, list[_Observation]] = field(default_factory=lambda: defaultdict(list))
+    _arms: dict[str, ArmSmoother] = field(default_factory=dict)
 
-    def add(self, result: TrackResult, sights: Mapping[str, Sight] | None = None) -> None:
+    def add(self, result: TrackResult, sights: Mapping[str, ArmEvidence] | None = None) -> None:
         """Take the result of the next image, and the `sights` of all its people where a detector has hypotheses."""
         for puppet in result.puppets:
             track = self._tracks[puppet.id]
@@ -58,13 +56,13 @@ class Clip:
             motion, trust = np.zeros((count, 2)), np.zeros(count)
             if result.flow is not None and track and track[-1].image == self.images - 1:
                 before, after = _place(track[-1].puppet), _place(puppet)
-                motion, trust = joint_motion(result.flow, result.grid, before, after)
+                motion, trust = flow_at_joints(result.flow, result.grid, before, after)
             if sights is not None:
-                history = self._arms.setdefault(puppet.id, ArmHistory(self.path))
+                history = self._arms.setdefault(puppet.id, ArmSmoother(self.path))
                 history.add(sights[puppet.id], result.flow if track else None, result.grid)
             energy = self.model.energy(puppet.shape)
             bare = replace(puppet, contours=(), shape=replace(puppet.shape, contours=()))
-            track.append(_Moment(self.images, bare, energy, motion, trust))
+            track.append(_Observation(self.images, bare, energy, motion, trust))
         self.images += 1
 
     def people(self) -> Iterator[list[TrackedPuppet]]:
@@ -81,7 +79,7 @@ class Clip:
                     at[identity] = k + 1
             yield found
 
-    def _smoothed(self, identity: str, track: list[_Moment]) -> tuple[Floats, Floats]:
+    def _smoothed(self, identity: str, track: list[_Observation]) -> tuple[F64, F64]:
         """Joints (T, J, 2) of one person, whose images are consecutive, and how probably (T, J) each is right.
 
         NaN where the tracker knows it best.
@@ -99,16 +97,16 @@ class Clip:
         if len(track) < 2 or not (confidence > 0).any():
             return start, right
         places = np.where(confidence[..., None] > 0, detected[..., :2], np.nan)
-        joints = smoothed(places, confidence, motion, trust, start, scale, self.settings)
+        joints = smooth_joints(places, confidence, motion, trust, start, scale, self.settings)
         # The body model has placed what nobody ever saw; along the flow alone it would drift.
         never = ~(confidence > 0).any(axis=0)
         joints[:, never] = start[:, never]
         return joints, right
 
-    def _resolve_arms(self, arms: ArmHistory, detected: Floats, motion: Floats, right: Floats, scale: float) -> None:
+    def _resolve_arms(self, arms: ArmSmoother, detected: F64, motion: F64, right: F64, scale: float) -> None:
         """Put the arms of the best path into the detected joints (T, J, 3), their motion (T-1, J, 2) and `right`."""
-        for side, arm in arms.resolved(scale * self.model.shoulder_width).items():
-            for k, name in enumerate(ENDS):
+        for side, arm in arms.resolve(scale * self.model.shoulder_width).items():
+            for k, name in enumerate(ARM_JOINTS):
                 joint = self.model.joint_names.index(f"{side}_{name}")
                 detected[:, joint, :2] = arm.places[:, k]
                 detected[:, joint, 2] = arm.sure
@@ -116,7 +114,7 @@ class Clip:
                 if len(motion):
                     motion[:, joint] = arm.motion[:-1, k]
 
-    def _puppet(self, moment: _Moment, joints: Floats, right: Floats) -> TrackedPuppet:
+    def _puppet(self, moment: _Observation, joints: F64, right: F64) -> TrackedPuppet:
         puppet = moment.puppet
         confidence = np.where(np.isfinite(right), right * puppet.visible, puppet.confidence)
         shape = self.model.puppet_from_joints(joints, puppet.scale, puppet.view)
@@ -126,7 +124,7 @@ class Clip:
         )
 
 
-def _place(puppet: TrackedPuppet) -> Floats:
+def _place(puppet: TrackedPuppet) -> F64:
     """Where the flow is asked: at the detected joints, else at the tracked ones."""
     if puppet.detected is None:
         return puppet.joints

@@ -17,10 +17,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.tree import mirrored_name
-
-Array = np.ndarray[Any, Any]
 
 GENDERS = ("neutral", "female", "male")
 # Rows map Anny's axes (x left, y back, z up) to ours.

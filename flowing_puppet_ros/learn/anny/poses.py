@@ -8,16 +8,14 @@ The motion capture (http://mocap.cs.cmu.edu, created with funding from NSF EIA-0
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.learn.anny.body import AnnyBody, RestBody
 from flowing_puppet_ros.model import rotation
-
-Array = np.ndarray[Any, Any]
 
 MOCAP_JOINTS = 38
 MOCAP_PARENTS = (

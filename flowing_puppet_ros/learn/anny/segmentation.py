@@ -7,14 +7,11 @@ interfaces are clean rings. Shoulder parts are wide caps: torso and upper arm, l
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.model.tree import SP_PARENTS, mirrored_name
-
-Array = np.ndarray[Any, Any]
 
 TORSO = ("Hips", "LHipJoint", "RHipJoint", "LowerBack", "Spine", "Spine1", "LeftShoulder", "RightShoulder")
 LEFT_BONES = {

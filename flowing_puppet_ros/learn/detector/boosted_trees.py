@@ -4,17 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.image.detector.boosted_trees import Forest, codes_of
+from flowing_puppet_ros.arrays import Array
+from flowing_puppet_ros.image.detector.boosted_trees import BoostedTrees, quantise_features
 from flowing_puppet_ros.image.detector.proposals import propose
-from flowing_puppet_ros.image.detector.root_filters import COLUMNS, PAD, ROWS, STEP, RootFilters, level
+from flowing_puppet_ros.image.detector.root_filters import COLUMNS, PAD, ROWS, STEP, RootFilters, make_level
 from flowing_puppet_ros.learn.detector.boosting import boost
 from flowing_puppet_ros.learn.detector.data import Example, center_of, close_to, varied
-
-type Array = np.ndarray[Any, Any]
 
 VARIANTS = 3  # of a true window: mirrored, blurred, brighter, off by half a cell and half a level
 NEGATIVES = 15  # candidates of an example that show nobody
@@ -24,7 +22,7 @@ TRUE_CENTER, TRUE_SCALE = 0.25, 1.2  # units of S and ratio: a candidate this cl
 
 def learn_forest(
     examples: Sequence[Example], root: RootFilters, trees: int, seed: int, report: Callable[[str], None]
-) -> Forest:
+) -> BoostedTrees:
     """Trees from the examples' true windows and from the candidates that the rigid filters find on them."""
     rng = np.random.default_rng(seed)
     codes: list[Array] = []
@@ -44,10 +42,10 @@ def learn_forest(
 
 
 def _true_window(example: Example, rng: np.random.Generator) -> Array:
-    at = level(example.image, example.scale * STEP ** rng.uniform(-0.5, 0.5))
+    at = make_level(example.image, example.scale * STEP ** rng.uniform(-0.5, 0.5))
     x, y = center_of(example) + 0.5
     row, column = round(y / at.cell - ROWS / 2) + PAD, round(x / at.cell - COLUMNS / 2) + PAD
-    return codes_of(at.features, at.colours, row, column)
+    return quantise_features(at.features, at.colours, row, column)
 
 
 def _candidates(example: Example, root: RootFilters) -> list[tuple[Array, bool]]:

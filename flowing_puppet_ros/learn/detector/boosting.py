@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from flowing_puppet_ros.image.detector.boosted_trees import BINS, Forest
-
-type Array = np.ndarray[Any, Any]
+from flowing_puppet_ros.arrays import Array
+from flowing_puppet_ros.image.detector.boosted_trees import BINS, BoostedTrees
 
 DEPTH = 3
 SHRINKAGE = 0.1
@@ -23,7 +22,7 @@ FEATURE_SHARE = 1 / 16
 LEAST_HESSIAN = 2.0  # in either child of a split
 
 
-def boost(codes: Array, positive: Array, weight: Array, rng: np.random.Generator, trees: int) -> Forest:
+def boost(codes: Array, positive: Array, weight: Array, rng: np.random.Generator, trees: int) -> BoostedTrees:
     """Trees that tell the windows `codes` (N, F) uint8 that are `positive` (N,), samples weighted by `weight` (N,)."""
     columns = np.ascontiguousarray(codes.T)
     count, samples = columns.shape
@@ -49,7 +48,7 @@ def boost(codes: Array, positive: Array, weight: Array, rng: np.random.Generator
         sums = np.bincount(node - inner, gradient, inner + 1), np.bincount(node - inner, hessian, inner + 1)
         leaves[tree] = SHRINKAGE * sums[0] / (sums[1] + RIDGE)
         scores += leaves[tree, node - inner]
-    return Forest(feature, threshold, leaves)
+    return BoostedTrees(feature, threshold, leaves)
 
 
 def _best_split(histogram: Array) -> tuple[int, int] | None:

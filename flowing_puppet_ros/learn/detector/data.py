@@ -8,16 +8,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import U8, Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.detector.root_filters import resize
 from flowing_puppet_ros.image.formats.annotations import AnnotatedFrame, source_of
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-
-type Array = np.ndarray[Any, Any]
 
 JOINTS = tuple(name for name in JOINT_NAMES[10] if "knee" not in name and "ankle" not in name)
 MIRRORED = tuple(
@@ -40,7 +38,7 @@ class Example:
     of further people, whom no negative example may touch; `source` is the video or file that the image is from.
     """
 
-    image: NDArray[np.uint8]
+    image: U8
     joints: Array
     seen: Array
     scale: float
@@ -52,7 +50,7 @@ class Example:
         at: Array = self.joints[JOINTS.index(name)]
         return at
 
-    def with_image(self, image: NDArray[np.uint8]) -> Example:
+    def with_image(self, image: U8) -> Example:
         """The same person on another image of the same size."""
         return replace(self, image=image)
 

@@ -12,27 +12,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.image.detector.part_filters import (
     COLUMNS,
     FILTER,
     PARENTS,
     ROWS,
+    FeatureWindow,
     PartFilters,
-    Window,
     pad_window,
     responses,
     window_at,
 )
-from flowing_puppet_ros.image.detector.pictorial_structure import PartTree, best_placement, score_of, upward
+from flowing_puppet_ros.image.detector.pictorial_structure import FilterTree, best_placement, pass_up, score_of
 from flowing_puppet_ros.learn.detector.data import Example, varied
 from flowing_puppet_ros.learn.detector.part_types import PartTypes, nodes_of
-
-type Array = np.ndarray[Any, Any]
 
 RIDGE = 0.02  # added to the covariance of features
 START = 0.05  # share of the whitened means that the filters start with
@@ -49,7 +47,7 @@ PLACE_JITTER, FACE_JITTER, SCALE_JITTER = 0.08, 0.06, 0.1  # as large as errors 
 class Shown:
     """An example as the filters see it: the window, the true layer and cell (P, 3) and which of the parts were seen."""
 
-    window: Window
+    window: FeatureWindow
     truth: Array
     seen: Array
 
@@ -68,7 +66,7 @@ def show(example: Example, types: PartTypes, rng: np.random.Generator) -> Shown:
     return Shown(window, np.column_stack([types.layers_of(nodes / example.scale), cells]), seen)
 
 
-def show_wrong(example: Example, rng: np.random.Generator) -> Window:
+def show_wrong(example: Example, rng: np.random.Generator) -> FeatureWindow:
     """Look where the person of an example is not, or at a scale that is not theirs."""
     example = varied(example, rng)
     scale, neck = example.scale, example.joint("neck")
@@ -145,11 +143,11 @@ class _Machine:
     def _clear(self) -> None:
         self.gradient, self.bias_gradient = np.zeros(self.weights.shape, np.float32), np.zeros(self.bias.shape)
 
-    def _tree(self) -> PartTree:
+    def _tree(self) -> FilterTree:
         tree = self.tree
-        return PartTree(tree.parents, tree.first, tree.anchor, tree.spring, self.bias.astype(np.float32))
+        return FilterTree(tree.parents, tree.first, tree.anchor, tree.spring, self.bias.astype(np.float32))
 
-    def _respond(self, window: Window) -> Array:
+    def _respond(self, window: FeatureWindow) -> Array:
         return responses(window.features, self.weights.reshape(len(self.weights), FILTER, FILTER, -1))
 
     def compare(self, one: Shown) -> float:
@@ -158,7 +156,7 @@ class _Machine:
         tree = self._tree()
         true_score = score_of(tree, unary, one.truth)
         augmented = unary + _losses(one, tree)
-        wrong = best_placement(tree, upward(tree, augmented))
+        wrong = best_placement(tree, pass_up(tree, augmented))
         # Parts that nobody saw have no truth to compare with.
         known = np.flatnonzero(one.seen)
         around = pad_window(one.window.features)
@@ -168,11 +166,11 @@ class _Machine:
             self._add(around, one.truth, known, 0.3)
         return score_of(tree, augmented, wrong) - true_score
 
-    def push_down(self, window: Window) -> None:
+    def push_down(self, window: FeatureWindow) -> None:
         """Add the subgradient of a window in which nobody is to be found."""
         unary = self._respond(window)
         tree = self._tree()
-        found = best_placement(tree, upward(tree, unary))
+        found = best_placement(tree, pass_up(tree, unary))
         if score_of(tree, unary, found) > -1:
             self._add(pad_window(window.features), found, np.arange(len(found)), -0.3)
 
@@ -205,17 +203,17 @@ class _Machine:
         tree = self.tree
         filters = weights.astype(np.float32).reshape(len(weights), FILTER, FILTER, -1)
         return PartFilters(
-            filters, PartTree(tree.parents, tree.first, tree.anchor, tree.spring, bias.astype(np.float32))
+            filters, FilterTree(tree.parents, tree.first, tree.anchor, tree.spring, bias.astype(np.float32))
         )
 
 
-def _patches(window: Window) -> Array:
+def _patches(window: FeatureWindow) -> Array:
     """All patches (ROWS, COLUMNS, 5, 5, D) that the filters see, a view of the padded features."""
     views = np.lib.stride_tricks.sliding_window_view(pad_window(window.features), (FILTER, FILTER), axis=(0, 1))
     return views.transpose(0, 1, 3, 4, 2)
 
 
-def _losses(one: Shown, tree: PartTree) -> Array:
+def _losses(one: Shown, tree: FilterTree) -> Array:
     """What placing each layer in each cell (L, ROWS, COLUMNS) costs: up to 1, growing with the distance."""
     y, x = np.indices((ROWS, COLUMNS))
     losses = np.zeros((int(tree.first[-1]), ROWS, COLUMNS), np.float32)

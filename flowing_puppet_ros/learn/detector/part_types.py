@@ -5,16 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.image.detector.part_filters import CELLS_PER_SCALE, PARENTS, PARTS
-from flowing_puppet_ros.image.detector.pictorial_structure import PartTree
+from flowing_puppet_ros.image.detector.pictorial_structure import FilterTree
 from flowing_puppet_ros.learn.detector.data import JOINTS, Example
-
-type Array = np.ndarray[Any, Any]
 
 SPRING_SHARE = 0.1  # of the negative log-likelihood of a Gaussian, in units of the margin
 LEAST_DEVIATION = 0.7  # cells
@@ -50,7 +49,7 @@ class PartTypes:
     """For every part the centres (T, 2 * vectors) of its types; and the tree with its springs, biases 0."""
 
     centers: tuple[Array, ...]
-    tree: PartTree
+    tree: FilterTree
 
     @classmethod
     def learn(cls, examples: Sequence[Example], rng: np.random.Generator) -> Self:
@@ -114,7 +113,7 @@ def _nearest(vectors: Array, centers: Array) -> Array:
     return nearest
 
 
-def _springs(nodes: Array, seen: Array, types: Array, centers: tuple[Array, ...]) -> PartTree:
+def _springs(nodes: Array, seen: Array, types: Array, centers: tuple[Array, ...]) -> FilterTree:
     """Mean and deviation of the step from the parent for every type; positions (N, P, 2) in cells."""
     first = np.cumsum([0, *(len(c) for c in centers)])
     anchor, spring = np.zeros((first[-1], 2), np.float32), np.ones((first[-1], 2), np.float32)
@@ -129,4 +128,4 @@ def _springs(nodes: Array, seen: Array, types: Array, centers: tuple[Array, ...]
             anchor[first[part] + kind] = mine.mean(axis=0)
             spring[first[part] + kind] = SPRING_SHARE * 0.5 / deviation**2
     bias = np.zeros((first[-1], max(len(c) for c in centers)), np.float32)
-    return PartTree(np.array(PARENTS), first, anchor, spring, bias)
+    return FilterTree(np.array(PARENTS), first, anchor, spring, bias)

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.image.detector.root_filters import (
     COLUMNS,
     PAD,
@@ -16,13 +16,11 @@ from flowing_puppet_ros.image.detector.root_filters import (
     STEP,
     Level,
     RootFilters,
-    level,
-    respond,
+    correlate,
+    make_level,
 )
 from flowing_puppet_ros.learn.detector.data import Example, center_of, close_to, varied
 from flowing_puppet_ros.learn.detector.squared_hinge import train
-
-type Array = np.ndarray[Any, Any]
 
 COMPONENTS = 1
 RIDGE = 100.0  # against features of about 0.2
@@ -69,7 +67,7 @@ def _components(examples: Sequence[Example], rng: np.random.Generator) -> tuple[
 
 def _window_at(example: Example, rng: np.random.Generator) -> Array:
     """Features of the window around the person, off by up to half a cell and half a level."""
-    at = level(example.image, example.scale * STEP ** rng.uniform(-0.5, 0.5))
+    at = make_level(example.image, example.scale * STEP ** rng.uniform(-0.5, 0.5))
     x, y = center_of(example) + 0.5
     column, row = round(x / at.cell - COLUMNS / 2) + PAD, round(y / at.cell - ROWS / 2) + PAD
     return _window(at, row, column)
@@ -93,7 +91,7 @@ def _random_negatives(example: Example, rng: np.random.Generator) -> Array:
     """Windows at random places and scales."""
     found = []
     for _ in range(2):
-        at = level(example.image, example.scale * STEP ** rng.integers(LEVELS_AROUND.start, LEVELS_AROUND.stop))
+        at = make_level(example.image, example.scale * STEP ** rng.integers(LEVELS_AROUND.start, LEVELS_AROUND.stop))
         rows = rng.integers(0, max(1, at.features.shape[0] - ROWS + 1), NEGATIVES // 2)
         columns = rng.integers(0, max(1, at.features.shape[1] - COLUMNS + 1), NEGATIVES // 2)
         near = _near_person(example, at, rows, columns)
@@ -105,8 +103,8 @@ def _hard_negatives(example: Example, root: RootFilters, rng: np.random.Generato
     """The best-scoring windows that show no person, from three levels."""
     found: list[tuple[float, Array]] = []
     for step in rng.choice(np.array(LEVELS_AROUND), 3, replace=False):
-        at = level(example.image, example.scale * STEP ** float(step))
-        scores = (respond(at.features, root.filters) + root.bias).max(axis=2)
+        at = make_level(example.image, example.scale * STEP ** float(step))
+        scores = (correlate(at.features, root.filters) + root.bias).max(axis=2)
         if not scores.size:
             continue
         grid = np.indices(scores.shape)

@@ -4,19 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 from sklearn.linear_model import LogisticRegression
 from sklearn.preprocessing import StandardScaler
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.detector.detection import FoundPose
-from flowing_puppet_ros.image.detector.scoring import Ranking, agreed_scale, best_places, lengths
+from flowing_puppet_ros.image.detector.detection import PoseHypothesis
+from flowing_puppet_ros.image.detector.scoring import PoseScorer, agree_on_scale, length_ratios, suppress_duplicates
 from flowing_puppet_ros.learn.detector.data import Example
-
-type Array = np.ndarray[Any, Any]
 
 FOUND_NECK, FOUND_SCALE = 0.5, 1.25  # units of S and ratio: a pose this close to the person has found them
 SCALE_DEVIATION = 0.15  # of the logarithm: how much the choice among poses at the right place minds their scale
@@ -24,35 +22,35 @@ LEAST_TARGET = 0.05
 RIDGE, SCALE_RIDGE = 3.0, 1.0
 
 
-def learn_ranking(found: Sequence[tuple[Example, list[FoundPose]]]) -> tuple[Ranking, float]:
+def learn_ranking(found: Sequence[tuple[Example, list[PoseHypothesis]]]) -> tuple[PoseScorer, float]:
     """The ranking of the poses found on each example's image, and the share of people whom the best ones find.
 
     InputError when hardly any or nearly all poses are right: then there is nothing to tell.
     """
     found = [(example, poses) for example, poses in found if poses]
     weight = _conditional_logit(found)
-    ranking = Ranking(weight, np.zeros(4), np.zeros(2))
+    ranking = PoseScorer(weight, np.zeros(4), np.zeros(2))
     rows, corrections, picked = [], [], []
     for example, poses in found:
         scores = ranking.scores(poses)
-        for order, index in enumerate(best_places(poses, scores)):
-            scale = agreed_scale(poses, scores, index)
+        for order, index in enumerate(suppress_duplicates(poses, scores)):
+            scale = agree_on_scale(poses, scores, index)
             picked.append((example, poses[index], scale, float(scores[index])))
             if order == 0 and _at_place(example, poses[index]):
-                rows.append(lengths(poses[index], scale))
+                rows.append(length_ratios(poses[index], scale))
                 corrections.append(np.log(example.scale / scale))
     if not rows:
         raise InputError("no annotated person of the held-out images was found; annotate more images")
     design = np.array(rows)
     normal = design.T @ design + np.diag([SCALE_RIDGE] * 3 + [1e-6])
-    ranking = Ranking(weight, np.linalg.solve(normal, design.T @ np.array(corrections)), np.zeros(2))
+    ranking = PoseScorer(weight, np.linalg.solve(normal, design.T @ np.array(corrections)), np.zeros(2))
     right = np.array(
         [_right(example, pose, ranking.corrected_scale(pose, scale)) for example, pose, scale, _ in picked]
     )
     values = np.array([score for *_, score in picked])
     slope, offset = logistic(values[:, None], right)
     first = {id(example): correct for (example, *_), correct in reversed(list(zip(picked, right, strict=True)))}
-    return Ranking(weight, ranking.scale, np.array([slope[0], offset])), float(np.mean(list(first.values())))
+    return PoseScorer(weight, ranking.scale, np.array([slope[0], offset])), float(np.mean(list(first.values())))
 
 
 def logistic(features: Array, right: Array, ridge: float = 1.0) -> tuple[Array, float]:
@@ -66,18 +64,18 @@ def logistic(features: Array, right: Array, ridge: float = 1.0) -> tuple[Array, 
     return weight, float(fitted.intercept_[0] - weight @ scaler.mean_)
 
 
-def _at_place(example: Example, pose: FoundPose) -> bool:
+def _at_place(example: Example, pose: PoseHypothesis) -> bool:
     distance = float(np.linalg.norm(pose.points[0] - example.joint("neck")))
     return distance < FOUND_NECK * example.scale
 
 
-def _right(example: Example, pose: FoundPose, scale: float) -> bool:
+def _right(example: Example, pose: PoseHypothesis, scale: float) -> bool:
     return _at_place(example, pose) and 1 / FOUND_SCALE < scale / example.scale < FOUND_SCALE
 
 
-def _conditional_logit(found: Sequence[tuple[Example, list[FoundPose]]]) -> Array:
+def _conditional_logit(found: Sequence[tuple[Example, list[PoseHypothesis]]]) -> Array:
     """Weights (MEASURES,) under which softmax over an image's poses agrees best with how well they fit the person."""
-    measures = [np.stack([pose.measures for pose in poses]) for _, poses in found]
+    measures = [np.stack([pose.features for pose in poses]) for _, poses in found]
     every = np.concatenate(measures)
     mean, deviation = every.mean(axis=0), np.maximum(every.std(axis=0), 1e-9)
     images = []

@@ -7,12 +7,10 @@ order, and with matrix products alone: thousands of dimensions and tens of thous
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-type Array = np.ndarray[Any, Any]
+from flowing_puppet_ros.arrays import Array
 
 MOST_STEPS = 15
 

@@ -6,22 +6,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
-from flowing_puppet_ros.image.detector.scoring import MEASURES, Ranking
+from flowing_puppet_ros.image.detector.scoring import FEATURES, PoseScorer
 from flowing_puppet_ros.learn.detector.boosted_trees import learn_forest
 from flowing_puppet_ros.learn.detector.data import Example
 from flowing_puppet_ros.learn.detector.part_filters import learn_parts
 from flowing_puppet_ros.learn.detector.root_filters import learn_root
 from flowing_puppet_ros.learn.detector.scoring import learn_ranking
 from flowing_puppet_ros.settings import Settings, setting
-
-type Array = np.ndarray[Any, Any]
 
 PLACES = 12
 RANKED = 220  # held-out people, about, that the ranking is learned on
@@ -62,15 +59,15 @@ def learn(examples: Sequence[Example], settings: LearnDetectorSettings, report: 
     forest = learn_forest(kept, root, settings.trees, settings.seed + 1, report)
     parts = learn_parts(kept, settings.steps, settings.seed + 2, report)
     skin = PartLikelihood.load().skin
-    detector = PartDetector(root, forest, parts, skin, Ranking(np.zeros(MEASURES), np.zeros(4), np.zeros(2)))
+    detector = PartDetector(root, forest, parts, skin, PoseScorer(np.zeros(FEATURES), np.zeros(4), np.zeros(2)))
     ranking, found = rank(detector, others)
     return Learned(replace(detector, ranking=ranking), len(kept), len(others), found)
 
 
-def rank(detector: PartDetector, examples: Sequence[Example]) -> tuple[Ranking, float]:
+def rank(detector: PartDetector, examples: Sequence[Example]) -> tuple[PoseScorer, float]:
     """Learn the ranking on about RANKED of the examples; also the share of them whom the best poses find."""
     poses = []
     for example in examples[:: math.ceil(len(examples) / RANKED)]:
         smallest = max(8.0, max(example.image.shape[:2]) / 20)
-        poses.append((example, detector.look(example.image, smallest, PLACES)))
+        poses.append((example, detector.find_poses(example.image, smallest, PLACES)))
     return learn_ranking(poses)

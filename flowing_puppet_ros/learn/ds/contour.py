@@ -9,7 +9,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numba import njit
-from numpy.typing import NDArray
+
+from flowing_puppet_ros.arrays import F64, I32, U8
 
 RESOLUTION = 500.0
 """Pixels per metre at which silhouettes are drawn: 2 mm a pixel."""
@@ -19,7 +20,7 @@ _CLEFT = 0.025  # metres
 
 
 @njit(cache=True)
-def _fill(points: NDArray[np.float64], triangles: NDArray[np.int32], mask: NDArray[np.uint8]) -> None:
+def _fill(points: F64, triangles: I32, mask: U8) -> None:
     height, width = mask.shape
     for face in range(triangles.shape[0]):
         a, b, c = points[triangles[face, 0]], points[triangles[face, 1]], points[triangles[face, 2]]
@@ -41,7 +42,7 @@ def _fill(points: NDArray[np.float64], triangles: NDArray[np.int32], mask: NDArr
                     mask[y, x] = 1
 
 
-def silhouette(points: NDArray[np.float64], triangles: NDArray[np.int32], shape: tuple[int, int]) -> NDArray[np.uint8]:
+def silhouette(points: F64, triangles: I32, shape: tuple[int, int]) -> U8:
     """Fill every projected triangle, whichever way it faces.
 
     `points` (V, 2) pixels, `triangles` (F, 3), `shape` (H, W). Returns (H, W) uint8: 1 where a pixel's centre is
@@ -52,9 +53,7 @@ def silhouette(points: NDArray[np.float64], triangles: NDArray[np.int32], shape:
     return mask
 
 
-def closed_contour(
-    points: NDArray[np.float64], triangles: NDArray[np.int32], resolution: float = RESOLUTION
-) -> NDArray[np.float64]:
+def closed_contour(points: F64, triangles: I32, resolution: float = RESOLUTION) -> F64:
     """Return the outer contour of the largest piece of the silhouette of a projected part mesh.
 
     `points` (V, 2) in metres (only those that `triangles` (F, 3) name count), `resolution` in pixels per metre.
@@ -76,7 +75,7 @@ def closed_contour(
     return _smooth(piece) / resolution + origin
 
 
-def _smooth(closed: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smooth(closed: F64) -> F64:
     """Circular Gaussian filter along a closed chain of pixels."""
     reach = int(3 * _SMOOTHING)
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / _SMOOTHING) ** 2)
@@ -85,9 +84,7 @@ def _smooth(closed: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([np.convolve(padded[:, axis], kernel, "valid") for axis in (0, 1)], axis=1)
 
 
-def resample_sides(
-    contour: NDArray[np.float64], proximal: NDArray[np.float64], distal: NDArray[np.float64], per_side: int
-) -> NDArray[np.float64]:
+def resample_sides(contour: F64, proximal: F64, distal: F64, per_side: int) -> F64:
     """Divide a closed contour by the line through the bone and sample each side evenly by arc length.
 
     `contour` (K, 2); `proximal`, `distal` (2,) bone ends. Returns (2 * per_side, 2) in the part's own frame (origin in
@@ -111,9 +108,7 @@ def resample_sides(
     return np.concatenate([_even(there, per_side), _even(back, per_side)])
 
 
-def to_bone_frame(
-    points: NDArray[np.float64], proximal: NDArray[np.float64], distal: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def to_bone_frame(points: F64, proximal: F64, distal: F64) -> F64:
     """Express (K, 2) points in the frame with its origin in the middle of the bone and x from proximal to distal."""
     axis = distal - proximal
     axis = axis / np.hypot(*axis)
@@ -121,14 +116,14 @@ def to_bone_frame(
     return np.stack([moved @ axis, moved @ np.array([-axis[1], axis[0]])], axis=1)
 
 
-def _arc(closed: NDArray[np.float64], start: int, end: int, start_x: float, end_x: float) -> NDArray[np.float64]:
+def _arc(closed: F64, start: int, end: int, start_x: float, end_x: float) -> F64:
     """Points of a closed contour from the crossing after index `start` to the crossing after index `end`."""
     count = (end - start) % len(closed)
     inner = np.take(closed, np.arange(start + 1, start + 1 + count), axis=0, mode="wrap")
     return np.concatenate([[[start_x, 0.0]], inner, [[end_x, 0.0]]])
 
 
-def _even(arc: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def _even(arc: F64, count: int) -> F64:
     """Sample `count` points at equal arc length, the first included and the last not."""
     length = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(arc, axis=0).T))])
     wanted = length[-1] * np.arange(count) / count

@@ -3,17 +3,14 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.learn.ds.samples import PartSamples, TrainingSet
 from flowing_puppet_ros.model.ds.joints import PART_JOINTS
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PairLayout, PartShape, rotate
 from flowing_puppet_ros.model.gaussian import Gaussian
-
-Array = np.ndarray[Any, Any]
 
 COMPONENTS = 10
 NEGLIGIBLE = 1e-6  # metres: components with less deviation are rounding noise and get coefficients of about 0

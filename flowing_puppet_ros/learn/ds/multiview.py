@@ -4,17 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.learn.ds.fit import fit_pair, fit_part, joint_statistics
 from flowing_puppet_ros.learn.ds.samples import PartSamples, TrainingSet
 from flowing_puppet_ros.model.ds.multiview import packed, turned_torso
 from flowing_puppet_ros.model.ds.shape import PartShape
 from flowing_puppet_ros.model.gaussian import Gaussian
-
-Array = np.ndarray[Any, Any]
 
 LEAST_VARIANCE = 1e-4
 """Added to the variances of a view's torso coefficients, which have unit variance over all views."""

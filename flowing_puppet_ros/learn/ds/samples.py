@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.learn.anny.poses import PoseSampler
 from flowing_puppet_ros.learn.ds.contour import closed_contour, resample_sides, to_bone_frame
@@ -20,8 +20,6 @@ from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES, PART_JOINTS, part_tree
 from flowing_puppet_ros.model.ds.multiview import VIEW_HEADINGS, VIEW_NAMES
 from flowing_puppet_ros.model.tree import PartTree, mirrored_name
-
-Array = np.ndarray[Any, Any]
 
 BATCH = 20
 POINTS_PER_SIDE = {"torso": 40, "head": 24}

@@ -5,18 +5,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8, Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.annotations import AnnotatedPerson, Annotations
 from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PuppetShape, rotate
-
-Array = np.ndarray[Any, Any]
 
 WRONG_METRES = 0.05
 """A contour is wrong when its points are moved by more than this on average."""
@@ -52,10 +49,10 @@ class Posed:
     """
 
     file: str
-    image: NDArray[np.uint8]
+    image: U8
     puppet: PuppetShape
     confidence: Array
-    before: NDArray[np.uint8] | None = None
+    before: U8 | None = None
 
     def shows(self, model: DeformableStructures, part: int) -> bool:
         """Tell whether a part is in the image and its joints are known well enough to learn from it."""
@@ -89,7 +86,7 @@ def _pose(model: DeformableStructures, person: AnnotatedPerson) -> tuple[PuppetS
 
 def wrong_contours(
     model: DeformableStructures, puppet: PuppetShape, part: int, count: int, moves: Moves, rng: np.random.Generator
-) -> NDArray[np.float64]:
+) -> F64:
     """Contours (count,K,2) px of a part that is turned, moved and stretched until it is wrong by WRONG_METRES."""
     contour, scale = puppet.contours[part], puppet.scale
     proximal, distal = puppet.joints[list(model.part_joints[part][:2])]

@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 from sklearn.svm import LinearSVC
 
+from flowing_puppet_ros.arrays import F32, F64, Array, Bools
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.colour import BINS, ColourImage, SkinColour, face_of, histogram_of, log_ratio
 from flowing_puppet_ros.evidence.image.contour import (
@@ -30,8 +30,6 @@ from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import render_labels
 from flowing_puppet_ros.model.tree import mirrored_name
 from flowing_puppet_ros.settings import Settings, setting
-
-Array = np.ndarray[Any, Any]
 
 FEWEST = 20
 """Right examples that each kind of part needs at least."""
@@ -61,9 +59,9 @@ class Learned:
 class _Examples:
     """N groups of one right and M wrong contours: descriptors, which are seen, colour terms, and the fold of each."""
 
-    found: NDArray[np.float32]
-    visible: NDArray[np.bool_]
-    colours: NDArray[np.float64]
+    found: F32
+    visible: Bools
+    colours: F64
     fold: NDArray[np.intp]
 
     def of_fold(self, fold: int) -> _Examples:
@@ -97,7 +95,7 @@ def learn(
     return Learned(PartLikelihood(len(model.tree), ContourLikelihood(filters), skin, terms), counts)
 
 
-def learn_skin(people: Sequence[Posed]) -> NDArray[np.float64]:
+def learn_skin(people: Sequence[Posed]) -> F64:
     """Log ratio (BINS^2,) of colours in the faces against those beside the people; every image counts the same."""
     face_sum, beside_sum = np.zeros(BINS * BINS), np.zeros(BINS * BINS)
     for posed in people:
@@ -175,7 +173,7 @@ def _fit_filter(examples: _Examples, settings: LikelihoodSettings) -> ContourFil
     return ContourFilter(weights.astype(np.float32), unseen.astype(np.float32), float(svm.intercept_[0]), (-1.0, 0.0))
 
 
-def _logistic(columns: Array) -> tuple[NDArray[np.float64], float]:
+def _logistic(columns: Array) -> tuple[F64, float]:
     """Slopes (T,) and offset of the log odds that a contour is right, given columns (N,1+M,T)."""
     right, share = _labels(columns.shape[:2])
     regression = LogisticRegression(C=1.0, tol=1e-6, max_iter=1000)
@@ -183,7 +181,7 @@ def _logistic(columns: Array) -> tuple[NDArray[np.float64], float]:
     return np.asarray(regression.coef_[0], np.float64), float(regression.intercept_[0])
 
 
-def _labels(shape: tuple[int, ...]) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+def _labels(shape: tuple[int, ...]) -> tuple[Bools, F64]:
     """Which of (N,1+M) examples are right (the first of each group), and weights that balance right and wrong."""
     right = np.zeros(shape, np.bool_)
     right[:, 0] = True

@@ -8,12 +8,10 @@ coarse one.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numba import njit
 
-Array = np.ndarray[Any, Any]
+from flowing_puppet_ros.arrays import Array
 
 VALENCE_LIMIT = 60  # room in the table of faces about a vertex
 GOOD_VALENCE = 9

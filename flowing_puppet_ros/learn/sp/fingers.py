@@ -10,17 +10,15 @@ from __future__ import annotations
 import json
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.learn.sp.pca import MIRROR
 from flowing_puppet_ros.model import rotation
-
-Array = np.ndarray[Any, Any]
 
 ASSETS = Path("data", "mpfb2")
 WEIGHTS_FILE, MESH_FILE = Path("rigs", "standard", "weights.default.json"), Path("3dobjs", "base.obj")

@@ -3,14 +3,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy.optimize import nnls
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.model.tree import mirrored_name
-
-Array = np.ndarray[Any, Any]
 
 NEAREST = 120  # vertices tried for a joint
 TERMS = 24  # vertices that a joint may use

@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-Array = np.ndarray[Any, Any]
+from flowing_puppet_ros.arrays import Array
 
 MIRROR = np.array([1.0, -1.0, 1.0])
 

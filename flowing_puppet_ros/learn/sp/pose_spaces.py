@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.learn.anny.body import AnnyBody, RestBody
 from flowing_puppet_ros.learn.sp.fingers import Fingers
 from flowing_puppet_ros.learn.sp.pca import MIRROR, Space, mirrored_space, principal_space
@@ -16,8 +17,6 @@ from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.sp import MIRROR_AXIS, PartTopology
 from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
-
-Array = np.ndarray[Any, Any]
 
 TREE = PartTree.from_parents(SP_PARENTS)
 # By the name without its side; all other parts have OTHER_POSE_COUNT.

@@ -4,20 +4,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import PuppetError
 from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.learn.anny.segmentation import part_of_vertex
 from flowing_puppet_ros.learn.sp.decimate import decimate
 from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
-
-Array = np.ndarray[Any, Any]
 
 VERTICES = 3800
 SPACING = 0.025  # metres between neighbouring vertices

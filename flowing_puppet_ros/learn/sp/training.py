@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.learn.anny.body import AnnyBody, RestBody
 from flowing_puppet_ros.learn.anny.poses import PoseSampler
 from flowing_puppet_ros.learn.sp.joints import regress_joints
@@ -20,7 +20,6 @@ from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.sp import PartTopology
 from flowing_puppet_ros.settings import Settings, setting
 
-Array = np.ndarray[Any, Any]
 Progress = Callable[[str], None]
 
 STRETCH = 0.8  # Eq. 48: weight of the front of the knee and the back of the elbow

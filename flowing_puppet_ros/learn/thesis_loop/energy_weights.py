@@ -10,30 +10,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
 from zlib import crc32
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.hands import HandDetectors
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import OpticalFlow, working_size
 from flowing_puppet_ros.image.formats.annotations import source_of
-from flowing_puppet_ros.image.pose.evidence import Window
+from flowing_puppet_ros.image.pose.evidence import PersonWindow
 from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FlowingEnergy, FrameEvidence
 from flowing_puppet_ros.image.thesis_loop.flow_moments import FlowMoments
 from flowing_puppet_ros.image.thesis_loop.hand_maps import hand_maps
-from flowing_puppet_ros.image.thesis_loop.upper_body import UpperBody
-from flowing_puppet_ros.image.thesis_loop.wrist_proposals import WristMoves
-from flowing_puppet_ros.image.tracking.propagation import Grid
+from flowing_puppet_ros.image.thesis_loop.upper_body import UpperBodyParameters
+from flowing_puppet_ros.image.thesis_loop.wrist_proposals import WristProposals
+from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.learn.likelihood.samples import Posed
 from flowing_puppet_ros.learn.thesis_loop.hands import SURE
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
-
-Array = np.ndarray[Any, Any]
 
 SEARCHED = ("prior", "colour", "hand")
 """What is searched for; the weight of contours is 1, for only ratios matter here."""
@@ -77,7 +75,7 @@ def gather(
 ) -> Choices:
     """Puppets around annotated people who have an image before theirs; InputError when there are too few."""
     likelihood, hands, optical_flow = PartLikelihood.load(), HandDetectors.load(), OpticalFlow()
-    bodies = {"front": UpperBody(model, "front"), "back": UpperBody(model, "back")}
+    bodies = {"front": UpperBodyParameters(model, "front"), "back": UpperBodyParameters(model, "back")}
     rng = np.random.default_rng(settings.seed)
     rows: list[tuple[Array, Array, int]] = []
     for posed in people:
@@ -99,7 +97,7 @@ def gather(
 
 
 def _of_person(
-    body: UpperBody,
+    body: UpperBodyParameters,
     posed: Posed,
     likelihood: PartLikelihood,
     hands: HandDetectors,
@@ -110,12 +108,12 @@ def _of_person(
     """Joints (P,J,2) and terms (P,7) of puppets around one person; None outside of the image."""
     puppet, earlier = posed.puppet, posed.before
     assert earlier is not None
-    windows = [Window.around(likelihood, image, puppet.joints, puppet.scale) for image in (earlier, posed.image)]
+    windows = [PersonWindow.around(likelihood, image, puppet.joints, puppet.scale) for image in (earlier, posed.image)]
     if windows[0] is None or windows[1] is None:
         return None
     before, now = (window.with_torso(*puppet.contours[:2]) for window in windows if window is not None)
     size = (posed.image.shape[1], posed.image.shape[0])
-    grid = Grid(size, working_size(posed.image.shape, optical_flow.settings.max_side))
+    grid = ImageScale(size, working_size(posed.image.shape, optical_flow.settings.max_side))
     flow = optical_flow.at_working_scale(earlier, posed.image)
     low, high = puppet.joints.min(axis=0) - puppet.scale, puppet.joints.max(axis=0) + puppet.scale
     frames = [
@@ -131,7 +129,7 @@ def _of_person(
         part = drawn[:, where[name]]
         drawn[:, where[name]] = part + deviation * rng.standard_normal(part.shape)
     if frames[1].hands is not None:
-        moves = WristMoves.of(body, box, legs, frames[1].hands, puppet.joints[0], puppet.scale)
+        moves = WristProposals.of(body, box, legs, frames[1].hands, puppet.joints[0], puppet.scale)
         drawn[::3] = moves(drawn[::3], rng)
     joints, scale = body.joints(box.inside(drawn), legs)
     prior, own, elsewhere = FlowingEnergy(body, frames, EnergySettings(forward=False)).terms(1, joints, scale)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 from zlib import crc32
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from sklearn.linear_model import LogisticRegression
 from sklearn.svm import LinearSVC
 
+from flowing_puppet_ros.arrays import F32, Array, Bools
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.hands import (
     CELL_METRES,
@@ -34,8 +34,6 @@ from flowing_puppet_ros.image.formats.annotations import source_of
 from flowing_puppet_ros.learn.likelihood.samples import Posed
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
-
-Array = np.ndarray[Any, Any]
 
 KINDS = tuple(EXTRAS)
 SIDES = ("right", "left")
@@ -60,9 +58,9 @@ class HandSettings(Settings):
 class Boxes:
     """N boxes: descriptors (N,D) by kind, whether they are `right` and have `flow` (N,), their `half` of the videos."""
 
-    found: dict[str, NDArray[np.float32]]
-    right: NDArray[np.bool_]
-    flow: NDArray[np.bool_]
+    found: dict[str, F32]
+    right: Bools
+    flow: Bools
     half: NDArray[np.intp]
 
     @classmethod
@@ -101,7 +99,7 @@ def wrong_places(model: DeformableStructures, posed: Posed, count: int, rng: np.
     return places[far_from_wrists(model, posed, places)][:count]
 
 
-def far_from_wrists(model: DeformableStructures, posed: Posed, places: Array) -> NDArray[np.bool_]:
+def far_from_wrists(model: DeformableStructures, posed: Posed, places: Array) -> Bools:
     """Which of places (N,2) px are in the image and not near either wrist."""
     wrists = posed.puppet.joints[[model.joint_names.index(f"{side}_wrist") for side in SIDES]]
     near = np.linalg.norm(places[:, None] - wrists, axis=2).min(axis=1) < APART * posed.puppet.scale
@@ -195,7 +193,7 @@ def _fit(boxes: Boxes, settings: HandSettings) -> HandDetectors:
     return HandDetectors(filters, np.append(weight, bias))
 
 
-def _svm(boxes: Boxes, kind: str, chosen: NDArray[np.bool_], settings: HandSettings) -> HandFilter:
+def _svm(boxes: Boxes, kind: str, chosen: Bools, settings: HandSettings) -> HandFilter:
     """Linear SVM of some boxes and of what a mirror shows of them."""
     found, right = boxes.found[kind][chosen], boxes.right[chosen]
     svm = LinearSVC(C=settings.regularisation, class_weight="balanced", random_state=settings.seed, dual=False)

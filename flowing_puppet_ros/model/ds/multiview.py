@@ -11,19 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from scipy.special import logsumexp
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.model.ds.joints import PART_JOINTS, part_tree
 from flowing_puppet_ros.model.ds.puppet import KNOWN_JOINT_NOISE, DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PartShape, PuppetShape
 from flowing_puppet_ros.model.gaussian import Gaussian
-
-Array = np.ndarray[Any, Any]
 
 VIEW_NAMES = ("W", "WSW", "SW", "SSW", "S", "SSE", "SE", "ESE", "E")
 VIEW_HEADINGS = tuple(float(angle) for angle in np.radians(np.linspace(-90.0, 90.0, len(VIEW_NAMES))))

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.model.ds.energy import PairwiseEnergy
@@ -21,8 +22,6 @@ from flowing_puppet_ros.model.ds.shape import COEFFICIENT_LIMIT, PairLayout, Par
 from flowing_puppet_ros.model.ds.shape_from_joints import ShapeFromJoints
 from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.tree import PartTree
-
-Array = np.ndarray[Any, Any]
 
 KNOWN_JOINT_NOISE = 0.02
 """Standard deviation in metres of a joint with confidence 1; it grows with the inverse of the confidence."""

@@ -4,15 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
-
-Array = np.ndarray[Any, Any]
 
 _FAR_TO_NEAR = ("upper_leg", "lower_leg", "foot", "torso", "head", "upper_arm", "lower_arm", "hand")
 SIDEWAYS = np.radians(40.0)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.tree import PartTree
 
-Array = np.ndarray[Any, Any]
 View = Literal["front", "back"]
 
 JOINT_NOISE = 0.003

@@ -4,15 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.model.ds.shape import COEFFICIENT_LIMIT, PartShape, rotate, shape_posterior
 from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.tree import PartTree
-
-Array = np.ndarray[Any, Any]
 
 LENGTH_LIMIT = 3.0
 """The shape posterior sees bone lengths within this many standard deviations of the mean; the rest is stretching."""

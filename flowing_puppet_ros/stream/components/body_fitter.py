@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings, Progress
-from flowing_puppet_ros.body.scans.scan_frame import axis_of, upright
-from flowing_puppet_ros.body.track.scene_tracker import ScenePeople, SceneSettings, View, within
+from flowing_puppet_ros.body.scans.scan_frame import axis_of, rotation_to_z_up
+from flowing_puppet_ros.body.track.scene_tracker import OrientedCloud, SceneSettings, SceneTracker, crop_to_region
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
@@ -33,7 +33,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
     MessageFactory,
 )
 from flowing_puppet_ros.stream.messages.puppets import Joint, joints_of, make_bodies, make_body
-from flowing_puppet_ros.stream.stamp_buffer import Line, Shelf
+from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 
 OPTICAL = re.compile(r"optical(_frame)?$")
 """Frames that look along z with y down (REP-103)."""
@@ -75,11 +75,11 @@ class BodyFitterComponent(Component):
         self._settings = settings
         self._model = StitchedPuppet.load(settings.model)
         self._fitter = BodyFitter(self._model, settings)
-        self._people = ScenePeople(self._fitter, settings)
+        self._people = SceneTracker(self._fitter, settings)
         self._silhouettes = SilhouetteBodies(self._model, settings)
         self._depth = DepthPairs()
-        self._line = Line()
-        self._initial = Shelf()
+        self._line = PendingQueue()
+        self._initial = StampBuffer()
         self._outputs = BodyOutputs(settings, factory, self._model)
         self.outputs = (*BodyOutputs.ports, *self._outputs.humans.ports)
 
@@ -116,7 +116,7 @@ class BodyFitterComponent(Component):
         bodies = [make_body(self.factory, identity, self._model, fit) for identity, fit in fits]
         return make_bodies(self.factory, cloud.header, bodies), fits
 
-    def _view(self, cloud: Any, of_depth: bool) -> View:
+    def _view(self, cloud: Any, of_depth: bool) -> OrientedCloud:
         """The points of a cloud message in the region of interest, z up.
 
         That of a depth image is seen from one side, in an optical frame, whatever its name, whose y axis points down.
@@ -124,15 +124,17 @@ class BodyFitterComponent(Component):
         up = self._settings.up
         if up == "auto":
             up = "-y" if of_depth or OPTICAL.search(cloud.header.frame_id) else "z"
-        turn = upright(axis_of(up))
+        turn = rotation_to_z_up(axis_of(up))
         points, normals = decode_cloud(cloud)
-        inside = within(points, self._settings)
+        inside = crop_to_region(points, self._settings)
         if not inside.all():
             points, normals = points[inside], None if normals is None else normals[inside]
-        return View(points @ turn.T, None if normals is None else normals @ turn.T, turn, stamp_ns(cloud), of_depth)
+        return OrientedCloud(
+            points @ turn.T, None if normals is None else normals @ turn.T, turn, stamp_ns(cloud), of_depth
+        )
 
     def _from_initial(
-        self, view: View, initial: Any, seed: int, progress: Progress | None = None
+        self, view: OrientedCloud, initial: Any, seed: int, progress: Progress | None = None
     ) -> list[tuple[str, BodyFit]]:
         viewpoint = np.zeros(3) if self._settings.view == "single" or view.single else None
         fits = []
@@ -156,7 +158,7 @@ class BodyFitterComponent(Component):
         stamp = stamp_ns(message)
         if port == "points":
             self._line.waiting.append((stamp, (message, False)))
-        elif self._line.too_late(stamp):
+        elif self._line.is_late(stamp):
             self.counters["late initial"] += 1
         else:
             self._initial.put(stamp, message)
@@ -184,7 +186,7 @@ class BodyFitterComponent(Component):
             if not (final or crowded or initial is not None or "initial" not in self._expected):
                 break
             self._line.pop()
-            self._initial.forget_until(stamp)
+            self._initial.drop_until(stamp)
             outputs += self._fit_one(stamp, cloud, of_depth, initial)
         return outputs
 
@@ -220,12 +222,12 @@ class BodyFitterComponent(Component):
         return self._outputs.make(message.header, fits, wanted=self._wanted)
 
 
-def _turned_joints(joints: dict[str, Joint], turn: NDArray[np.float64]) -> dict[str, Joint]:
+def _turned_joints(joints: dict[str, Joint], turn: F64) -> dict[str, Joint]:
     places = {name: turn @ np.array(joint[:3]) for name, joint in joints.items()}
     return {name: (float(p[0]), float(p[1]), float(p[2]), joints[name][3]) for name, p in places.items()}
 
 
-def _turned_back(fit: BodyFit, turn: NDArray[np.float64]) -> BodyFit:
+def _turned_back(fit: BodyFit, turn: F64) -> BodyFit:
     """Return the fit in the cloud's own frame."""
     state = replace(fit.state, center=fit.state.center @ turn, rotation=turn.T @ fit.state.rotation)
     return replace(fit, state=state, vertices=fit.vertices @ turn, joints=fit.joints @ turn)

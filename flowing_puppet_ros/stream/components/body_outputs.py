@@ -9,13 +9,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import I64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import setting
 from flowing_puppet_ros.stream.component import Output, Port
-from flowing_puppet_ros.stream.components.ros4hri import Humans, HumansSettings, token
+from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, name_component
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import header_ns, make_transform
 from flowing_puppet_ros.stream.messages.message_types import BODIES, POINT_CLOUD, TRANSFORMS, MessageFactory
@@ -37,7 +37,7 @@ NEW_URDF = 0.02
 
 
 @dataclass(frozen=True)
-class BodyOutputSettings(HumansSettings):
+class BodyOutputSettings(Ros4HriSettings):
     """What is published of bodies beside the bodies."""
 
     mesh_rate: float = setting(5.0, "most body_meshes a second, by the stamps of the clouds; 0: every cloud", unit="Hz",
@@ -65,7 +65,7 @@ class BodyOutputs:
         self._model = model
         self._skeleton = Skeleton(model)
         self._urdf: dict[str, dict[str, np.ndarray]] = {}
-        self.humans = Humans(settings, factory, "joint_states", "urdf")
+        self.humans = Ros4HriPublisher(settings, factory, "joint_states", "urdf")
         self._markers: dict[str, int] = {}
         self._numbers = 0
         self._shown_at: int | None = None
@@ -115,7 +115,7 @@ class BodyOutputs:
         return markers
 
     @cached_property
-    def _preview(self) -> NDArray[np.int64]:
+    def _preview(self) -> I64:
         return preview_faces(self._model, self._settings.mesh_triangles)
 
     def _vertices(self, header: Any, fits: Fits) -> Any:
@@ -129,7 +129,7 @@ class BodyOutputs:
         """`body_<id>` in the frame of the cloud; in that the parts, and with REP-155 the links of the URDF."""
         factory = self._factory
         origin, turn = self._skeleton.body_frame(fit.joints, fit.state)
-        identity = token(identity)
+        identity = name_component(identity)
         frames = [make_transform(factory, header, f"body_{identity}", origin, turn)]
         placed = {}
         if self.humans.on:
@@ -154,14 +154,16 @@ class BodyOutputs:
                 "joint_states": self._factory.make(
                     "sensor_msgs/msg/JointState",
                     header=header,
-                    name=[f"{name}_{token(identity)}" for name in MOVING],
+                    name=[f"{name}_{name_component(identity)}" for name in MOVING],
                     position=np.array([angles[name] for name in MOVING]),
                 )
             }
             origins, known = self._skeleton.origins(fit.state.shape), self._urdf.get(identity)
             if known is None or max(np.linalg.norm(origins[name] - known[name]) for name in known) > NEW_URDF:
                 self._urdf[identity] = origins
-                made[identity]["urdf"] = self._factory.make("std_msgs/msg/String", data=urdf(token(identity), origins))
+                made[identity]["urdf"] = self._factory.make(
+                    "std_msgs/msg/String", data=urdf(name_component(identity), origins)
+                )
         return self.humans.publish(header, alive, made)
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, U8
 from flowing_puppet_ros.draw.flow_colour import flow_scale, flow_to_rgb
 from flowing_puppet_ros.flow.estimate import FlowSettings, OpticalFlow
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
@@ -38,12 +38,12 @@ class OpticalFlowComponent(Component):
         super().__init__(settings, factory)
         self._settings = settings
         self._flow = OpticalFlow(settings)
-        self._previous: tuple[Any, int, NDArray[np.uint8]] | None = None
+        self._previous: tuple[Any, int, U8] | None = None
 
     def warm_up(self) -> None:
         """Compute the flow of made-up images, and colour it, with a component of its own."""
         other = type(self)(self._settings, self.factory)
-        other.wants("flow/preview", True)
+        other.set_subscribed("flow/preview", True)
         for image in warm_up.images(self.factory):
             other.handle("image", image)
 
@@ -72,7 +72,7 @@ class OpticalFlowComponent(Component):
         return outputs
 
 
-def flow_picture(factory: MessageFactory, header: Any, flows: list[NDArray[np.float32]], side: int = 640) -> Any:
+def flow_picture(factory: MessageFactory, header: Any, flows: list[F32], side: int = 640) -> Any:
     """Return an rgb8 Image of flow fields (H,W,2) side by side in the colours of the first one's range."""
     scale = flow_scale(flows[0])
     factor = min(1.0, side / max(flows[0].shape[:2]))

@@ -9,10 +9,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, U8
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.multiview.hull_builder import HullBuilder, PuppetView
+from flowing_puppet_ros.multiview.hull_builder import CameraObservation, HullBuilder
 from flowing_puppet_ros.multiview.triangulation import TriangulationSettings, triangulate
 
 _LEAST_JOINTS = 4
@@ -24,10 +24,10 @@ class PersonView:
     """The puppet of one camera as the hull needs it, and the names of its joints."""
 
     joint_names: tuple[str, ...]
-    hull_view: PuppetView
+    hull_view: CameraObservation
 
 
-def joint_table(puppet: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def joint_table(puppet: Any) -> tuple[F64, F64]:
     """Return the joints (J,2) in pixels and the confidences (J,) of a Puppet message."""
     joints = np.array([(joint.x, joint.y) for joint in puppet.joints], float).reshape(-1, 2)
     return joints, np.array([joint.confidence for joint in puppet.joints], float)
@@ -67,15 +67,13 @@ def _agreement(
     return int(np.isfinite(joints).all(axis=1).sum()), float(certain.sum())
 
 
-def view_of(
-    builder: HullBuilder, name: str, image: NDArray[np.uint8], labels: NDArray[np.uint8], puppet: Any
-) -> PersonView:
+def view_of(builder: HullBuilder, name: str, image: U8, labels: U8, puppet: Any) -> PersonView:
     """Observe one camera's image (H,W,3) with the part labels (H,W) of all people; cut out the one that `puppet` is."""
     region = np.zeros(labels.shape, np.uint8)
     for part in puppet.parts:
         contour = np.asarray(part.contour, float).reshape(-1, 2)
         cv2.fillPoly(region, [np.rint(contour).astype(np.int32)], 1)
-    observation = builder.observe(name, image, labels, float(puppet.scale), person=labels * region)
+    observation = builder.update_background(name, image, labels, float(puppet.scale), person=labels * region)
     joints, confidence = joint_table(puppet)
     names = tuple(joint.name for joint in puppet.joints)
-    return PersonView(names, PuppetView(observation, joints, confidence))
+    return PersonView(names, CameraObservation(observation, joints, confidence))

@@ -8,33 +8,33 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import U8
 from flowing_puppet_ros.draw.overlay import DrawnPuppet, draw_puppets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, OpticalFlow
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
-from flowing_puppet_ros.image.video.live_tracker import Lookout, LookoutSettings
+from flowing_puppet_ros.image.video.live_tracker import LiveTracker, LiveTrackerSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
 from flowing_puppet_ros.stream.components import warm_up
 from flowing_puppet_ros.stream.components.optical_flow import flow_picture
-from flowing_puppet_ros.stream.components.ros4hri import Humans, HumansSettings, image_humans
+from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, image_humans
 from flowing_puppet_ros.stream.messages.geometry import header_ns, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_flow, decode_image, make_image
 from flowing_puppet_ros.stream.messages.message_types import IMAGE, PUPPETS, MessageFactory
 from flowing_puppet_ros.stream.messages.puppets import keypoints_of, make_puppets
-from flowing_puppet_ros.stream.stamp_buffer import Line, Shelf
+from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 
 _OF_A_NEW_TRACKER = {"model", "parts", "max_side", "seed", "humans", "humans_namespace"}
 
 
 @dataclass(frozen=True)
-class PuppetTrackerSettings(TrackerSettings, FlowSettings, LookoutSettings, HumansSettings):
+class PuppetTrackerSettings(TrackerSettings, FlowSettings, LiveTrackerSettings, Ros4HriSettings):
     """Settings of the tracker, its flow and its detector, and of what it waits for, draws and publishes."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
@@ -74,20 +74,20 @@ class PuppetTrackerComponent(Component):
         self._settings = settings
         self._model = DeformableStructures.load(settings.model, settings.parts)
         self._tracker = FlowingPuppetTracker(self._model, settings, settings)
-        self._lookout = Lookout(settings, self._tracker, self.counters)
-        self._line = Line()
-        self._shelves = {port.name: Shelf() for port in self.inputs if port.optional}
+        self._lookout = LiveTracker(settings, self._tracker, self.counters)
+        self._line = PendingQueue()
+        self._shelves = {port.name: StampBuffer() for port in self.inputs if port.optional}
         self._header: Any = None
-        self._humans = Humans(settings, factory, "skeleton2d", "roi", "cropped")
+        self._humans = Ros4HriPublisher(settings, factory, "skeleton2d", "roi", "cropped")
         self.outputs = (*type(self).outputs, *self._humans.ports)
 
     def warm_up(self) -> None:
         """Track somebody made up with a component of its own, and load the detector."""
         other = type(self)(self._settings, self.factory)
-        other.expects("detections", True)
+        other.set_expected("detections", True)
         for port in other.outputs:
             if port.lazy:
-                other.wants(port.name, True)
+                other.set_subscribed(port.name, True)
         messages = warm_up.tracking(self.factory, self._model)
         for port_name, message in messages:
             other.handle(port_name, message)
@@ -108,7 +108,7 @@ class PuppetTrackerComponent(Component):
         if settings.preset != self._settings.preset:
             self._tracker.optical_flow = OpticalFlow(settings)
         self.settings = self._settings = self._tracker.settings = settings
-        self._lookout.adopt(settings)
+        self._lookout.reconfigure(settings)
 
     def flush(self) -> Output:
         """Process the images that still wait."""
@@ -118,7 +118,7 @@ class PuppetTrackerComponent(Component):
         stamp = stamp_ns(message)
         if port == "image":
             self._take(stamp, message)
-        elif port != "flow/forward" and self._line.too_late(stamp):
+        elif port != "flow/forward" and self._line.is_late(stamp):
             self.counters[f"late {port}"] += 1
         else:
             self._shelves[port].put(stamp, message)
@@ -182,11 +182,11 @@ class PuppetTrackerComponent(Component):
 
     def _forget(self, stamp: int) -> None:
         """Drop what was for images up to this one; what no image has used is counted."""
-        unpaired = self._shelves["detections"].forget_until(stamp - 1)
+        unpaired = self._shelves["detections"].drop_until(stamp - 1)
         self.counters["unpaired detections"] += unpaired
-        self._shelves["detections"].forget_until(stamp)
-        self._shelves["flow/backward"].forget_until(stamp)
-        self._shelves["flow/forward"].forget_until(stamp - 1)
+        self._shelves["detections"].drop_until(stamp)
+        self._shelves["flow/backward"].drop_until(stamp)
+        self._shelves["flow/forward"].drop_until(stamp - 1)
 
     def _flow(self, stamp: int) -> FlowPair | None:
         if self._header is None or not {"flow/forward", "flow/backward"} <= self._expected:
@@ -204,7 +204,7 @@ class PuppetTrackerComponent(Component):
             self._unusable(error)
             return None
 
-    def _publish(self, header: Any, earlier: Any, image: NDArray[np.uint8], result: TrackResult) -> Output:
+    def _publish(self, header: Any, earlier: Any, image: U8, result: TrackResult) -> Output:
         puppets = make_puppets(self.factory, header, self._model, result.puppets)
         outputs: Output = [("puppets", puppets)]
         if self._humans.on:
@@ -225,7 +225,7 @@ class PuppetTrackerComponent(Component):
                 outputs.append(("puppet_flow/preview", picture))
         return outputs
 
-    def _overlay(self, header: Any, image: NDArray[np.uint8], puppets: Any) -> Any:
+    def _overlay(self, header: Any, image: U8, puppets: Any) -> Any:
         factor = min(1.0, self._settings.overlay_side / max(image.shape[:2]))
         drawn = [DrawnPuppet.from_message(puppet).placed(factor) for puppet in puppets.puppets]
         if factor < 1:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import U8, Array
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import Output, Port
 from flowing_puppet_ros.stream.messages.images import make_image
@@ -36,17 +36,17 @@ OUTSIDE = 0.1
 
 
 @dataclass(frozen=True)
-class HumansSettings(Settings):
+class Ros4HriSettings(Settings):
     """Whether and where people are published by REP-155."""
 
     humans: bool = setting(False, "also publish people as REP-155 (ROS4HRI) says; one node a namespace")
     humans_namespace: str = setting("/humans", "namespace of the REP-155 topics")
 
 
-class Humans:
+class Ros4HriPublisher:
     """Makes the REP-155 messages of one component; each person's topics are `leaves` of `LEAVES`."""
 
-    def __init__(self, settings: HumansSettings, factory: MessageFactory, *leaves: str) -> None:
+    def __init__(self, settings: Ros4HriSettings, factory: MessageFactory, *leaves: str) -> None:
         """Publish nothing, and have no ports, unless the settings say so."""
         root = f"{settings.humans_namespace.rstrip('/')}/bodies"
         self.on = settings.humans
@@ -58,7 +58,7 @@ class Humans:
 
     def publish(self, header: Any, alive: Sequence[str], messages: Mapping[str, Mapping[str, Any]]) -> Output:
         """Return the ids of all who are `alive`, the messages (id -> leaf -> message), and the ends of lost people."""
-        ids = {identity: token(identity) for identity in alive}
+        ids = {identity: name_component(identity) for identity in alive}
         outputs: Output = []
         for identity in [known for known in self._open if known not in ids.values()]:
             outputs += [(self._leaves[leaf].of(identity), None) for leaf in sorted(self._open.pop(identity))]
@@ -71,7 +71,7 @@ class Humans:
         return outputs
 
 
-def token(identity: str) -> str:
+def name_component(identity: str) -> str:
     """The id as a part of a topic's name: starts with a letter, then letters, digits and underscores."""
     text = re.sub(r"\W", "_", identity, flags=re.ASCII)
     return text if text[:1].isalpha() else f"p{text}"
@@ -109,7 +109,7 @@ def make_roi(factory: MessageFactory, header: Any, box: tuple[int, int, int, int
     )
 
 
-def box_around(points: NDArray[Any], size: tuple[int, int]) -> tuple[int, int, int, int] | None:
+def box_around(points: Array, size: tuple[int, int]) -> tuple[int, int, int, int] | None:
     """Left, top, right and bottom (past the last pixel) around points (N,2) in an image; None when all are outside."""
     low = np.floor(np.nanmin(points, axis=0) + 0.5)
     high = np.ceil(np.nanmax(points, axis=0) + 0.5)
@@ -117,9 +117,7 @@ def box_around(points: NDArray[Any], size: tuple[int, int]) -> tuple[int, int, i
     return (int(left), int(top), int(right), int(bottom)) if left < right and top < bottom else None
 
 
-def image_humans(
-    factory: MessageFactory, header: Any, image: NDArray[np.uint8], puppets: Any
-) -> dict[str, dict[str, Any]]:
+def image_humans(factory: MessageFactory, header: Any, image: U8, puppets: Any) -> dict[str, dict[str, Any]]:
     """Return id -> leaf -> message of the Puppets of an image (h,w,3) or (h,w): skeleton2d, roi and cropped."""
     size = (image.shape[1], image.shape[0])
     made: dict[str, dict[str, Any]] = {}

@@ -8,7 +8,7 @@ from typing import Any
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.multiview.hull_builder import HullBuilder, HullBuilderSettings, PersonSet
+from flowing_puppet_ros.multiview.hull_builder import HullBuilder, HullBuilderSettings, MultiViewPerson
 from flowing_puppet_ros.multiview.visual_hull import MIN_VIEWS
 from flowing_puppet_ros.settings import setting
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
@@ -29,7 +29,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
 )
 from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_joints
 from flowing_puppet_ros.stream.messages.silhouettes import make_silhouettes
-from flowing_puppet_ros.stream.time_synchronizer import Pairing
+from flowing_puppet_ros.stream.time_synchronizer import TimeSynchronizer
 
 _OF_CAMERA = ("image", "part_labels", "puppets")
 
@@ -71,8 +71,8 @@ class VisualHullComponent(Component):
         self._builder = HullBuilder(settings)
         self._frames = FrameTree()
         self._infos: dict[str, Any] = {}
-        self._of_camera = {name: Pairing(_OF_CAMERA) for name in self._names}
-        self._sets = Pairing(self._names, round(settings.slop * 1e9), patience=settings.patience)
+        self._of_camera = {name: TimeSynchronizer(_OF_CAMERA) for name in self._names}
+        self._sets = TimeSynchronizer(self._names, round(settings.slop * 1e9), patience=settings.patience)
         self._last_stamp: int | None = None
         self._seen = 0
         self._frame = ""
@@ -80,7 +80,7 @@ class VisualHullComponent(Component):
     def warm_up(self) -> None:
         """Cut out and carve somebody made up with a component of its own."""
         other = type(self)(replace(self._settings, every=1, frame=""), self.factory)
-        other.wants("silhouettes", True)
+        other.set_subscribed("silhouettes", True)
         for port, message in warm_up.cameras(self.factory, self._names):
             other.handle(port, message)
 
@@ -136,7 +136,7 @@ class VisualHullComponent(Component):
         carve = self._seen % self._settings.every == 0
         if not carve and "silhouettes" not in self._wanted:
             return []
-        person = self._builder.cut({name: view.hull_view for name, view in views.items()})
+        person = self._builder.segment({name: view.hull_view for name, view in views.items()})
         header = make_header(self.factory, stamp, self._frame)
         names = next(iter(views.values())).joint_names
         joints = make_joints(self.factory, names, person.joints, person.confidence)
@@ -191,7 +191,7 @@ class VisualHullComponent(Component):
                 self._unusable(error)
         return views
 
-    def _silhouettes(self, header: Any, body: Any, person: PersonSet, headers: dict[str, Any]) -> Output:
+    def _silhouettes(self, header: Any, body: Any, person: MultiViewPerson, headers: dict[str, Any]) -> Output:
         if "silhouettes" not in self._wanted:
             return []
         if person.problem:
@@ -202,7 +202,7 @@ class VisualHullComponent(Component):
         cameras = self._builder.cameras
         return [("silhouettes", make_silhouettes(self.factory, header, body, cameras, person.masks, headers))]
 
-    def _hull(self, header: Any, body: Any, person: PersonSet) -> Output:
+    def _hull(self, header: Any, body: Any, person: MultiViewPerson) -> Output:
         outputs: Output = [("hull/joints", make_bodies(self.factory, header, [body] if body.joints else []))]
         hull = self._builder.carve(person)
         if hull.problem:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -86,5 +86,5 @@ def _transform(factory: MessageFactory, name: str, angle: float) -> Any:
     """A camera in a circle that looks at its middle."""
     forward = np.array([-np.cos(angle), -np.sin(angle), 0.0])
     down = np.array([0.0, 0.0, -1.0])
-    rotation: NDArray[np.float64] = np.stack([np.cross(down, forward), down, forward], axis=1)
+    rotation: F64 = np.stack([np.cross(down, forward), down, forward], axis=1)
     return make_transform(factory, make_header(factory, 0, WORLD), name, -AWAY * forward, rotation)

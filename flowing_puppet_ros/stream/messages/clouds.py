@@ -6,8 +6,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory, message_bytes
 
@@ -19,7 +19,7 @@ _FARTHEST = 1000.0
 _NORMALS = ("normal_x", "normal_y", "normal_z")
 
 
-def decode_cloud(message: Any) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+def decode_cloud(message: Any) -> tuple[F64, F64 | None]:
     """Return the finite points (N,3) in metres and, when the cloud has normal_x/y/z, their normals (N,3).
 
     An organised cloud is flattened and points with a NaN, infinite or absurd coordinate are left out, whatever
@@ -41,7 +41,7 @@ def decode_cloud(message: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return points[good], np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
 
 
-def _records(message: Any, fields: dict[str, Any]) -> NDArray[Any]:
+def _records(message: Any, fields: dict[str, Any]) -> Array:
     """View the cloud as a flat structured array of the fields we know how to read."""
     order = ">" if message.is_bigendian else "<"
     known = {name: field for name, field in fields.items() if name in ("x", "y", "z", *_NORMALS)}
@@ -65,7 +65,7 @@ def _records(message: Any, fields: dict[str, Any]) -> NDArray[Any]:
     return np.ascontiguousarray(rows).reshape(-1).view(record)
 
 
-def make_cloud(factory: MessageFactory, header: Any, points: NDArray[Any], normals: NDArray[Any] | None = None) -> Any:
+def make_cloud(factory: MessageFactory, header: Any, points: Array, normals: Array | None = None) -> Any:
     """Return a dense, unorganised float32 PointCloud2 of points (N,3) in metres and their normals (N,3)."""
     columns = [np.asarray(points, np.float32).reshape(-1, 3)]
     names = ["x", "y", "z"]

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, U8, U16
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.message_types import message_bytes
 
@@ -37,7 +38,7 @@ def is_compressed_depth(form: str) -> bool:
     return "compresseddepth" in form.lower().replace(" ", "")
 
 
-def unpack_depth(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
+def unpack_depth(message: Any) -> U16 | F32:
     """Return the (H,W) image of a `compressedDepth` message: uint16 of 16UC1, float32 in metres, NaN unknown, of 32FC1.
 
     InputError in one sentence when it is none, when data is missing, or when it names more than LARGEST_PIXELS.
@@ -57,7 +58,7 @@ def unpack_depth(message: Any) -> NDArray[np.uint16] | NDArray[np.float32]:
     return np.where(pixels > 0, depth, np.float32(np.nan))
 
 
-def _png(data: NDArray[np.uint8]) -> NDArray[np.uint16]:
+def _png(data: U8) -> U16:
     width, height = struct.unpack(">II", data[16:24].tobytes().ljust(8, b"\0"))
     _check_size(width, height)
     try:
@@ -69,7 +70,7 @@ def _png(data: NDArray[np.uint8]) -> NDArray[np.uint16]:
     return np.asarray(image, np.uint16)
 
 
-def _rvl(data: NDArray[np.uint8]) -> NDArray[np.uint16]:
+def _rvl(data: U8) -> U16:
     if len(data) < 8:
         raise InputError(f"a compressed depth image of {len(data)} bytes is neither PNG nor RVL")
     width, height = struct.unpack_from("<II", data)
@@ -105,7 +106,7 @@ def _number(words: NDArray[np.uint32], at: int) -> tuple[int, int]:
 
 
 @njit(cache=True, nogil=True)
-def _unroll(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> int:
+def _unroll(words: NDArray[np.uint32], pixels: U16) -> int:
     """Fill `pixels` (N,), which are 0, from runs: so many zeros, so many others, each others' zigzag difference."""
     at, done, last = 0, 0, 0
     while done < len(pixels):

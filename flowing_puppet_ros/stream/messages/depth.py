@@ -7,8 +7,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.images import decode_depth
@@ -18,7 +18,7 @@ MOST_POINTS = 80_000
 """Points taken of a depth image: every n-th pixel of every n-th row, n as small as that allows."""
 
 
-def depth_points(depth: NDArray[np.float32], info: Any) -> NDArray[np.float32]:
+def depth_points(depth: F32, info: Any) -> F32:
     """Return the points (N,3) in metres of a depth image (H,W), metres, NaN unknown, in the camera's optical frame.
 
     The image is rectified, as REP-118 images are: pixel (u, v) at depth z lies at ((u - cx) z / fx, (v - cy) z / fy, z)

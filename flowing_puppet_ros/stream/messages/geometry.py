@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory
 from flowing_puppet_ros.units import NANOSECONDS
@@ -40,12 +40,12 @@ def make_header(factory: MessageFactory, nanoseconds: int, frame_id: str) -> Any
     return factory.make("std_msgs/msg/Header", stamp=make_stamp(factory, nanoseconds), frame_id=frame_id)
 
 
-def make_point(factory: MessageFactory, xyz: Sequence[float] | NDArray[Any]) -> Any:
+def make_point(factory: MessageFactory, xyz: Sequence[float] | Array) -> Any:
     """Return a geometry_msgs/Point."""
     return factory.make("geometry_msgs/msg/Point", x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
 
 
-def quaternion(rotation: NDArray[Any]) -> NDArray[np.float64]:
+def quaternion(rotation: Array) -> F64:
     """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation matrix (3,3)."""
     r = np.asarray(rotation, float)
     # Bar-Itzhack's symmetric matrix: its principal eigenvector is the quaternion, also of a slightly inexact matrix.
@@ -61,7 +61,7 @@ def quaternion(rotation: NDArray[Any]) -> NDArray[np.float64]:
     return q if q[3] >= 0 else -q
 
 
-def rotation_matrix(q: Sequence[float] | NDArray[Any]) -> NDArray[np.float64]:
+def rotation_matrix(q: Sequence[float] | Array) -> F64:
     """Return the rotation matrix (3,3) of a quaternion (x, y, z, w) of any length but 0."""
     length = math.sqrt(sum(float(c) ** 2 for c in q))
     if not length > 0 or not math.isfinite(length):
@@ -76,13 +76,13 @@ def rotation_matrix(q: Sequence[float] | NDArray[Any]) -> NDArray[np.float64]:
     )
 
 
-def make_quaternion(factory: MessageFactory, rotation: NDArray[Any]) -> Any:
+def make_quaternion(factory: MessageFactory, rotation: Array) -> Any:
     """Return a geometry_msgs/Quaternion of a rotation matrix (3,3)."""
     x, y, z, w = (float(c) for c in quaternion(rotation))
     return factory.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
-def make_pose(factory: MessageFactory, position: NDArray[Any], rotation: NDArray[Any]) -> Any:
+def make_pose(factory: MessageFactory, position: Array, rotation: Array) -> Any:
     """Return a geometry_msgs/Pose."""
     return factory.make(
         "geometry_msgs/msg/Pose",
@@ -91,9 +91,7 @@ def make_pose(factory: MessageFactory, position: NDArray[Any], rotation: NDArray
     )
 
 
-def make_transform(
-    factory: MessageFactory, header: Any, child: str, position: NDArray[Any], rotation: NDArray[Any]
-) -> Any:
+def make_transform(factory: MessageFactory, header: Any, child: str, position: Array, rotation: Array) -> Any:
     """Return a TransformStamped: the pose (metres) of frame `child` in the frame of `header`."""
     x, y, z = (float(c) for c in position)
     return factory.make(
@@ -112,7 +110,7 @@ class FrameTree:
     """The static frames heard on `/tf_static`."""
 
     def __init__(self) -> None:
-        self._parent: dict[str, tuple[str, NDArray[np.float64], NDArray[np.float64]]] = {}
+        self._parent: dict[str, tuple[str, F64, F64]] = {}
 
     def add(self, message: Any) -> None:
         """Take the transforms of a TFMessage; a later one replaces an earlier one of the same child.
@@ -134,7 +132,7 @@ class FrameTree:
         """Return the topmost known ancestor of `frame` (itself when it has none)."""
         return self._climb(frame)[0]
 
-    def _climb(self, frame: str) -> tuple[str, NDArray[np.float64], NDArray[np.float64]]:
+    def _climb(self, frame: str) -> tuple[str, F64, F64]:
         position, rotation = np.zeros(3), np.eye(3)
         seen = {frame}
         while frame in self._parent:
@@ -145,7 +143,7 @@ class FrameTree:
             position, rotation = turn @ position + step, turn @ rotation
         return frame, position, rotation
 
-    def pose(self, frame: str, target: str) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    def pose(self, frame: str, target: str) -> tuple[F64, F64] | None:
         """Return the position (3,) and rotation (3,3) of `frame` in `target`; None when nothing connects them."""
         frame_root, position, rotation = self._climb(frame.lstrip("/"))
         target_root, target_position, target_rotation = self._climb(target.lstrip("/"))

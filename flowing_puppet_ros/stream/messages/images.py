@@ -7,8 +7,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import F32, U8, Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.compressed_depth import LARGEST_PIXELS, is_compressed_depth, unpack_depth
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory, message_bytes
@@ -47,7 +47,7 @@ _RAW: dict[str, tuple[int, int, int | None]] = {
 _DEPTH = {"16uc1": ("u2", 0.001), "mono16": ("u2", 0.001), "32fc1": ("f4", 1.0)}
 
 
-def decode_image(message: Any) -> NDArray[np.uint8]:
+def decode_image(message: Any) -> U8:
     """Return the (H,W,3) RGB image of an Image or a CompressedImage; InputError in one sentence when it has none."""
     if hasattr(message, "format"):
         return _decode_compressed(message)
@@ -69,7 +69,7 @@ def decode_image(message: Any) -> NDArray[np.uint8]:
         ) from error
 
 
-def _decode_compressed(message: Any) -> NDArray[np.uint8]:
+def _decode_compressed(message: Any) -> U8:
     data = message_bytes(message.data)
     if is_compressed_depth(message.format):
         raise InputError(f"the compressed image format {message.format!r} is a depth image, not a picture")
@@ -83,7 +83,7 @@ def _decode_compressed(message: Any) -> NDArray[np.uint8]:
     return np.asarray(image, np.uint8)
 
 
-def _rows(message: Any, channels: int, dtype: np.dtype[Any]) -> NDArray[Any]:
+def _rows(message: Any, channels: int, dtype: np.dtype[Any]) -> Array:
     """Return the pixels (H,W) or (H,W,channels) of a raw Image without the padding of its rows."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     if height * width > LARGEST_PIXELS:
@@ -97,14 +97,14 @@ def _rows(message: Any, channels: int, dtype: np.dtype[Any]) -> NDArray[Any]:
     return pixels if channels == 1 else pixels.reshape(height, width, channels)
 
 
-def decode_labels(message: Any) -> NDArray[np.uint8]:
+def decode_labels(message: Any) -> U8:
     """Return the (H,W) labels of a mono8 Image."""
     if message.encoding.lower() not in ("mono8", "8uc1"):
         raise InputError(f"part labels come as mono8, not as {message.encoding!r}")
     return np.asarray(_rows(message, 1, np.dtype("u1")))
 
 
-def decode_flow(message: Any) -> NDArray[np.float32]:
+def decode_flow(message: Any) -> F32:
     """Return the (H,W,2) flow of a 32FC2 Image: pixels, +x right, +y down, NaN where unknown or absurd."""
     if message.encoding.upper() != "32FC2":
         raise InputError(f"optical flow comes as 32FC2, not as {message.encoding!r}")
@@ -119,14 +119,14 @@ def is_depth(encoding: str) -> bool:
     return encoding.lower() in _DEPTH
 
 
-def decode_depth(message: Any) -> NDArray[np.float32]:
+def decode_depth(message: Any) -> F32:
     """Return the (H,W) depth of a depth Image in metres along the optical axis (REP-118), NaN where unknown.
 
     16UC1 is in millimetres and 0 is unknown, 32FC1 is in metres; what is not positive or not finite is unknown. Takes
     the CompressedImage of the transport `compressedDepth` too.
     """
     if hasattr(message, "format"):
-        raw: NDArray[Any] = unpack_depth(message)
+        raw: Array = unpack_depth(message)
         unit = 0.001 if raw.dtype == np.uint16 else 1.0
     else:
         encoding = message.encoding.lower()
@@ -138,7 +138,7 @@ def decode_depth(message: Any) -> NDArray[np.float32]:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
 
 
-def make_image(factory: MessageFactory, header: Any, pixels: NDArray[Any], encoding: str) -> Any:
+def make_image(factory: MessageFactory, header: Any, pixels: Array, encoding: str) -> Any:
     """Return an Image of (H,W) or (H,W,C) pixels whose type fits `encoding`."""
     little = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
     return factory.make(
@@ -161,7 +161,7 @@ def compress(factory: MessageFactory, message: Any) -> Any:
     )
 
 
-def jpeg(rgb: NDArray[np.uint8], quality: int = JPEG_QUALITY) -> NDArray[np.uint8]:
+def jpeg(rgb: U8, quality: int = JPEG_QUALITY) -> U8:
     """Return the bytes of the JPEG file of an (H,W,3) RGB image."""
     done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:

@@ -6,7 +6,8 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+
+from flowing_puppet_ros.arrays import U8
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
@@ -26,6 +27,6 @@ class MessageFactory(Protocol):
         ...
 
 
-def message_bytes(data: Any) -> NDArray[np.uint8]:
+def message_bytes(data: Any) -> U8:
     """View the uint8[] field of any message flavour as an array, without a copy."""
     return data.view(np.uint8) if isinstance(data, np.ndarray) else np.frombuffer(memoryview(data), np.uint8)

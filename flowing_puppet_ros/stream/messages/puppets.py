@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
 from flowing_puppet_ros.stream.messages.message_types import BODIES, PUPPETS, MessageFactory
@@ -73,9 +73,7 @@ def _make_puppet(factory: MessageFactory, model: DeformableStructures, puppet: T
     )
 
 
-def make_joints(
-    factory: MessageFactory, names: Sequence[str], joints: NDArray[Any], confidence: NDArray[Any]
-) -> list[Any]:
+def make_joints(factory: MessageFactory, names: Sequence[str], joints: Array, confidence: Array) -> list[Any]:
     """Return the BodyJoints of joints (J,3) in metres with confidence (J,); those that are NaN are left out."""
     return [
         factory.make(_MESSAGES + "BodyJoint", name=name, position=make_point(factory, xyz), confidence=c)

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import I64, Array
 from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory
 
@@ -22,9 +22,7 @@ _LIFETIME_S = 5
 _SKIN = (0.85, 0.68, 0.55)
 
 
-def make_mesh_marker(
-    factory: MessageFactory, header: Any, number: int, faces: NDArray[Any], vertices: NDArray[Any]
-) -> Any:
+def make_mesh_marker(factory: MessageFactory, header: Any, number: int, faces: Array, vertices: Array) -> Any:
     """Return a TRIANGLE_LIST marker of a body mesh: faces (F,3), vertices (V,3) in metres in the header's frame."""
     points = [make_point(factory, vertex) for vertex in vertices]
     red, green, blue = _SKIN
@@ -70,7 +68,7 @@ def make_topology(factory: MessageFactory, model: StitchedPuppet) -> Any:
     return factory.make("shape_msgs/msg/Mesh", triangles=triangles, vertices=vertices)
 
 
-def preview_faces(model: StitchedPuppet, triangles: int) -> NDArray[np.int64]:
+def preview_faces(model: StitchedPuppet, triangles: int) -> I64:
     """Return faces (F',3) over the model's own vertices, about `triangles` of them; all of the model's when 0.
 
     Quadric edge collapses (Garland and Heckbert 1997) of the body at rest, every vertex that is left moved to the

@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flowing_puppet_ros.arrays import U8
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.stream.messages.geometry import make_pose, rotation_matrix
 from flowing_puppet_ros.stream.messages.images import decode_labels, make_image
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, SILHOUETTES, MessageFactory
 
-Masks = Mapping[str, NDArray[np.uint8]]
+Masks = Mapping[str, U8]
 
 
 def make_silhouettes(
@@ -52,7 +52,7 @@ def _make_info(factory: MessageFactory, header: Any, camera: Camera) -> Any:
     )
 
 
-def views_of(message: Any) -> list[tuple[Camera, NDArray[np.uint8]]]:
+def views_of(message: Any) -> list[tuple[Camera, U8]]:
     """Return the cameras and masks (h,w) of a SilhouetteSet; InputError names the camera that cannot be used."""
     views = []
     for each in message.silhouettes:

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from capsule_man import Joints, cloud_of, dog, joints_of  # type: ignore[import-not-found]
 
-from flowing_puppet_ros.body.cloud.normals import estimated_normals
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings, checked_cloud
+from flowing_puppet_ros.body.cloud.normals import estimate_normals
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings, check_cloud
 from flowing_puppet_ros.body.scans.scan import write_ply
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
@@ -135,7 +135,7 @@ def test_unusable_clouds_are_refused_in_one_sentence(fitter: BodyFitter) -> None
     ):
         with pytest.raises(InputError, match=words):
             fitter.fit(bad)
-    assert checked_cloud(cloud, np.zeros((100, 3)))[1] is None
+    assert check_cloud(cloud, np.zeros((100, 3)))[1] is None
     with pytest.raises(InputError, match="normals"):
         fitter.fit(cloud, cloud[:50])
     with pytest.raises(InputError, match="initial joints"):
@@ -148,11 +148,11 @@ def test_unusable_clouds_are_refused_in_one_sentence(fitter: BodyFitter) -> None
 def test_normals_do_not_depend_on_how_far_off_the_origin_is(man: tuple[np.ndarray, np.ndarray, Joints]) -> None:
     points, normals, _ = man
     for viewpoint in (None, np.array([3.0, 0.5, 0.2])):
-        here = estimated_normals(points, viewpoint)
+        here = estimate_normals(points, viewpoint)
         map_origin = np.array([5e5, 5.5e6, 300.0])
-        there = estimated_normals(points + map_origin, None if viewpoint is None else viewpoint + map_origin)
+        there = estimate_normals(points + map_origin, None if viewpoint is None else viewpoint + map_origin)
         assert ((here * there).sum(axis=1) > 0.999).mean() > 0.98
-    assert ((estimated_normals(points, None) * normals).sum(axis=1) > 0.7).mean() > 0.9
+    assert ((estimate_normals(points, None) * normals).sum(axis=1) > 0.7).mean() > 0.9
 
 
 def test_fit_verb_writes_the_contract_and_goes_on_after_a_bad_input(

@@ -9,16 +9,16 @@ from capsule_man import Joints, cloud_of, joints_of  # type: ignore[import-not-f
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
-from flowing_puppet_ros.body.fit.hypotheses import BodyFinder, FitterSettings
-from flowing_puppet_ros.body.fit.quality import judged
+from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses, FitterSettings
+from flowing_puppet_ros.body.fit.quality import assess_fit
 from flowing_puppet_ros.body.search.limb_search import limb_groups
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 
 @pytest.fixture(scope="module")
-def finder(model: StitchedPuppet) -> BodyFinder:
-    return BodyFinder(model, FitterSettings(limb_rounds=2))
+def finder(model: StitchedPuppet) -> BodyHypotheses:
+    return BodyHypotheses(model, FitterSettings(limb_rounds=2))
 
 
 @pytest.fixture(scope="module")
@@ -52,21 +52,21 @@ def off(model: StitchedPuppet, body: BodyState, joints: Joints, names: tuple[str
 
 
 def test_two_legs_on_one_come_apart(
-    model: StitchedPuppet, finder: BodyFinder, joints: Joints, cloud: Cloud, body: BodyState
+    model: StitchedPuppet, finder: BodyHypotheses, joints: Joints, cloud: Cloud, body: BodyState
 ) -> None:
     wrong = placed_like(model, body, "right", "left", ("upper_leg", "lower_leg", "foot"))
     names = ("right_knee", "right_ankle", "left_knee", "left_ankle")
     assert off(model, wrong, joints, names) > 0.2
     start = finder.candidate(wrong, cloud)
-    assert start.judgement.doubtful
+    assert start.quality.limb_suspect
     grid = CloudGrid.build(cloud.points, cloud.normals)
-    mended = finder.mended(start, cloud, grid, np.random.default_rng(0))
+    mended = finder.repair_limbs(start, cloud, grid, np.random.default_rng(0))
     assert off(model, mended.state, joints, names) < 0.1
     assert mended.cost < 0.7 * start.cost
 
 
 def test_an_arm_is_found_in_what_the_rest_leaves_and_the_rest_stays(
-    model: StitchedPuppet, finder: BodyFinder, joints: Joints, cloud: Cloud, body: BodyState
+    model: StitchedPuppet, finder: BodyHypotheses, joints: Joints, cloud: Cloud, body: BodyState
 ) -> None:
     arm = limb_groups(model.tree)[2]
     assert [model.tree.names[part] for part in arm] == [
@@ -85,7 +85,7 @@ def test_an_arm_is_found_in_what_the_rest_leaves_and_the_rest_stays(
 
 
 def test_no_limb_is_sought_where_nothing_is_left(
-    model: StitchedPuppet, finder: BodyFinder, cloud: Cloud, body: BodyState
+    model: StitchedPuppet, finder: BodyHypotheses, cloud: Cloud, body: BodyState
 ) -> None:
     arm = limb_groups(model.tree)[2]
     rest = model.vertices(body)[~np.isin(model.part_of_vertex, arm)]
@@ -96,14 +96,14 @@ def test_no_limb_is_sought_where_nothing_is_left(
 
 
 def test_a_body_without_fault_stays_as_it_is(
-    model: StitchedPuppet, finder: BodyFinder, cloud: Cloud, body: BodyState
+    model: StitchedPuppet, finder: BodyHypotheses, cloud: Cloud, body: BodyState
 ) -> None:
     vertices = model.vertices(body)
     own = Cloud.of(vertices, np.zeros_like(vertices))
-    candidate = replace(finder.candidate(body, cloud), judgement=judged(model, vertices, own))
-    candidate = replace(candidate, judgement=replace(candidate.judgement, part_confidence=np.ones(16)))
+    candidate = replace(finder.candidate(body, cloud), quality=assess_fit(model, vertices, own))
+    candidate = replace(candidate, quality=replace(candidate.quality, part_confidence=np.ones(16)))
     grid = CloudGrid.build(cloud.points, cloud.normals)
-    assert finder.mended(candidate, cloud, grid, np.random.default_rng(0)) is candidate
+    assert finder.repair_limbs(candidate, cloud, grid, np.random.default_rng(0)) is candidate
 
 
 def test_groups_hold_every_limb_from_the_trunk_outwards(model: StitchedPuppet) -> None:

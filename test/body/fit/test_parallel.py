@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from flowing_puppet_ros.body.fit import hypotheses
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.model.sp import StitchedPuppet
-from flowing_puppet_ros.parallel import ordered, usable
+from flowing_puppet_ros.parallel import parallel_map, usable_threads
 
 
 def test_results_keep_the_order_of_the_items() -> None:
@@ -22,15 +22,15 @@ def test_results_keep_the_order_of_the_items() -> None:
         names.add(threading.current_thread().name)
         return item * item
 
-    assert ordered(work, range(50), 1) == ordered(work, range(50), 3) == [item * item for item in range(50)]
+    assert parallel_map(work, range(50), 1) == parallel_map(work, range(50), 3) == [item * item for item in range(50)]
     assert threading.main_thread().name in names and len(names) > 1
 
 
 def test_a_worker_that_may_use_one_core_uses_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 1)
-    assert usable(8) == 1
+    assert usable_threads(8) == 1
     monkeypatch.setattr(numba.config, "NUMBA_NUM_THREADS", 4)
-    assert [usable(1), usable(3), usable(8)] == [1, 3, 4]
+    assert [usable_threads(1), usable_threads(3), usable_threads(8)] == [1, 3, 4]
 
 
 def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,7 +41,7 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(monkeypatch:
     )
     fits = []
     for threads, seed in ((1, 5), (2, 5), (2, 6)):
-        monkeypatch.setattr(hypotheses, "usable", lambda _, count=threads: count)
+        monkeypatch.setattr(hypotheses, "usable_threads", lambda _, count=threads: count)
         with threadpool_limits(limits=threads):
             fits.append(BodyFitter(StitchedPuppet.load("neutral"), small).fit(points, normals, seed=seed))
     for name in ("vertices", "joints", "part_confidence"):

@@ -9,11 +9,11 @@ from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.cloud.single_view import BEFORE, ViewCloud
+from flowing_puppet_ros.body.cloud.single_view import DEPTH_TOLERANCE, SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
-from flowing_puppet_ros.body.fit.pose_bank import BodyBank, Coarse
+from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
 from flowing_puppet_ros.body.search.part_points import part_points
-from flowing_puppet_ros.body.search.particles import particles_of
+from flowing_puppet_ros.body.search.particles import states_to_particles
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -68,7 +68,7 @@ def test_depth_cameras_and_lidars_show_the_joints_and_the_sides(
 
 def test_free_space_draws_out_what_stands_in_it_and_nothing_else() -> None:
     points, _ = one_side(0.6, 6000, 0.0)
-    cloud = ViewCloud.seen_from(points, np.zeros_like(points), SENSOR)
+    cloud = SingleViewCloud.seen_from(points, np.zeros_like(points), SENSOR)
     forward = cloud.view.axes[2]
     side = cloud.view.axes[0]
     behind, before = points[::50] + 0.3 * forward, points[::50] - 0.05 * forward
@@ -77,7 +77,7 @@ def test_free_space_draws_out_what_stands_in_it_and_nothing_else() -> None:
     drawn = cloud.free_space(np.concatenate([before, beside[None]]), 0.1)
     # The step of a Gauss-Newton on each vertex alone, pseudo-inverse because other directions are free.
     steps = -np.einsum("vij,vj->vi", np.linalg.pinv(drawn.matrix), drawn.vector)
-    assert np.median(np.abs(steps[:-1] @ forward - (0.05 - BEFORE))) < 0.01
+    assert np.median(np.abs(steps[:-1] @ forward - (0.05 - DEPTH_TOLERANCE))) < 0.01
     assert steps[-1] @ side < -0.5
     assert abs(steps[-1] @ (beside - SENSOR)) < 1e-9 * np.linalg.norm(beside - SENSOR) + 1e-9
     far = cloud.free_space(np.concatenate([before, beside[None]]), 0.01)
@@ -92,35 +92,35 @@ def test_hidden_vertices_are_not_seen(fitter: BodyFitter) -> None:
     sensor = np.array([0.0, 3.0, 0.3])  # the left arm hides part of the trunk
     facing = ((sensor - vertices) * normals).sum(axis=1) > 0
     arm = np.isin(model.part_of_vertex, [model.tree.index(f"left_{part}") for part in ("upper_arm", "lower_arm")])
-    cloud = ViewCloud.seen_from(vertices[facing & arm], normals[facing & arm], sensor)
+    cloud = SingleViewCloud.seen_from(vertices[facing & arm], normals[facing & arm], sensor)
     seen = cloud.sees(vertices, normals)
     assert seen[facing & arm].mean() > 0.97
     shadow = facing & cloud.view.hidden(vertices)
     assert shadow.sum() > 50 and not seen[shadow].any()
     assert not seen[~facing].any()
     with pytest.raises(InputError, match="within the cloud"):
-        ViewCloud.seen_from(vertices, normals, vertices.mean(axis=0))
+        SingleViewCloud.seen_from(vertices, normals, vertices.mean(axis=0))
 
 
 def test_bank_judges_bodies_by_all_or_by_some_of_their_parts(fitter: BodyFitter) -> None:
     model = fitter.model
-    bank = BodyBank(model, part_points(model))
+    bank = PoseBank(model, part_points(model))
     points, normals = cloud_of(joints_of(), 3000)
-    coarse = Coarse.of(Cloud.of(points, normals), 60)
+    coarse = CoarseCloud.of(Cloud.of(points, normals), 60)
     bodies = bank.best(coarse, 4)
     cost = [bank.cost(body, coarse) for body in bodies]
     assert cost == sorted(cost)
-    groups = particles_of(model, bodies)
-    whole = bank.judge(groups, coarse, range(16))
+    groups = states_to_particles(model, bodies)
+    whole = bank.coverage_cost(groups, coarse, range(16))
     np.testing.assert_allclose(whole.cost, cost)
     legs = [part for part in range(16) if "leg" in model.tree.names[part]]
     others = [part for part in range(16) if part not in legs]
-    rest = bank.judge(groups, coarse, others)
-    np.testing.assert_allclose(bank.judge(groups, coarse, legs, rest.distance).distance, whole.distance)
+    rest = bank.coverage_cost(groups, coarse, others)
+    np.testing.assert_allclose(bank.coverage_cost(groups, coarse, legs, rest.distance).distance, whole.distance)
 
 
 def test_a_body_promises_more_upright_than_lying(fitter: BodyFitter) -> None:
     points, _ = cloud_of(joints_of(raise_left=0.3), 3000)
-    upright = fitter.promise(points)
-    assert upright < fitter.promise(points @ np.diag([1.0, -1.0, -1.0]))
-    assert upright < 0.8 * fitter.promise(points[:, [2, 0, 1]])
+    upright = fitter.coarse_cost(points)
+    assert upright < fitter.coarse_cost(points @ np.diag([1.0, -1.0, -1.0]))
+    assert upright < 0.8 * fitter.coarse_cost(points[:, [2, 0, 1]])

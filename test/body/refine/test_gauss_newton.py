@@ -3,9 +3,9 @@
 
 import numpy as np
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, Quadratic, two_way_distance
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic, two_way_distance
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.refine.gauss_newton import LOOSE, Refiner, RefineWeights
+from flowing_puppet_ros.body.refine.gauss_newton import LOOSE, GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -17,12 +17,12 @@ def test_a_further_term_draws_the_body_where_it_says() -> None:
     goal, count = model.vertices(start) + move, len(model.part_of_vertex)
     widths = []
 
-    def springs(vertices: np.ndarray, sigma: float) -> Quadratic:
+    def springs(vertices: np.ndarray, sigma: float) -> VertexQuadratic:
         widths.append(sigma)
-        return Quadratic(np.tile(np.eye(3) / count, (count, 1, 1)), (vertices - goal) / count)
+        return VertexQuadratic(np.tile(np.eye(3) / count, (count, 1, 1)), (vertices - goal) / count)
 
     weights = RefineWeights(sigma_start=0.2, sigma_end=0.05, iterations=5)
-    body = Refiner(model).run(start, None, JointTargets.none(model), weights, [springs])
+    body = GaussNewton(model).run(start, None, JointTargets.none(model), weights, [springs])
     miss = np.linalg.norm(model.vertices(body) - goal, axis=1)
     assert miss.max() < 0.01
     assert miss.mean() < 0.003
@@ -33,7 +33,7 @@ def test_without_evidence_the_shape_is_the_expected_one() -> None:
     model = StitchedPuppet.load("neutral")
     expected = np.linspace(-1.5, 1.5, model.shape_count)
     weights = RefineWeights(iterations=6, shape_center=expected)
-    body = Refiner(model).run(model.rest_state(), None, JointTargets.none(model), weights)
+    body = GaussNewton(model).run(model.rest_state(), None, JointTargets.none(model), weights)
     np.testing.assert_allclose(body.shape, np.tile(expected, (len(model.tree), 1)), atol=0.2)
 
 
@@ -44,7 +44,7 @@ def test_loose_parts_follow_a_foreign_surface_more_closely() -> None:
     waves = 0.015 * np.sin(vertices @ [9.0, 7.0, 15.0])[:, None]
     truth = vertices + waves * vertex_normals(vertices, model.faces)
     cloud = Cloud.of(truth, vertex_normals(truth, model.faces))
-    refiner, none = Refiner(model), JointTargets.none(model)
+    refiner, none = GaussNewton(model), JointTargets.none(model)
     firm = refiner.run(start, cloud, none, RefineWeights(sigma_start=0.05, sigma_end=0.05, iterations=6))
     loose = refiner.run(firm, cloud, none, LOOSE)
     apart = [two_way_distance(model.vertices(body), model.faces, cloud) for body in (start, firm, loose)]

@@ -6,15 +6,15 @@ from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.refine.gauss_newton import Refiner, RefineWeights
-from flowing_puppet_ros.body.refine.hand_pose import with_hands
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
+from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 
 def test_each_hand_is_closed_or_opened_as_the_cloud_has_it() -> None:
     model = StitchedPuppet.load("neutral")
-    refiner = Refiner(model)
+    refiner = GaussNewton(model)
     left, right = model.tree.index("left_hand"), model.tree.index("right_hand")
     truth = model.rest_state()
     truth.pose[left, :2], truth.pose[right, :2] = (1.8, 0.5), (-1.2, 1.5)
@@ -24,8 +24,8 @@ def test_each_hand_is_closed_or_opened_as_the_cloud_has_it() -> None:
     start.pose[left, :2], start.pose[right, :2] = (-1.5, 0.0), (1.5, -1.0)
     with threadpool_limits(1):
         stuck = refiner.run(start, cloud, JointTargets.none(model), RefineWeights(sigma_start=0.05, iterations=8))
-        found = with_hands(model, refiner, stuck, cloud)
-        again = with_hands(model, refiner, found, cloud)
+        found = refine_hand_pose(model, refiner, stuck, cloud)
+        again = refine_hand_pose(model, refiner, found, cloud)
     stuck_hands = []
     for hand in (left, right):
         rows = model.part_of_vertex == hand

@@ -8,13 +8,13 @@ import pytest
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.refine.nonrigid import FinishWeights, SurfaceFinish, umbrella
+from flowing_puppet_ros.body.refine.nonrigid import NonRigidRefinement, NonRigidWeights, umbrella_laplacian
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 
 @pytest.fixture(scope="module")
-def finish(model: StitchedPuppet) -> SurfaceFinish:
-    return SurfaceFinish(model.faces, len(model.part_of_vertex), FinishWeights())
+def finish(model: StitchedPuppet) -> NonRigidRefinement:
+    return NonRigidRefinement(model.faces, len(model.part_of_vertex), NonRigidWeights())
 
 
 def swollen(model: StitchedPuppet) -> tuple[np.ndarray, np.ndarray]:
@@ -39,10 +39,10 @@ def test_umbrella_takes_the_mean_of_the_neighbours() -> None:
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     values = np.array([1.0, 5.0, -2.0, 7.0, 4.0])
     expected = [1 - (5 - 2 + 7) / 3, 5 - (1 - 2) / 2, -2 - (1 + 5 + 7) / 3, 7 - (1 - 2) / 2, 0.0]
-    np.testing.assert_allclose(umbrella(faces, 5) @ values, expected)
+    np.testing.assert_allclose(umbrella_laplacian(faces, 5) @ values, expected)
 
 
-def test_what_the_model_cannot_express_is_followed(model: StitchedPuppet, finish: SurfaceFinish) -> None:
+def test_what_the_model_cannot_express_is_followed(model: StitchedPuppet, finish: NonRigidRefinement) -> None:
     start, truth = swollen(model)
     cloud = cloud_on(truth, model.faces, 8000)
     finished = finish.run(start, cloud)
@@ -52,7 +52,7 @@ def test_what_the_model_cannot_express_is_followed(model: StitchedPuppet, finish
     assert two_way_distance(finished, model.faces, cloud) < two_way_distance(start, model.faces, cloud) - 0.002
 
 
-def test_holes_follow_their_surroundings(model: StitchedPuppet, finish: SurfaceFinish) -> None:
+def test_holes_follow_their_surroundings(model: StitchedPuppet, finish: NonRigidRefinement) -> None:
     start = model.vertices(model.rest_state())
     truth = start + np.array([0.01, 0.0, 0.01])
     whole = cloud_on(truth, model.faces, 8000)
@@ -64,13 +64,13 @@ def test_holes_follow_their_surroundings(model: StitchedPuppet, finish: SurfaceF
     assert np.linalg.norm(finished - truth, axis=1)[inside].mean() < 0.006
 
 
-def test_a_cloud_that_is_elsewhere_moves_nothing(model: StitchedPuppet, finish: SurfaceFinish) -> None:
+def test_a_cloud_that_is_elsewhere_moves_nothing(model: StitchedPuppet, finish: NonRigidRefinement) -> None:
     start = model.vertices(model.rest_state())
     elsewhere = Cloud.of(start + np.array([20.0, 0.0, 0.0]), vertex_normals(start, model.faces))
     assert np.abs(finish.run(start, elsewhere) - start).max() < 1e-3
 
 
-def test_the_same_cloud_gives_the_same_bytes(model: StitchedPuppet, finish: SurfaceFinish) -> None:
+def test_the_same_cloud_gives_the_same_bytes(model: StitchedPuppet, finish: NonRigidRefinement) -> None:
     start, truth = swollen(model)
     cloud = cloud_on(truth, model.faces, 2000)
     assert finish.run(start, cloud).tobytes() == finish.run(start.copy(), cloud).tobytes()

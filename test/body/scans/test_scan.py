@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 from flowing_puppet_ros.body.scans.scan import Scan, read_scan, storable, write_ply
 from flowing_puppet_ros.body.scans.scan_frame import (
     UP_NAMES,
-    Frame,
+    ScanFrame,
     all_candidates,
     axis_of,
     guess_scale,
+    rotation_to_z_up,
     seen_from_origin,
     up_candidates,
-    upright,
 )
 from flowing_puppet_ros.errors import InputError
 
@@ -136,7 +136,7 @@ def test_pickles_and_wrong_arrays_are_refused(tmp_path: Path) -> None:
 
 
 def test_frame_there_and_back() -> None:
-    frame = Frame(0.01, upright(axis_of("y")))
+    frame = ScanFrame(0.01, rotation_to_z_up(axis_of("y")))
     points = np.random.default_rng(0).normal(size=(5, 3))
     np.testing.assert_allclose(frame.to_scan(frame.to_body(points)), points)
     np.testing.assert_allclose(frame.to_body(np.array([[0.0, 100.0, 0.0]])), [[0.0, 0.0, 1.0]])
@@ -144,16 +144,16 @@ def test_frame_there_and_back() -> None:
 
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda up: np.linalg.norm(up) > 0.1))
 def test_every_direction_becomes_z_by_a_rotation(up: list[float]) -> None:
-    turn = upright(np.array(up))
+    turn = rotation_to_z_up(np.array(up))
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(turn) == pytest.approx(1)
     np.testing.assert_allclose(turn @ up, [0, 0, np.linalg.norm(up)], atol=1e-9)
-    np.testing.assert_allclose(Frame(0.01, turn).up, np.array(up) / np.linalg.norm(up), atol=1e-9)
+    np.testing.assert_allclose(ScanFrame(0.01, turn).up, np.array(up) / np.linalg.norm(up), atol=1e-9)
 
 
 def test_people_with_y_up_look_along_z_and_z_up_stays() -> None:
-    assert np.array_equal(upright(axis_of("z")), np.eye(3))
-    assert np.array_equal(upright(axis_of("y")) @ [0, 0, 1], [1, 0, 0])
+    assert np.array_equal(rotation_to_z_up(axis_of("z")), np.eye(3))
+    assert np.array_equal(rotation_to_z_up(axis_of("y")) @ [0, 0, 1], [1, 0, 0])
     assert np.array_equal(axis_of("-x"), [-1, 0, 0])
     assert len({tuple(axis_of(name)) for name in UP_NAMES}) == 6
 
@@ -190,7 +190,7 @@ def test_up_is_the_long_side_and_open_when_two_are_alike() -> None:
 def test_people_who_lie_askew_have_their_length_among_the_directions() -> None:
     cloud = np.random.default_rng(0).normal(size=(500, 3)) * [0.5, 0.15, 0.1]
     assert len(all_candidates(cloud)) == 6
-    turn = upright(np.array([1.0, 1.0, 0.2])).T
+    turn = rotation_to_z_up(np.array([1.0, 1.0, 0.2])).T
     askew = all_candidates(cloud[:, [1, 2, 0]] @ turn.T)
     assert len(askew) == 8
     np.testing.assert_allclose(np.abs(askew[6] @ turn[:, 2]), 1, atol=0.01)

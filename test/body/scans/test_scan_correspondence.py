@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, Matches, two_way_distance
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, two_way_distance
 from flowing_puppet_ros.body.scans.scan import Scan
 from flowing_puppet_ros.body.scans.scan_correspondence import closest_on_mesh, correspond
 
@@ -104,7 +104,7 @@ def ball() -> Ball:
 
 def test_a_body_on_its_cloud_is_not_pulled(ball: Ball) -> None:
     vertices, faces, cloud = ball
-    quadratic = Matches(cloud).attract(vertices, faces, 0.1)
+    quadratic = TwoWayCorrespondence(cloud).attract(vertices, faces, 0.1)
     np.testing.assert_allclose(quadratic.vector, 0, atol=1e-12)
     assert np.trace(quadratic.matrix.sum(axis=0)) == pytest.approx(2 * (1 + 3 * 0.05))
 
@@ -112,7 +112,7 @@ def test_a_body_on_its_cloud_is_not_pulled(ball: Ball) -> None:
 def test_a_moved_body_is_pulled_back(ball: Ball) -> None:
     vertices, faces, cloud = ball
     move = np.array([0.02, -0.01, 0.03])
-    quadratic = Matches(cloud).attract(vertices + move, faces, 0.1)
+    quadratic = TwoWayCorrespondence(cloud).attract(vertices + move, faces, 0.1)
     step = np.linalg.solve(quadratic.matrix.sum(axis=0), -quadratic.vector.sum(axis=0))
     np.testing.assert_allclose(step, -move, atol=0.006)
 
@@ -120,8 +120,8 @@ def test_a_moved_body_is_pulled_back(ball: Ball) -> None:
 def test_contradicting_normals_and_far_points_do_not_pull(ball: Ball) -> None:
     vertices, faces, _ = ball
     inside_out = Cloud.of(vertices, -vertices)
-    assert not Matches(inside_out).attract(vertices, faces, 0.1).matrix.any()
-    far = Matches(Cloud.of(vertices, vertices)).attract(vertices + SHIFT, faces, 0.1)
+    assert not TwoWayCorrespondence(inside_out).attract(vertices, faces, 0.1).matrix.any()
+    far = TwoWayCorrespondence(Cloud.of(vertices, vertices)).attract(vertices + SHIFT, faces, 0.1)
     assert np.abs(far.matrix).sum() < 1e-3
 
 

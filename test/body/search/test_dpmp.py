@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.search.dpmp import Search, SearchWeights
+from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.limb_search import LimbSearch, limb_groups
 from flowing_puppet_ros.body.search.part_points import PartPoints
-from flowing_puppet_ros.body.search.particles import Particles, particles_of
+from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer
 from flowing_puppet_ros.body.search.schedule import limb_stages
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
@@ -18,8 +18,8 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 
 @pytest.fixture(scope="module")
-def search(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> Search:
-    return Search(model, points, SearchWeights(lm_steps=2))
+def search(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> BodyParticleSearch:
+    return BodyParticleSearch(model, points, SearchWeights(lm_steps=2))
 
 
 @pytest.fixture(scope="module")
@@ -39,30 +39,30 @@ def relative(model: StitchedPuppet, group: list[Particles], part: int) -> np.nda
 
 
 def test_parts_with_one_particle_stay_and_every_mode_holds_its_own_particle(
-    model: StitchedPuppet, points: tuple[PartPoints, ...], search: Search, body: BodyState, grid: CloudGrid
+    model: StitchedPuppet, points: tuple[PartPoints, ...], search: BodyParticleSearch, body: BodyState, grid: CloudGrid
 ) -> None:
-    start, leg = particles_of(model, [body]), limb_groups(model.tree)[0]
+    start, leg = states_to_particles(model, [body]), limb_groups(model.tree)[0]
     proposer, rng = Proposer(model, points), np.random.default_rng(2)
     for part in leg:
         above = start[model.tree.parents[part]]
         parents = above.take(np.arange(12) % len(above))
-        start[part] = Particles.join([start[part], proposer.hang(part, parents, start[part].shape[0], rng)])
+        start[part] = Particles.join([start[part], proposer.attach_to_parent(part, parents, start[part].shape[0], rng)])
     none, stages = JointTargets.none(model), limb_stages(model.tree)
-    found = search.run(start, grid, none, stages, 2, rng, keep=5)
+    found = search.optimise(start, grid, none, stages, 2, rng, keep=5)
     others = np.setdiff1d(np.arange(16), leg)
     np.testing.assert_array_equal(found.state.center[others], body.center[others])
     np.testing.assert_array_equal(found.state.pose[others], body.pose[others])
-    assert [len(group.particles) for group in found.judged] == [5 if part in leg else 1 for part in range(16)]
+    assert [len(group.particles) for group in found.scored] == [5 if part in leg else 1 for part in range(16)]
     foot = leg[-1]
     modes = search.modes(found, foot)
-    np.testing.assert_array_equal([mode.center[foot] for mode in modes], found.judged[foot].particles.center)
+    np.testing.assert_array_equal([mode.center[foot] for mode in modes], found.scored[foot].particles.center)
     assert any(np.array_equal(mode.center, found.state.center) for mode in modes)
     # No body of other particles above the foot has less energy than the mode with that foot.
     for mode in modes[:2]:
         least = search.energy(mode, grid)
         for thigh in range(5):
             other = mode.center.copy(), mode.rotation.copy(), mode.pose.copy(), mode.shape.copy()
-            for values, own in zip(other, astuple(found.judged[leg[0]].particles, thigh), strict=True):
+            for values, own in zip(other, astuple(found.scored[leg[0]].particles, thigh), strict=True):
                 values[leg[0]][: len(own)] = own
             assert search.energy(BodyState(*other), grid) >= least - 1e-9
 
@@ -74,9 +74,11 @@ def astuple(particles: Particles, index: int) -> tuple[np.ndarray, ...]:
 def test_hung_parts_turn_within_their_limits_about_their_interfaces(
     model: StitchedPuppet, points: tuple[PartPoints, ...], body: BodyState
 ) -> None:
-    group, part = particles_of(model, [body] * 200), model.tree.index("left_lower_arm")
+    group, part = states_to_particles(model, [body] * 200), model.tree.index("left_lower_arm")
     above = model.tree.parents[part]
-    group[part] = Proposer(model, points).hang(part, group[above], body.shape[part], np.random.default_rng(0))
+    group[part] = Proposer(model, points).attach_to_parent(
+        part, group[above], body.shape[part], np.random.default_rng(0)
+    )
     turns = so3.log(relative(model, group, part))
     low, high = model.limit_low[part - 1], model.limit_high[part - 1]
     inside = (turns >= low - 1e-9) & (turns <= high + 1e-9)
@@ -89,11 +91,11 @@ def test_hung_parts_turn_within_their_limits_about_their_interfaces(
 
 
 def test_usual_limbs_have_the_mean_of_their_gaussians(
-    model: StitchedPuppet, points: tuple[PartPoints, ...], search: Search, body: BodyState
+    model: StitchedPuppet, points: tuple[PartPoints, ...], search: BodyParticleSearch, body: BodyState
 ) -> None:
     arm = limb_groups(model.tree)[3]
-    usual = LimbSearch(model, search, Proposer(model, points)).usual(body, arm)
-    group, meshes = particles_of(model, [usual]), model.parts(usual)
+    usual = LimbSearch(model, search, Proposer(model, points)).mean_limb(body, arm)
+    group, meshes = states_to_particles(model, [usual]), model.parts(usual)
     for part in arm:
         above, mean, interface = model.tree.parents[part], model.pairwise[part - 1].mean, model.interfaces[part - 1]
         np.testing.assert_allclose(so3.log(relative(model, group, part))[0], mean[:3], atol=1e-9)

@@ -6,9 +6,15 @@ import pytest
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.search.levenberg import CONTRADICTING_WEIGHT, POSE_PRIOR, assemble, improve, prepared_part
+from flowing_puppet_ros.body.search.levenberg import (
+    CONTRADICTING_WEIGHT,
+    POSE_PRIOR,
+    assemble,
+    levenberg_marquardt,
+    prepare_part,
+)
 from flowing_puppet_ros.body.search.part_points import PartPoints
-from flowing_puppet_ros.body.search.particles import Particles, particles_of
+from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer, WalkNoise
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, look_up
 from flowing_puppet_ros.model import rotation as so3
@@ -18,7 +24,7 @@ UPPER_LEG = 10
 
 
 def copies(model: StitchedPuppet, count: int) -> list[Particles]:
-    return particles_of(model, [model.rest_state()] * count)
+    return states_to_particles(model, [model.rest_state()] * count)
 
 
 def test_marquardt_brings_a_part_back_to_its_surface(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> None:
@@ -34,12 +40,12 @@ def test_marquardt_brings_a_part_back_to_its_surface(model: StitchedPuppet, poin
     )
     none = JointTargets.none(model)
     before = part.cost(points, moved)
-    after = improve(points[UPPER_LEG], moved, part.grid, none, 10, 60)
+    after = levenberg_marquardt(points[UPPER_LEG], moved, part.grid, none, 10, 60)
     assert np.all(part.cost(points, after) < before)
     assert part.cost(points, after).mean() < part.cost(points, start).mean() + 0.2 * (
         before.mean() - part.cost(points, start).mean()
     )
-    still = improve(points[UPPER_LEG], moved, part.grid, none, 0, 60)
+    still = levenberg_marquardt(points[UPPER_LEG], moved, part.grid, none, 0, 60)
     assert np.array_equal(still.center, moved.center)
 
 
@@ -51,7 +57,7 @@ def test_marquardt_follows_believed_joints(model: StitchedPuppet, points: tuple[
     goal = model.joints(model.vertices(model.rest_state())) + np.array([0.1, 0.0, 0.0])
     weight = np.zeros(len(goal))
     weight[knee] = 100.0
-    pulled = improve(points[UPPER_LEG], start, part.grid, JointTargets(goal, weight), 15, 60)
+    pulled = levenberg_marquardt(points[UPPER_LEG], start, part.grid, JointTargets(goal, weight), 15, 60)
     row = points[UPPER_LEG].joint_index.tolist().index(knee)
     np.testing.assert_allclose(points[UPPER_LEG].joints.world(pulled)[0, row], goal[knee], atol=0.01)
 
@@ -75,7 +81,7 @@ def test_marquardt_s_normal_equations_equal_finite_differences(
     """Against J^T W J and J^T W r of the world points, with the closest points held."""
     own, rng = points[UPPER_LEG], np.random.default_rng(5)
     part = PartPointsOf(model, UPPER_LEG, model.parts(model.rest_state())[UPPER_LEG])
-    body = Proposer(model, points).walk(copies(model, 1)[UPPER_LEG], WalkNoise(0.05, 1.5, 1.0, 1.0), rng)
+    body = Proposer(model, points).random_walk(copies(model, 1)[UPPER_LEG], WalkNoise(0.05, 1.5, 1.0, 1.0), rng)
     goal, belief = rng.normal(size=(len(own.joints), 3)), rng.random(len(own.joints))
 
     def world(unknowns: np.ndarray) -> np.ndarray:
@@ -96,7 +102,7 @@ def test_marquardt_s_normal_equations_equal_finite_differences(
     hessian[6:, 6:] += POSE_PRIOR * np.eye(len(zero) - 6)
     gradient[6:] += POSE_PRIOR * body.pose[0]
 
-    prepared = prepared_part(own, body, JointTargets(*belief_of(model, own, goal, belief)), count)
+    prepared = prepare_part(own, body, JointTargets(*belief_of(model, own, goal, belief)), count)
     found_hessian, found_gradient = np.ones_like(hessian), np.ones_like(gradient)
     state = body.center[0], body.rotation[0], body.pose[0]
     grid = (part.grid.points, part.grid.normals, part.grid.nearest, part.grid.origin, part.grid.cell)

@@ -6,11 +6,11 @@ import pytest
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import farthest_points, vertex_normals
-from flowing_puppet_ros.body.fit.initialisation import body_from_joints, joint_targets, turned_around
-from flowing_puppet_ros.body.refine.gauss_newton import Refiner, RefineWeights
-from flowing_puppet_ros.body.search.energy import JointTargets, Judged, stitching_costs
+from flowing_puppet_ros.body.fit.initialisation import body_from_joints, flip_heading, joint_targets
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
+from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles, stitching_costs
 from flowing_puppet_ros.body.search.part_points import PartPoints
-from flowing_puppet_ros.body.search.particles import Particles, particles_of, state_of
+from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Conditional, Proposer, WalkNoise
 from flowing_puppet_ros.body.search.schedule import four_stages, local_stages
 from flowing_puppet_ros.errors import InputError
@@ -23,7 +23,7 @@ UPPER_LEG = 10
 
 
 def copies(model: StitchedPuppet, count: int) -> list[Particles]:
-    return particles_of(model, [model.rest_state()] * count)
+    return states_to_particles(model, [model.rest_state()] * count)
 
 
 def test_stitching_costs_equal_the_sum_of_eq_48() -> None:
@@ -41,8 +41,8 @@ def test_stitching_costs_equal_the_sum_of_eq_48() -> None:
 def test_points_of_parts_equal_the_model(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> None:
     body = model.sample(np.random.default_rng(1))
     meshes, joints = model.parts(body), model.joints(model.vertices(model.rest_state()))
-    rest = particles_of(model, [model.rest_state()])
-    for part, group in enumerate(particles_of(model, [body])):
+    rest = states_to_particles(model, [model.rest_state()])
+    for part, group in enumerate(states_to_particles(model, [body])):
         surface = points[part].surface.world(group)[0]
         distance = np.linalg.norm(surface[:, None] - meshes[part], axis=2).min(axis=1)
         assert distance.max() < 1e-9
@@ -50,7 +50,7 @@ def test_points_of_parts_equal_the_model(model: StitchedPuppet, points: tuple[Pa
         np.testing.assert_allclose(own, joints[points[part].joint_index], atol=1e-6)
     for edge, (parent, child) in enumerate(model.tree.edges):
         interface = model.interfaces[edge]
-        at_child = points[child].interfaces[edge].world(particles_of(model, [body])[child])[0]
+        at_child = points[child].interfaces[edge].world(states_to_particles(model, [body])[child])[0]
         np.testing.assert_allclose(at_child, meshes[child][interface.child_index])
         assert parent == model.tree.parents[child]
 
@@ -76,14 +76,14 @@ def test_normals_of_the_template_point_outward(model: StitchedPuppet) -> None:
 
 def test_judged_particles_survive_taking_and_joining(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> None:
     rng = np.random.default_rng(0)
-    group = Proposer(model, points).walk(copies(model, 6)[UPPER_LEG], WalkNoise(0.1, 0.3, 1.0, 1.0), rng)
+    group = Proposer(model, points).random_walk(copies(model, 6)[UPPER_LEG], WalkNoise(0.1, 0.3, 1.0, 1.0), rng)
     vertices = model.vertices(model.rest_state())
     grid = CloudGrid.build(vertices, vertex_normals(vertices, model.faces))
     targets = JointTargets(np.zeros((len(model.joint_names), 3)), np.ones(len(model.joint_names)))
-    whole = Judged.judge(points[UPPER_LEG], group, grid, targets)
+    whole = ScoredParticles.judge(points[UPPER_LEG], group, grid, targets)
     order = np.array([4, 0, 5, 1])
     again = whole.take(order[:2]).extend(whole.take(order[2:]))
-    direct = Judged.judge(points[UPPER_LEG], group.take(order), grid, targets)
+    direct = ScoredParticles.judge(points[UPPER_LEG], group.take(order), grid, targets)
     for name in ("distance", "mismatch", "pull"):
         np.testing.assert_allclose(getattr(again, name), getattr(direct, name))
     for edge, interface in direct.interfaces.items():
@@ -109,11 +109,11 @@ def test_neighbours_propose_parts_that_are_stitched_to_them(
     vertices = model.vertices(model.rest_state())
     grid = CloudGrid.build(vertices, vertex_normals(vertices, model.faces))
     none = JointTargets.none(model)
-    judged = [Judged.judge(p, group, grid, none) for p, group in zip(points, copies(model, 12), strict=True)]
+    judged = [ScoredParticles.judge(p, group, grid, none) for p, group in zip(points, copies(model, 12), strict=True)]
     proposer, noise = Proposer(model, points), WalkNoise(0.04, 0.25, 0.5, 0.3)
     new = proposer.propose(UPPER_LEG, judged, noise, 1.0, np.random.default_rng(0))
     assert len(new) == 12
-    moved = Judged.judge(points[UPPER_LEG], new, grid, none)
+    moved = ScoredParticles.judge(points[UPPER_LEG], new, grid, none)
     gaps = [
         np.linalg.norm(moved.interfaces[edge] - judged[other].interfaces[edge][:1], axis=2).mean(axis=1)
         for edge, other in (
@@ -129,18 +129,18 @@ def test_neighbours_propose_parts_that_are_stitched_to_them(
 
 def test_states_and_particles_are_inverse(model: StitchedPuppet) -> None:
     bodies = [model.sample(np.random.default_rng(seed)) for seed in range(3)]
-    back = state_of(model, particles_of(model, bodies), np.full(16, 2))
+    back = particles_to_state(model, states_to_particles(model, bodies), np.full(16, 2))
     for name in ("center", "rotation", "pose", "shape"):
         np.testing.assert_array_equal(getattr(back, name), getattr(bodies[2], name))
 
 
 def test_turning_around_twice_changes_places_back(model: StitchedPuppet) -> None:
     body = model.sample(np.random.default_rng(0))
-    once = turned_around(model, body)
+    once = flip_heading(model, body)
     hand, other = model.tree.index("left_hand"), model.tree.index("right_hand")
     np.testing.assert_array_equal(once.center[hand], body.center[other])
     np.testing.assert_allclose(once.rotation[0, :2, 0], -body.rotation[0, :2, 0])
-    twice = turned_around(model, once)
+    twice = flip_heading(model, once)
     np.testing.assert_allclose(twice.center, body.center)
     np.testing.assert_allclose(twice.rotation, body.rotation)
 
@@ -172,7 +172,7 @@ def test_body_is_placed_on_joints(model: StitchedPuppet) -> None:
     turn, shift = so3.exp(np.array([0.0, 0.0, 2.5])), np.array([3.0, 1.0, 0.5])
     goal = {name: turn @ at + shift for name, at in squatting(model).items()}
     targets = joint_targets(model, {name: (at[0], at[1], at[2], 1.0) for name, at in goal.items()})
-    body = body_from_joints(model, Refiner(model), targets)
+    body = body_from_joints(model, GaussNewton(model), targets)
     found = dict(zip(model.joint_names, model.joints(model.vertices(body)), strict=True))
     errors = {name: np.linalg.norm(found[name] - at) for name, at in goal.items()}
     assert max(errors.values()) < 0.08
@@ -191,7 +191,7 @@ def test_a_trunk_on_a_line_faces_where_the_limbs_say(model: StitchedPuppet) -> N
     rest = dict(zip(model.joint_names, model.joints(model.vertices(model.rest_state())), strict=True))
     goal = {name: at for name, at in goal.items() if name != "face"} | {name: turn @ rest[name] for name in spine}
     body = body_from_joints(
-        model, Refiner(model), joint_targets(model, {name: (*at, 1.0) for name, at in goal.items()})
+        model, GaussNewton(model), joint_targets(model, {name: (*at, 1.0) for name, at in goal.items()})
     )
     assert (body.rotation[0] @ [1, 0, 0]) @ (turn @ [1, 0, 0]) > 0.9
     with pytest.raises(InputError, match="on a line"):
@@ -206,7 +206,7 @@ def test_finish_draws_a_disturbed_body_to_the_surface_of_another_shape(model: St
     center = truth.center + rng.normal(0, 0.02, truth.center.shape)
     turned = so3.exp(rng.normal(0, 0.1, (16, 3))) @ truth.rotation
     start = BodyState(center, turned, np.zeros_like(truth.pose), np.zeros_like(truth.shape))
-    refined = Refiner(model).run(start, cloud, JointTargets.none(model), RefineWeights())
+    refined = GaussNewton(model).run(start, cloud, JointTargets.none(model), RefineWeights())
     before = np.linalg.norm(model.vertices(start) - vertices, axis=1).mean()
     after = np.linalg.norm(model.vertices(refined) - vertices, axis=1).mean()
     assert before > 0.02

@@ -4,12 +4,12 @@
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.segmentation.people import ExtractionSettings, extract_people
+from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import find_floor, find_wall
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
-SETTINGS = ExtractionSettings()
+SETTINGS = SegmentationSettings()
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def test_two_people_among_furniture_are_found_and_nothing_else(person: np.ndarra
     truth = np.concatenate([np.repeat([0, 1], len(person)), np.full(41000, -1)])
     order = rng.permutation(len(scene))
     scene, truth = scene[order], truth[order]
-    found = extract_people(scene, -scene, SETTINGS, np.array([0.0, -4.0, 1.0]))
+    found = segment_people(scene, -scene, SETTINGS, np.array([0.0, -4.0, 1.0]))
     assert len(found) == 2
     for cloud in found:
         whose = truth[cloud.rows]
@@ -53,22 +53,22 @@ def test_two_people_among_furniture_are_found_and_nothing_else(person: np.ndarra
         assert (whose == owner).sum() > 0.97 * (person[:, 2] > 0.1).sum()
         assert np.array_equal(cloud.points, scene[cloud.rows])
         assert cloud.normals is not None and np.array_equal(cloud.normals, -cloud.points)
-    again = extract_people(scene, None, SETTINGS, np.array([0.0, -4.0, 1.0]))
+    again = segment_people(scene, None, SETTINGS, np.array([0.0, -4.0, 1.0]))
     assert [cloud.points.tobytes() for cloud in again] == [cloud.points.tobytes() for cloud in found]
-    assert len(extract_people(scene, None, ExtractionSettings(people=1), np.array([0.0, -4.0, 1.0]))) == 1
+    assert len(segment_people(scene, None, SegmentationSettings(max_people=1), np.array([0.0, -4.0, 1.0]))) == 1
 
 
 def test_an_empty_room_holds_nobody() -> None:
     scene = room(np.random.default_rng(1))
-    assert extract_people(scene, None, SETTINGS, np.array([0.0, -4.0, 1.0])) == []
-    assert extract_people(scene, None, SETTINGS) == []
+    assert segment_people(scene, None, SETTINGS, np.array([0.0, -4.0, 1.0])) == []
+    assert segment_people(scene, None, SETTINGS) == []
 
 
 def test_a_person_alone_stays_whole_wherever_the_origin_is(person: np.ndarray) -> None:
     for place in (np.zeros(3), np.array([5e5, 5.5e6, 300.0])):
-        (cloud,) = extract_people(person + place, None, SETTINGS)
+        (cloud,) = segment_people(person + place, None, SETTINGS)
         assert len(cloud.rows) == len(person)
-        assert cloud.likeness > 0.8
+        assert cloud.score > 0.8
 
 
 def test_rings_far_away_stay_together(person: np.ndarray) -> None:
@@ -76,20 +76,20 @@ def test_rings_far_away_stay_together(person: np.ndarray) -> None:
     seen = person + place
     direction = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     ring = np.abs(np.degrees(direction[:, 2]) % 0.6 - 0.3) < 0.06
-    (cloud,) = extract_people(seen[ring], None, SETTINGS, np.zeros(3))
+    (cloud,) = segment_people(seen[ring], None, SETTINGS, np.zeros(3))
     assert len(cloud.rows) > 0.95 * ring.sum()
-    assert extract_people(seen[ring], None, ExtractionSettings(reach=8.0), np.zeros(3)) == []
+    assert segment_people(seen[ring], None, SegmentationSettings(reach=8.0), np.zeros(3)) == []
 
 
 def test_nothing_in_gives_nobody_and_wrong_shapes_are_refused(person: np.ndarray) -> None:
-    assert extract_people(np.empty((0, 3)), None, SETTINGS) == []
-    assert extract_people(np.full((500, 3), np.nan), None, SETTINGS) == []
-    assert extract_people(np.zeros((500, 3)), None, SETTINGS) == []
-    assert extract_people(person[:20], None, SETTINGS) == []
+    assert segment_people(np.empty((0, 3)), None, SETTINGS) == []
+    assert segment_people(np.full((500, 3), np.nan), None, SETTINGS) == []
+    assert segment_people(np.zeros((500, 3)), None, SETTINGS) == []
+    assert segment_people(person[:20], None, SETTINGS) == []
     with pytest.raises(InputError, match="shape"):
-        extract_people(person[:, :2], None, SETTINGS)
+        segment_people(person[:, :2], None, SETTINGS)
     with pytest.raises(InputError, match="normals"):
-        extract_people(person, person[:5], SETTINGS)
+        segment_people(person, person[:5], SETTINGS)
 
 
 def test_floor_is_the_level_plane_below_and_walls_are_larger_than_people(person: np.ndarray) -> None:

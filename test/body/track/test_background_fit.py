@@ -5,7 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from flowing_puppet_ros.body.track.background_fit import CHASE_NS, FEW, MOST_KEPT, Pursuit, Task
+from flowing_puppet_ros.body.track.background_fit import CATCH_UP_SPACING_NS, FEW, MAX_KEPT, BackgroundFit, Task
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 
 TENTH = 100_000_000
@@ -18,11 +18,11 @@ class _Notes:
         self.stamps: list[int] = []
         self.meanwhile = meanwhile
 
-    def step(self, points: Any, normals: Any, stamp: int, *_: Any) -> None:
+    def track_or_refit(self, points: Any, normals: Any, stamp: int, *_: Any) -> None:
         self.stamps.append(stamp)
         self.meanwhile()
 
-    def follow(self, points: Any, normals: Any, stamp: int, viewpoint: Any) -> None:
+    def track(self, points: Any, normals: Any, stamp: int, viewpoint: Any) -> None:
         self.stamps.append(stamp)
 
 
@@ -38,7 +38,7 @@ class _Later:
 
 
 def _led(clouds: int) -> list[int]:
-    pursuit, later = Pursuit(), _Later()
+    pursuit, later = BackgroundFit(), _Later()
 
     def meanwhile() -> None:
         for number in range(1, clouds + 1):
@@ -57,7 +57,7 @@ def test_a_body_is_led_evenly_through_what_was_kept_to_the_newest() -> None:
     assert _led(1) == [0, TENTH]
     for clouds in (5, 20, 100, 1000):
         stamps = _led(clouds)
-        assert stamps[-1] == clouds * TENTH and len(stamps) <= 1 + MOST_KEPT + FEW
+        assert stamps[-1] == clouds * TENTH and len(stamps) <= 1 + MAX_KEPT + FEW
         gaps = np.diff(stamps[:-1])
-        assert len(gaps) == 0 or gaps.min() >= CHASE_NS
+        assert len(gaps) == 0 or gaps.min() >= CATCH_UP_SPACING_NS
         assert len(gaps) < 2 or gaps.max() <= 2.5 * gaps.min(), stamps

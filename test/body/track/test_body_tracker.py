@@ -74,7 +74,7 @@ def test_a_walk_is_followed_without_searching(fitter: _KnowingFitter, person: Bo
     fitter.truth = _at(person, 0)
     for frame in range(6):
         truth = _at(person, frame)
-        fit = tracker.step(*_cloud(fitter.model, truth, frame), frame * FRAME)
+        fit = tracker.track_or_refit(*_cloud(fitter.model, truth, frame), frame * FRAME)
         assert _error(fitter, fit, truth) < 0.012
     assert tracker.counters == {"searched": 1, "tracked": 5}
 
@@ -86,7 +86,7 @@ def test_motion_goes_on_at_its_velocity(fitter: _KnowingFitter, person: BodyStat
     for tracker, frames in ((moving, (0, 0.2, 0.6, 1.2, 2.0, 3.0, 4.0)), (standing, (0, 0, 0, 0, 0, 0, 4.0))):
         for count, frame in enumerate(frames):
             truth = _at(person, frame, speed=0.25)
-            fit = tracker.step(*_cloud(fitter.model, truth, count), count * FRAME)
+            fit = tracker.track_or_refit(*_cloud(fitter.model, truth, count), count * FRAME)
         if tracker is moving:
             assert _error(fitter, fit, truth) < 0.015
     assert moving.counters["searched"] == 1
@@ -97,14 +97,14 @@ def test_a_lost_person_is_searched_for(fitter: _KnowingFitter, person: BodyState
     tracker = BodyTracker(fitter, SETTINGS)
     fitter.truth = person
     for frame in range(3):
-        tracker.step(*_cloud(fitter.model, person, frame), frame * FRAME)
+        tracker.track_or_refit(*_cloud(fitter.model, person, frame), frame * FRAME)
     elsewhere = replace(person, center=person.center + np.array([3.0, -2.0, 0.0]))
     fitter.truth = elsewhere
-    fit = tracker.step(*_cloud(fitter.model, elsewhere), 3 * FRAME)
+    fit = tracker.track_or_refit(*_cloud(fitter.model, elsewhere), 3 * FRAME)
     assert _error(fitter, fit, elsewhere) < 0.012
     assert tracker.counters["searched"] == 2
     # The jump is no velocity.
-    fit = tracker.step(*_cloud(fitter.model, elsewhere), 4 * FRAME)
+    fit = tracker.track_or_refit(*_cloud(fitter.model, elsewhere), 4 * FRAME)
     assert _error(fitter, fit, elsewhere) < 0.012
     assert tracker.counters["searched"] == 2
 
@@ -113,8 +113,8 @@ def test_a_lost_person_is_searched_for(fitter: _KnowingFitter, person: BodyState
 def test_time_that_jumps_back_starts_a_new_track(fitter: _KnowingFitter, person: BodyState, stamp: int) -> None:
     tracker = BodyTracker(fitter, SETTINGS)
     fitter.truth = person
-    tracker.step(*_cloud(fitter.model, person), 0)
-    tracker.step(*_cloud(fitter.model, person), stamp)
+    tracker.track_or_refit(*_cloud(fitter.model, person), 0)
+    tracker.track_or_refit(*_cloud(fitter.model, person), stamp)
     assert tracker.counters["searched"] == 2
 
 
@@ -122,9 +122,9 @@ def test_a_person_is_found_again_after_a_gap(fitter: _KnowingFitter, person: Bod
     """As after the first search of a live stream: seconds later, somewhere else, in about the same pose."""
     tracker = BodyTracker(fitter, SETTINGS)
     fitter.truth = person
-    tracker.step(*_cloud(fitter.model, person), 0)
+    tracker.track_or_refit(*_cloud(fitter.model, person), 0)
     later = _at(replace(person, center=person.center + np.array([0.5, -1.5, 0.0])), 4)
-    fit = tracker.step(*_cloud(fitter.model, later), 80 * FRAME)
+    fit = tracker.track_or_refit(*_cloud(fitter.model, later), 80 * FRAME)
     assert _error(fitter, fit, later) < 0.012
     assert tracker.counters["searched"] == 1
 
@@ -133,7 +133,7 @@ def test_a_wrong_search_does_not_replace_a_better_track(fitter: _KnowingFitter, 
     tracker = BodyTracker(fitter, BodyTrackerSettings(track_points=1500, track_lost_ratio=1.0, track_lost_distance=0.0))
     fitter.truth = person
     for frame in range(4):
-        fit = tracker.step(*_cloud(fitter.model, person, frame, noise=0.002 * frame), frame * FRAME)
+        fit = tracker.track_or_refit(*_cloud(fitter.model, person, frame, noise=0.002 * frame), frame * FRAME)
         fitter.truth = _at(person, 30)
         assert _error(fitter, fit, person) < 0.015
     assert tracker.counters["searched"] > 1
@@ -150,7 +150,7 @@ def test_shape_is_learned_over_one_sided_frames(fitter: _KnowingFitter, person: 
         eye = middle + 3 * np.array([np.cos(angle), np.sin(angle), 0.0])
         points, normals = _cloud(model, person, frame)
         near = ((eye - points) * normals).sum(axis=1) > 0
-        fit = tracker.step(points[near], normals[near], frame * FRAME, eye)
+        fit = tracker.track_or_refit(points[near], normals[near], frame * FRAME, eye)
         shapes.append(fit.state.shape[0])
     error = np.linalg.norm(np.array(shapes)[:, :3] - person.shape[0, :3], axis=1)
     assert error[-1] < 0.5 * error[0]
@@ -163,7 +163,7 @@ def test_the_same_clouds_give_the_same_bytes(fitter: _KnowingFitter, person: Bod
         tracker = BodyTracker(fitter, SETTINGS)
         fitter.truth = person
         for frame in range(3):
-            fit = tracker.step(*_cloud(fitter.model, _at(person, frame), frame), frame * FRAME)
+            fit = tracker.track_or_refit(*_cloud(fitter.model, _at(person, frame), frame), frame * FRAME)
         return fit.vertices.tobytes()
 
     assert run() == run()
@@ -178,10 +178,10 @@ def test_a_bad_cloud_is_named_and_the_track_goes_on(
     tracker = BodyTracker(fitter, SETTINGS)
     fitter.truth = person
     points, normals = _cloud(fitter.model, person)
-    tracker.step(points, normals, 0)
+    tracker.track_or_refit(points, normals, 0)
     with pytest.raises(InputError):
-        tracker.step(spoil(points), None, FRAME)
-    tracker.step(points, normals, 2 * FRAME)
+        tracker.track_or_refit(spoil(points), None, FRAME)
+    tracker.track_or_refit(points, normals, 2 * FRAME)
     assert tracker.counters == {"searched": 1, "tracked": 1}
 
 
@@ -192,5 +192,5 @@ def test_clouds_without_normals_are_tracked(fitter: _KnowingFitter, person: Body
     for frame in range(3):
         truth = _at(person, frame)
         scan = whole_scan(Scene(model.vertices(truth), model.faces), np.random.default_rng(frame), 1500, noise=0.003)
-        fit = tracker.step(scan.points, None, frame * FRAME)
+        fit = tracker.track_or_refit(scan.points, None, frame * FRAME)
         assert _error(fitter, fit, truth) < 0.015

@@ -11,7 +11,7 @@ import pytest
 
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.evaluate.image.pcp_methods import DETECTOR, METHODS
-from flowing_puppet_ros.image.formats.stickmen import sticks_of, write_sticks
+from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints, write_sticks
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 MODEL = DeformableStructures.load()
@@ -35,7 +35,7 @@ def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.Captur
     poses, truth = poses_file(tmp_path / "poses.json", 14.0), tmp_path / form
     people = [np.column_stack([JOINTS, np.ones(len(JOINTS))]).tolist()]
     if form == "sticks.txt":
-        write_sticks(truth, {k: [sticks_of(MODEL.joint_names, JOINTS)] for k in (0, 1)})
+        write_sticks(truth, {k: [sticks_from_joints(MODEL.joint_names, JOINTS)] for k in (0, 1)})
     elif form == "keypoints.json":
         truth.write_text(json.dumps({"joint_names": MODEL.joint_names, "frames": {"0": people, "1": people}}))
     else:
@@ -51,7 +51,7 @@ def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.Captur
 def test_one_command_measures_every_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for number in (1, 2):
         assert cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((90, 100, 3), 60 * number, np.uint8))
-    write_sticks(tmp_path / "sticks.txt", {k: [sticks_of(MODEL.joint_names, JOINTS / 3)] for k in (1, 2)})
+    write_sticks(tmp_path / "sticks.txt", {k: [sticks_from_joints(MODEL.joint_names, JOINTS / 3)] for k in (1, 2)})
     out = tmp_path / "figures"
     flags = ["--truth", str(tmp_path / "sticks.txt"), "--out", str(out), "--particles", "8", "--iterations", "1"]
     assert main(["evaluate", "pcp", str(tmp_path), *flags]) == 0
@@ -72,7 +72,7 @@ def test_one_command_measures_every_method(tmp_path: Path, capsys: pytest.Captur
 @pytest.mark.parametrize("case", ["no truth", "no poses", "broken", "strangers", "pixels", "nobody", "no image"])
 def test_unusable_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str) -> None:
     truth = tmp_path / "sticks.txt"
-    write_sticks(truth, {k: [sticks_of(MODEL.joint_names, JOINTS)] for k in (0, 1)})
+    write_sticks(truth, {k: [sticks_from_joints(MODEL.joint_names, JOINTS)] for k in (0, 1)})
     source, flags = poses_file(tmp_path / "poses.json", 0.0), ["--truth", str(truth)]
     if case == "no truth":
         flags = []
@@ -81,7 +81,7 @@ def test_unusable_input_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFi
     if case == "broken":
         source.write_text('{"frames": [{}], "joint_names": []}')
     if case == "strangers":
-        write_sticks(truth, {77: [sticks_of(MODEL.joint_names, JOINTS)]})
+        write_sticks(truth, {77: [sticks_from_joints(MODEL.joint_names, JOINTS)]})
     if case == "pixels":
         flags += ["--pixels", "0"]
     if case == "nobody":

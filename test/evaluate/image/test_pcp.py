@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.image.pcp import PosedSticks, Tally, correct_parts, match_people
 from flowing_puppet_ros.evaluate.image.pcp_truth import images_of, read_truth
-from flowing_puppet_ros.image.formats.stickmen import STICKS, sticks_of, write_sticks
+from flowing_puppet_ros.image.formats.stickmen import STICKS, sticks_from_joints, write_sticks
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 MODEL = DeformableStructures.load()
-TRUTH = sticks_of(MODEL.joint_names, MODEL.likely().joints * 150 + 200)
+TRUTH = sticks_from_joints(MODEL.joint_names, MODEL.likely().joints * 150 + 200)
 LENGTH = np.linalg.norm(TRUTH[:, 1] - TRUTH[:, 0], axis=1)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.hands import HandDetectors, HandField, HandMaps, hand_score, mirrored
-from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood, Scene
+from flowing_puppet_ros.evidence.image.likelihood import ImageEvidence, PartLikelihood
 from flowing_puppet_ros.learn.likelihood.samples import Posed
 from flowing_puppet_ros.learn.thesis_loop.hands import HandSettings, learn
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -29,7 +29,7 @@ def arm(angle: float, size: int = 300) -> np.ndarray:
     return image
 
 
-def scene(image: np.ndarray) -> Scene:
+def scene(image: np.ndarray) -> ImageEvidence:
     return PartLikelihood.load().scene(image)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.contour import PLACES, describe, kind_of, on_right
-from flowing_puppet_ros.evidence.image.likelihood import TERMS_OF, PartLikelihood, Scene, hand_of
+from flowing_puppet_ros.evidence.image.likelihood import TERMS_OF, ImageEvidence, PartLikelihood, hand_of
 from flowing_puppet_ros.evidence.image.outline import mirrored_order
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PuppetShape
@@ -43,7 +43,7 @@ def image(puppet: PuppetShape) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def scene(likelihood: PartLikelihood, puppet: PuppetShape, image: np.ndarray) -> Scene:
+def scene(likelihood: PartLikelihood, puppet: PuppetShape, image: np.ndarray) -> ImageEvidence:
     return likelihood.scene(image).with_torso(*puppet.contours[:2])
 
 
@@ -66,7 +66,7 @@ def test_saved_and_loaded_it_is_the_same(likelihood: PartLikelihood, puppet: Pup
 
 
 @pytest.mark.parametrize("part", UPPER)
-def test_right_contours_beat_moved_ones(scene: Scene, puppet: PuppetShape, part: int) -> None:
+def test_right_contours_beat_moved_ones(scene: ImageEvidence, puppet: PuppetShape, part: int) -> None:
     rng = np.random.default_rng(part)
     shifts = rng.choice([-1, 1], (40, 1, 2)) * rng.uniform(8, 40, (40, 1, 2))
     contours = np.concatenate([puppet.contours[part][None], puppet.contours[part] + shifts])
@@ -74,7 +74,7 @@ def test_right_contours_beat_moved_ones(scene: Scene, puppet: PuppetShape, part:
     assert np.sum(scores[1:] > scores[0]) <= 4
 
 
-def test_a_batch_is_its_members(scene: Scene, puppet: PuppetShape) -> None:
+def test_a_batch_is_its_members(scene: ImageEvidence, puppet: PuppetShape) -> None:
     scales = np.array([60.0, 130.0, 131.0, 290.0])
     contours = puppet.contours[4] + np.arange(4)[:, None, None]
     together = scene.log_likelihood(4, contours, scales)
@@ -84,7 +84,7 @@ def test_a_batch_is_its_members(scene: Scene, puppet: PuppetShape) -> None:
 
 
 def test_the_picture_in_a_mirror_has_the_other_limb(
-    likelihood: PartLikelihood, scene: Scene, puppet: PuppetShape, image: np.ndarray
+    likelihood: PartLikelihood, scene: ImageEvidence, puppet: PuppetShape, image: np.ndarray
 ) -> None:
     def mirrored(contour: np.ndarray) -> np.ndarray:
         return mirrored_order(contour) * (-1, 1) + (SIZE[0] - 1, 0)
@@ -97,7 +97,7 @@ def test_the_picture_in_a_mirror_has_the_other_limb(
         np.testing.assert_allclose(again, found, atol=0.02)
 
 
-def test_a_person_from_behind_has_the_same_contours(scene: Scene, puppet: PuppetShape) -> None:
+def test_a_person_from_behind_has_the_same_contours(scene: ImageEvidence, puppet: PuppetShape) -> None:
     """From behind the right arm is drawn as the left one is from the front, with mirrored points."""
     left = puppet.contours[5]
     as_right = mirrored_order(left)
@@ -109,7 +109,7 @@ def test_a_person_from_behind_has_the_same_contours(scene: Scene, puppet: Puppet
 
 
 @pytest.mark.parametrize("part", UPPER)
-def test_what_is_out_of_sight_says_nothing(scene: Scene, puppet: PuppetShape, part: int) -> None:
+def test_what_is_out_of_sight_says_nothing(scene: ImageEvidence, puppet: PuppetShape, part: int) -> None:
     contours = puppet.contours[part] + np.array([[5000, 0], [0, -9e6], [1e300, 3]])[:, None]
     terms = scene.terms(part, contours, 130.0)
     known = scene.likelihood.contour.filters[kind_of(scene.names[part])]
@@ -122,7 +122,7 @@ def test_what_is_out_of_sight_says_nothing(scene: Scene, puppet: PuppetShape, pa
     )
 
 
-def test_half_out_of_sight_is_between(scene: Scene, puppet: PuppetShape) -> None:
+def test_half_out_of_sight_is_between(scene: ImageEvidence, puppet: PuppetShape) -> None:
     contour = puppet.contours[0]
     half = contour - (contour[:, 0].mean(), 0)
     assert np.isfinite(scene.log_likelihood(0, half[None], 130.0)).all()
@@ -131,7 +131,9 @@ def test_half_out_of_sight_is_between(scene: Scene, puppet: PuppetShape) -> None
 
 
 @pytest.mark.parametrize("part", range(10))
-def test_broken_contours_are_impossible_and_spoil_no_others(scene: Scene, puppet: PuppetShape, part: int) -> None:
+def test_broken_contours_are_impossible_and_spoil_no_others(
+    scene: ImageEvidence, puppet: PuppetShape, part: int
+) -> None:
     contours = np.repeat(puppet.contours[part][None], 4, axis=0)
     contours[1, 5, 0], contours[2, 0, 1] = np.nan, np.inf
     scores = scene.log_likelihood(part, contours, np.array([130.0, 130.0, 130.0, np.nan]))
@@ -139,7 +141,7 @@ def test_broken_contours_are_impossible_and_spoil_no_others(scene: Scene, puppet
     assert np.all(scene.log_likelihood(part, contours[:1], 0.0) == -np.inf)
 
 
-def test_legs_say_nothing(scene: Scene, puppet: PuppetShape) -> None:
+def test_legs_say_nothing(scene: ImageEvidence, puppet: PuppetShape) -> None:
     for part in range(6, 10):
         assert scene.log_likelihood(part, puppet.contours[part][None], 130.0)[0] == 0.0
 
@@ -154,7 +156,7 @@ def test_grey_and_tiny_images(likelihood: PartLikelihood, puppet: PuppetShape, s
     assert hands.shape == shape[:2] and hands.min() >= 0 and hands.sum() == pytest.approx(1.0)
 
 
-def test_hand_map_finds_bare_forearms_and_not_the_face(scene: Scene, puppet: PuppetShape) -> None:
+def test_hand_map_finds_bare_forearms_and_not_the_face(scene: ImageEvidence, puppet: PuppetShape) -> None:
     hands = scene.hand_map(130.0)
     weight = {}
     for part in (0, 1, 4, 5):
@@ -165,7 +167,7 @@ def test_hand_map_finds_bare_forearms_and_not_the_face(scene: Scene, puppet: Pup
 
 
 def test_hand_map_of_an_enlarged_picture_is_the_enlarged_map(
-    likelihood: PartLikelihood, scene: Scene, puppet: PuppetShape, image: np.ndarray
+    likelihood: PartLikelihood, scene: ImageEvidence, puppet: PuppetShape, image: np.ndarray
 ) -> None:
     large = likelihood.scene(cv2.resize(image, None, fx=5, fy=5, interpolation=cv2.INTER_NEAREST))
     hands = large.with_torso(*(5 * contour + 2 for contour in puppet.contours[:2])).hand_map(650.0)

@@ -9,19 +9,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flowing_puppet_ros.image.arms.evidence import Eyes, Sight
-from flowing_puppet_ros.image.arms.hypotheses import DISTINCT, KEPT, ArmFilter, ArmHistory, probability_right
-from flowing_puppet_ros.image.arms.viterbi import ArmHypotheses, PathSettings, best_path
-from flowing_puppet_ros.image.detector.detection import Place
+from flowing_puppet_ros.image.arms.evidence import ArmEvidence, ArmEvidenceModel
+from flowing_puppet_ros.image.arms.hypotheses import MAX_KEPT, MIN_DISTANCE, ArmFilter, ArmSmoother, joint_correctness
+from flowing_puppet_ros.image.arms.viterbi import ArmHypotheses, PathSettings, max_marginals
+from flowing_puppet_ros.image.detector.detection import PersonCandidate
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.tracking.propagation import Grid
+from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings
-from flowing_puppet_ros.image.video.offline_smoother import Clip
-from flowing_puppet_ros.image.video.tracking_by_detection import DetectionSettings, VideoTracker
+from flowing_puppet_ros.image.video.offline_smoother import OfflineSmoother
+from flowing_puppet_ros.image.video.tracking_by_detection import DetectingTracker, DetectionSettings
 from test.helpers.drawn_people import NAMES, CapsuleModel, draw, pose, tracker
 
 SETTINGS = PathSettings(evidence_weight=0.0)
-GRID = Grid((64, 48), (64, 48))
+GRID = ImageScale((64, 48), (64, 48))
 
 
 def path_cost(arms: list[ArmHypotheses], chosen: tuple[int, ...], width: float) -> float:
@@ -44,7 +44,7 @@ def test_max_marginals_are_those_of_brute_force(seed: int, images: int) -> None:
         shape = (count, 2, 2)
         arms.append(ArmHypotheses(rng.uniform(0, 60, shape), rng.normal(0, 2, count), rng.normal(0, 5, shape)))
     every = {chosen: path_cost(arms, chosen, 30.0) for chosen in product(*(range(len(arm.score)) for arm in arms))}
-    for t, cost in enumerate(best_path(arms, 30.0, SETTINGS)):
+    for t, cost in enumerate(max_marginals(arms, 30.0, SETTINGS)):
         for k in range(len(arms[t].score)):
             expected = min(value for chosen, value in every.items() if chosen[t] == k)
             assert cost[k] == pytest.approx(expected)
@@ -66,9 +66,9 @@ class Guesser:
         return Keypoints(NAMES, self.joints, np.full(len(self.joints), self.confidence))
 
     @property
-    def place(self) -> Place:
+    def place(self) -> PersonCandidate:
         neck, face = (self.joints[NAMES.index(name)] for name in ("neck", "face"))
-        return Place(neck, face, self.scale, 2.0)
+        return PersonCandidate(neck, face, self.scale, 2.0)
 
     def arms(self, side: str, count: int) -> np.ndarray:
         return self.guesses[side][:count]
@@ -80,8 +80,8 @@ class Guesser:
         return np.asarray((self.scores - 0.02 * distance).max(axis=1))
 
 
-def sight(guesser: Guesser | None, joints: np.ndarray) -> Sight:
-    return Sight(CapsuleModel(), joints, 160.0, "front", guesser, None)  # type: ignore[arg-type]
+def sight(guesser: Guesser | None, joints: np.ndarray) -> ArmEvidence:
+    return ArmEvidence(CapsuleModel(), joints, 160.0, "front", guesser, None)  # type: ignore[arg-type]
 
 
 def still() -> tuple[np.ndarray, np.ndarray]:
@@ -89,21 +89,21 @@ def still() -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_better_an_arm_and_its_pose_fit_the_surer_they_are() -> None:
-    poor, good, better = (probability_right(*scores) for scores in ((-6.0, 1.0), (-1.0, 1.0), (-1.0, 4.0)))
+    poor, good, better = (joint_correctness(*scores) for scores in ((-6.0, 1.0), (-1.0, 1.0), (-1.0, 4.0)))
     assert ((poor > 0) & (poor < good) & (good < better) & (better < 1)).all()
-    assert np.isnan(probability_right(0.0, sight(None, np.zeros((15, 2))).pose_score)).all()
+    assert np.isnan(joint_correctness(0.0, sight(None, np.zeros((15, 2))).pose_score)).all()
 
 
 def test_a_guess_that_one_image_lacks_is_carried_into_it() -> None:
     joints = np.full((15, 2), 20.0)
     true, false = np.array([[20.0, 20.0], [30.0, 30.0]]), np.array([[20.0, 20.0], [10.0, 40.0]])
-    history = ArmHistory(SETTINGS)
+    history = ArmSmoother(SETTINGS)
     for t in range(3):
         guesses = np.array([false]) if t == 1 else np.array([true, false])
         both = {"left": guesses, "right": guesses}
         scores = np.array([-0.1]) if t == 1 else np.array([0.0, -3.0])
         history.add(sight(Guesser(joints, both, scores), joints), still() if t else None, GRID)
-    arm = history.resolved(40.0)["left"]
+    arm = history.resolve(40.0)["left"]
     np.testing.assert_allclose(arm.places, [true] * 3)
     assert ((arm.sure >= 0.5) & (arm.sure < 1)).all()
 
@@ -112,14 +112,14 @@ def test_hypotheses_move_with_the_flow() -> None:
     joints = np.full((15, 2), 20.0)
     start = np.array([[20.0, 20.0], [24.0, 28.0]])
     forth = np.full((48, 64, 2), (3.0, 1.0), np.float32)
-    history = ArmHistory(SETTINGS)
+    history = ArmSmoother(SETTINGS)
     for t in range(3):
         guesses = np.array([start + t * np.array([3.0, 1.0])])
         history.add(
             sight(Guesser(joints, {"left": guesses, "right": guesses}, np.zeros(1)), joints),
             (forth, -forth) if t else None, GRID,
         )  # fmt: skip
-    arm = history.resolved(40.0)["right"]
+    arm = history.resolve(40.0)["right"]
     np.testing.assert_allclose(arm.motion[:2], np.full((2, 2, 2), (3.0, 1.0)), atol=1e-5)
     np.testing.assert_allclose(arm.places[2], start + np.array([6.0, 2.0]))
 
@@ -127,13 +127,13 @@ def test_hypotheses_move_with_the_flow() -> None:
 def test_an_image_without_a_detection_takes_the_tracked_arm_or_the_carried_one() -> None:
     joints = np.full((15, 2), 5.0)
     true = np.array([[20.0, 20.0], [30.0, 30.0]])
-    history = ArmHistory(SETTINGS)
+    history = ArmSmoother(SETTINGS)
     history.add(sight(Guesser(joints, {"left": true[None], "right": true[None]}, np.zeros(1)), joints), None, GRID)
     history.add(sight(None, joints), still(), GRID)
-    np.testing.assert_allclose(history.resolved(40.0)["left"].places, [true, true])
-    alone = ArmHistory(SETTINGS)
+    np.testing.assert_allclose(history.resolve(40.0)["left"].places, [true, true])
+    alone = ArmSmoother(SETTINGS)
     alone.add(sight(None, joints), None, GRID)
-    np.testing.assert_allclose(alone.resolved(40.0)["left"].places, np.full((1, 2, 2), 5.0))
+    np.testing.assert_allclose(alone.resolve(40.0)["left"].places, np.full((1, 2, 2), 5.0))
 
 
 class Finder:
@@ -142,12 +142,12 @@ class Finder:
     def __init__(self) -> None:
         self.images = self.searches = 0
 
-    def candidates(self, image: np.ndarray) -> list[Place]:
+    def propose(self, image: np.ndarray) -> list[PersonCandidate]:
         self.searches += 1
         truth = pose(self.images)
-        return [Place(truth[NAMES.index("neck")], truth[NAMES.index("face")], 50.0, 3.0)]
+        return [PersonCandidate(truth[NAMES.index("neck")], truth[NAMES.index("face")], 50.0, 3.0)]
 
-    def at(self, image: np.ndarray, places: list[Place]) -> list[Guesser]:
+    def detect_at(self, image: np.ndarray, places: list[PersonCandidate]) -> list[Guesser]:
         neck = pose(self.images)[NAMES.index("neck")]
         assert len(places) == 1 and np.linalg.norm(places[0].neck - neck) < 20
         return self.found()
@@ -182,32 +182,32 @@ class NoEvidence:
         return np.ones((1, 1))
 
 
-EYES = Eyes(CapsuleModel(), NoEvidence())  # type: ignore[arg-type]
+EYES = ArmEvidenceModel(CapsuleModel(), NoEvidence())  # type: ignore[arg-type]
 
 
 def test_a_clip_joins_the_guesses_that_move_with_the_person() -> None:
-    video = VideoTracker(tracker(), Finder(), EYES, DetectionSettings())  # type: ignore[arg-type]
+    video = DetectingTracker(tracker(), Finder(), EYES, DetectionSettings())  # type: ignore[arg-type]
     path = PathSettings()
-    clip = Clip(CapsuleModel(), SmoothingSettings(), path)  # type: ignore[arg-type]
+    clip = OfflineSmoother(CapsuleModel(), SmoothingSettings(), path)  # type: ignore[arg-type]
     for t in range(9):
         image = draw(pose(t))
         result, found = video.step(image, t)
-        clip.add(result, video.sights(image, result, found))
+        clip.add(result, video.arm_evidence(image, result, found))
     wrist = NAMES.index("left_wrist")
     for t, people in enumerate(clip.people()):
         (puppet,) = people
         assert np.linalg.norm(puppet.joints[wrist] - pose(t)[wrist]) < 6, t
-        told = [probability_right(score, Guesser.score)[1] for score in (-4.0, 0.0)]
+        told = [joint_correctness(score, Guesser.score)[1] for score in (-4.0, 0.0)]
         assert told[0] < puppet.confidence[wrist] <= told[1], t
 
 
 def test_between_runs_of_the_detector_people_are_carried() -> None:
     finder = Finder()
     settings = DetectionSettings(detect_every=4)
-    video = VideoTracker(tracker(), finder, EYES, settings)  # type: ignore[arg-type]
+    video = DetectingTracker(tracker(), finder, EYES, settings)  # type: ignore[arg-type]
     for t in range(6):
         result, found = video.step(draw(pose(0)), t)
-        sights = video.sights(draw(pose(0)), result, found)
+        sights = video.arm_evidence(draw(pose(0)), result, found)
         assert [puppet.id for puppet in result.puppets] == ["a1"] == list(sights)
         assert (sights["a1"].detection is None) == (t % 4 > 0)
     assert finder.images == 2
@@ -215,7 +215,7 @@ def test_between_runs_of_the_detector_people_are_carried() -> None:
 
 def test_live_arms_follow_the_guesses_that_move_with_the_person() -> None:
     finder = Finder()
-    video = VideoTracker(tracker(), finder, EYES, DetectionSettings())  # type: ignore[arg-type]
+    video = DetectingTracker(tracker(), finder, EYES, DetectionSettings())  # type: ignore[arg-type]
     wrist = NAMES.index("left_wrist")
     for t in range(9):
         result, _ = video.step(draw(pose(t)), t)
@@ -225,7 +225,7 @@ def test_live_arms_follow_the_guesses_that_move_with_the_person() -> None:
 def test_live_only_the_place_of_a_known_person_is_looked_at_between_searches() -> None:
     finder = Finder()
     settings = DetectionSettings(renew_every=5)
-    video = VideoTracker(tracker(), finder, EYES, settings)  # type: ignore[arg-type]
+    video = DetectingTracker(tracker(), finder, EYES, settings)  # type: ignore[arg-type]
     searches = []
     for t in range(11):
         video.step(draw(pose(t)), t)
@@ -235,7 +235,7 @@ def test_live_only_the_place_of_a_known_person_is_looked_at_between_searches() -
 
 def test_live_a_cut_makes_it_search_anew_and_nobody_is_left_behind() -> None:
     finder = Finder()
-    video = VideoTracker(tracker(), finder, EYES, DetectionSettings())  # type: ignore[arg-type]
+    video = DetectingTracker(tracker(), finder, EYES, DetectionSettings())  # type: ignore[arg-type]
     for t in range(8):
         before, _ = video.step(draw(pose(t)), t)
     assert finder.searches == 5
@@ -253,19 +253,19 @@ def test_a_filter_agrees_with_the_best_path_that_ends_now() -> None:
     for t in range(5):
         guesses = rng.uniform(10, 40, (3, 2, 2))
         person = sight(Guesser(joints, {"left": guesses, "right": guesses}, rng.normal(0, 0.3, 3)), joints)
-        arms.carry(still() if t else None, GRID)
+        arms.propagate(still() if t else None, GRID)
         found, right = arms.step(person)["left"]
         if t:
             before: list[np.ndarray] = []
-            for k in np.argsort(best_path(history, person.width, SETTINGS)[-1], kind="stable"):
+            for k in np.argsort(max_marginals(history, person.width, SETTINGS)[-1], kind="stable"):
                 place = history[-1].places[k]
-                if len(before) < KEPT and all(
-                    np.hypot(*(place - b).T).max() >= DISTINCT * person.width for b in before
+                if len(before) < MAX_KEPT and all(
+                    np.hypot(*(place - b).T).max() >= MIN_DISTANCE * person.width for b in before
                 ):
                     before.append(place)
             guesses = np.concatenate([guesses, before])
-        history.append(ArmHypotheses(guesses, person.judged("left", guesses, SETTINGS), np.zeros_like(guesses)))
-        cost = best_path(history, person.width, SETTINGS)[-1]
+        history.append(ArmHypotheses(guesses, person.score("left", guesses, SETTINGS), np.zeros_like(guesses)))
+        cost = max_marginals(history, person.width, SETTINGS)[-1]
         np.testing.assert_allclose(found, guesses[cost.argmin()])
         assert ((right > 0.0) & (right < 1.0)).all()
 
@@ -280,5 +280,5 @@ def test_a_filter_is_carried_through_images_without_a_look() -> None:
         person = sight(Guesser(joints, {"left": guesses, "right": guesses}, scores), joints)
         found, _ = arms.step(person)["right"]
         for _image in range(2):
-            arms.carry((forth, -forth), GRID)
+            arms.propagate((forth, -forth), GRID)
     np.testing.assert_allclose(found, start + np.array([6.0, 0.0]), atol=1e-5)

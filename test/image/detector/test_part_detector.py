@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.region import RegionMap
-from flowing_puppet_ros.image.detector.detection import JOINTS, PersonDetection, Place
+from flowing_puppet_ros.image.detector.detection import JOINTS, PersonCandidate, PersonDetection
 from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
 from flowing_puppet_ros.image.detector.part_filters import (
     COLUMNS,
@@ -27,8 +27,15 @@ from flowing_puppet_ros.image.detector.part_filters import (
     window_at,
 )
 from flowing_puppet_ros.image.detector.proposals import propose
-from flowing_puppet_ros.image.detector.root_filters import RootFilters, level, overlap, pyramid, respond, suppress
-from flowing_puppet_ros.image.detector.skin_features import skin_measures
+from flowing_puppet_ros.image.detector.root_filters import (
+    RootFilters,
+    correlate,
+    make_level,
+    non_max_suppression,
+    pyramid,
+    window_iou,
+)
+from flowing_puppet_ros.image.detector.skin_features import skin_features
 from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
@@ -131,10 +138,10 @@ def test_people_are_reported_once_and_surest_first(detector: PartDetector) -> No
 
 def test_a_pose_is_found_again_where_it_was_found(detector: PartDetector, person: PersonDetection) -> None:
     image, _, _ = painted.picture(np.random.default_rng(3), 40.0)
-    places = detector.candidates(image, ANYBODY)
+    places = detector.propose(image, ANYBODY)
     assert len(places) > 1
     nearest = min(places, key=lambda place: float(np.linalg.norm(place.neck - person.neck)))
-    (again,) = detector.at(image, [nearest], ANYBODY)
+    (again,) = detector.detect_at(image, [nearest], ANYBODY)
     assert np.linalg.norm(again.neck - person.neck) < 0.5 * person.scale
     assert again.scale == pytest.approx(nearest.scale)
     assert again.confidence == pytest.approx(1 / (1 + np.exp(-nearest.log_odds)))
@@ -142,35 +149,35 @@ def test_a_pose_is_found_again_where_it_was_found(detector: PartDetector, person
 
 def test_nobody_is_seen_at_a_place_whose_pose_scores_too_little(detector: PartDetector) -> None:
     image, _, _ = painted.picture(np.random.default_rng(3), 40.0)
-    place = detector.candidates(image, ANYBODY)[0]
-    score = detector.at(image, [place], ANYBODY)[0].pose.score
-    supposed = [replace(place, least=score - 0.1), replace(place, least=score + 0.1)]
-    assert len(detector.at(image, supposed, ANYBODY)) == 1
+    place = detector.propose(image, ANYBODY)[0]
+    score = detector.detect_at(image, [place], ANYBODY)[0].pose.score
+    supposed = [replace(place, min_score=score - 0.1), replace(place, min_score=score + 0.1)]
+    assert len(detector.detect_at(image, supposed, ANYBODY)) == 1
 
 
 def test_places_of_a_large_image_are_in_its_pixels(detector: PartDetector) -> None:
     image = painted.picture(np.random.default_rng(3), 40.0)[0]
     large = cv2.resize(image, None, fx=4, fy=4, interpolation=cv2.INTER_LINEAR)
-    place = max(detector.candidates(large, ANYBODY), key=lambda one: one.log_odds)
+    place = max(detector.propose(large, ANYBODY), key=lambda one: one.log_odds)
     assert (place.neck < np.array(large.shape[1::-1]) * 1.1).all()
-    (found,) = detector.at(large, [place], ANYBODY)
+    (found,) = detector.detect_at(large, [place], ANYBODY)
     assert np.linalg.norm(found.neck - place.neck) < 0.8 * place.scale
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (20, 300, 3)])
 def test_too_small_an_image_has_no_places(detector: PartDetector, shape: tuple[int, ...]) -> None:
     image = np.zeros(shape, np.uint8)
-    assert detector.candidates(image) == []
-    assert detector.at(image, [Place(np.zeros(2), np.array([0.0, -20.0]), 40.0, 0.0)]) == []
+    assert detector.propose(image) == []
+    assert detector.detect_at(image, [PersonCandidate(np.zeros(2), np.array([0.0, -20.0]), 40.0, 0.0)]) == []
 
 
 def test_skin_is_measured_on_face_around_it_and_on_the_chest() -> None:
     values = np.zeros((100, 100))
     values[15:26, 45:56] = 2.0  # the face
     values[60:, :] = 1.0
-    measures = skin_measures(RegionMap.of(values), np.array([50.0, 45.0]), np.array([50.0, 20.0]), 25.0)
+    measures = skin_features(RegionMap.of(values), np.array([50.0, 45.0]), np.array([50.0, 20.0]), 25.0)
     assert measures[0] == pytest.approx(2.0) and 1.0 < measures[1] < 2.0 and 0.1 < measures[2] < 0.9
-    assert (skin_measures(RegionMap.of(values), np.full(2, 900.0), np.full(2, 900.0), 25.0) == 0.0).all()
+    assert (skin_features(RegionMap.of(values), np.full(2, 900.0), np.full(2, 900.0), 25.0) == 0.0).all()
 
 
 @pytest.mark.parametrize("lost", [("right_shoulder", "left_shoulder"), ("neck", "face")])
@@ -239,13 +246,13 @@ def test_responses_are_correlations() -> None:
     rng = np.random.default_rng(1)
     features = rng.normal(size=(7, 8, 4)).astype(np.float32)
     filters = rng.normal(size=(3, 3, 2, 4)).astype(np.float32)
-    got = respond(features, filters)
+    got = correlate(features, filters)
     assert got.shape == (5, 7, 3)
     for row, column, k in np.ndindex(got.shape):
         assert got[row, column, k] == pytest.approx(
             (features[row : row + 3, column : column + 2] * filters[k]).sum(), abs=1e-4
         )
-    assert respond(features[:2], filters).shape == (0, 7, 3)
+    assert correlate(features[:2], filters).shape == (0, 7, 3)
 
 
 def test_levels_cover_the_scales() -> None:
@@ -280,16 +287,16 @@ def test_windows_beyond_the_image_are_marked() -> None:
 def test_overlap_of_windows_and_suppression(detector: PartDetector) -> None:
     image = painted.picture(np.random.default_rng(9))[0]
     found = propose(image, detector.root, 20.0)
-    assert overlap(found[0], found[0]) == pytest.approx(1.0)
-    kept = suppress(found, 5)
+    assert window_iou(found[0], found[0]) == pytest.approx(1.0)
+    kept = non_max_suppression(found, 5)
     assert len(kept) == 5 and kept[0].score == max(one.score for one in found)
 
 
 def test_a_filter_finds_the_window_it_was_cut_from() -> None:
     image = painted.picture(np.random.default_rng(10))[0]
-    at = level(image, 42.0)
+    at = make_level(image, 42.0)
     row, column = 9, 11
     window = at.features[row : row + 11, column : column + 12]
     root = RootFilters(window[None] - window.mean(), np.zeros(1, np.float32), np.zeros((1, 2, 2), np.float32))
-    scores = respond(at.features, root.filters)[..., 0]
+    scores = correlate(at.features, root.filters)[..., 0]
     assert scores.argmax() == row * scores.shape[1] + column

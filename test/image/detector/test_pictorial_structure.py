@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flowing_puppet_ros.image.detector.pictorial_structure import (
-    PartTree,
+    FilterTree,
     best_placement,
-    downward,
+    distance_transform,
+    pass_down,
+    pass_up,
     score_of,
-    transform,
-    upward,
 )
 
 
@@ -28,18 +28,18 @@ def test_transform_is_the_maximum_over_all_cells(seed: int, height: int, width: 
     anchor = rng.uniform(-4, 4, 2).astype(np.float32)
     spring = rng.uniform(0.01, 2, 2).astype(np.float32)
     out = np.empty_like(scores)
-    transform(scores, anchor, spring, out)
+    distance_transform(scores, anchor, spring, out)
     v, u = np.indices(scores.shape)
     for y, x in np.ndindex(scores.shape):
         cost = spring[0] * (u - x - anchor[0]) ** 2 + spring[1] * (v - y - anchor[1]) ** 2
         assert out[y, x] == pytest.approx((scores - cost).max(), abs=2e-4)
 
 
-def random_tree(rng: np.random.Generator) -> tuple[PartTree, np.ndarray]:
+def random_tree(rng: np.random.Generator) -> tuple[FilterTree, np.ndarray]:
     """A root of two types, a chain of two and a leaf, on a grid of 3 x 2; and the layers' scores."""
     first = np.array([0, 2, 4, 5, 7])
     layers = int(first[-1])
-    tree = PartTree(
+    tree = FilterTree(
         np.array([-1, 0, 1, 0]),
         first,
         rng.uniform(-1.5, 1.5, (layers, 2)).astype(np.float32),
@@ -49,7 +49,7 @@ def random_tree(rng: np.random.Generator) -> tuple[PartTree, np.ndarray]:
     return tree, rng.normal(0, 2, (layers, 2, 3)).astype(np.float32)
 
 
-def all_placements(tree: PartTree) -> list[np.ndarray]:
+def all_placements(tree: FilterTree) -> list[np.ndarray]:
     states = [
         [(layer, x, y) for layer in range(tree.first[p], tree.first[p + 1]) for x in range(3) for y in range(2)]
         for p in range(len(tree.parents))
@@ -62,7 +62,7 @@ def test_best_placement_and_marginals_agree_with_brute_force(seed: int) -> None:
     tree, unary = random_tree(np.random.default_rng(seed))
     placements = all_placements(tree)
     scores = np.array([score_of(tree, unary, placement) for placement in placements])
-    beliefs = downward(tree, upward(tree, unary))
+    beliefs = pass_down(tree, pass_up(tree, unary))
     best = best_placement(tree, beliefs)
     assert score_of(tree, unary, best) == pytest.approx(scores.max(), abs=1e-4)
     assert beliefs.down is not None

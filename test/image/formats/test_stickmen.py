@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.formats.stickmen import STICKS, read_sticks, sticks_of, write_sticks
+from flowing_puppet_ros.image.formats.stickmen import STICKS, read_sticks, sticks_from_joints, write_sticks
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 
 def test_sticks_of_the_mean_puppet_stand_where_its_limbs_do() -> None:
     model = DeformableStructures.load()
     joints = model.mean_joints()
-    sticks = dict(zip(STICKS, sticks_of(model.joint_names, joints), strict=True))
+    sticks = dict(zip(STICKS, sticks_from_joints(model.joint_names, joints), strict=True))
     for side in ("left", "right"):
         shoulder, elbow, wrist = (
             joints[model.joint_names.index(f"{side}_{j}")] for j in ("shoulder", "elbow", "wrist")
@@ -34,7 +34,7 @@ def test_unknown_joints_leave_their_sticks_unknown() -> None:
     model = DeformableStructures.load()
     joints = model.mean_joints()
     joints[model.joint_names.index("left_wrist")] = np.nan
-    known = np.isfinite(sticks_of(model.joint_names, joints)).all(axis=(1, 2))
+    known = np.isfinite(sticks_from_joints(model.joint_names, joints)).all(axis=(1, 2))
     assert [name for name, fine in zip(STICKS, known, strict=True) if not fine] == ["left_lower_arm"]
 
 

@@ -11,7 +11,7 @@ import pytest
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.pose.estimator import PoseEstimator
-from flowing_puppet_ros.image.pose.evidence import GivenPerson
+from flowing_puppet_ros.image.pose.evidence import KeypointPerson
 from flowing_puppet_ros.image.pose.result import PosedPuppet
 from flowing_puppet_ros.image.pose.settings import PoseSettings
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
@@ -75,7 +75,7 @@ class Guess:
     def joint_score(self, joint: str, xy: np.ndarray) -> np.ndarray:
         if joint in ("right_elbow", "right_wrist"):
             return np.zeros(len(xy))
-        return GivenPerson(self.keypoints, 0.3 * SCALE).joint_score(joint, xy)
+        return KeypointPerson(self.keypoints, 0.3 * SCALE).joint_score(joint, xy)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
 from flowing_puppet_ros.image.pose.particle_search import elbows
-from flowing_puppet_ros.image.pose.particles import Edge, Particles, joint_rows, particles_of, points_of
+from flowing_puppet_ros.image.pose.particles import PairwiseGaussian, Particles, joint_rows, particles_of, world_points
 from flowing_puppet_ros.model.ds.joints import PART_JOINTS
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PairLayout
@@ -28,12 +28,17 @@ def particles(rng: np.random.Generator, count: int) -> Particles:
     )
 
 
-def edge(child: str, spring: float = SPRING) -> tuple[Edge, int, int, int]:
+def edge(child: str, spring: float = SPRING) -> tuple[PairwiseGaussian, int, int, int]:
     part = MODEL.tree.index(child)
     parent = MODEL.tree.parents[part]
     hook = PART_JOINTS[MODEL.tree.names[parent]].index(PART_JOINTS[child][0])
     row = int(joint_rows(MODEL.shapes[parent])[hook])
-    return Edge(MODEL.pairwise[part - 1], MODEL.shapes[parent], MODEL.shapes[part], row, spring), parent, part, row
+    return (
+        PairwiseGaussian(MODEL.pairwise[part - 1], MODEL.shapes[parent], MODEL.shapes[part], row, spring),
+        parent,
+        part,
+        row,
+    )
 
 
 @pytest.mark.parametrize("child", ["head", "left_upper_arm", "right_lower_arm"])
@@ -49,9 +54,9 @@ def test_edge_costs_are_the_loosened_conditional_density(child: str) -> None:
             layout.child + layout.angle + layout.gap, layout.parent, above.shape[i]
         )
         covariance = law.covariance + np.diag([0.0] * (size + 2) + [SPRING**2] * 2)
-        hang = points_of(MODEL.shapes[parent], above.take(np.array([i])))[0, row]
+        hang = world_points(MODEL.shapes[parent], above.take(np.array([i])))[0, row]
         for j in range(4):
-            top = points_of(MODEL.shapes[part], below.take(np.array([j])))[0, joint_rows(MODEL.shapes[part])[0]]
+            top = world_points(MODEL.shapes[part], below.take(np.array([j])))[0, joint_rows(MODEL.shapes[part])[0]]
             turn = below.angle[j] - above.angle[i]
             x, y = (top - hang) / above.scale[i]
             c, s = np.cos(above.angle[i]), np.sin(above.angle[i])
@@ -69,11 +74,11 @@ def test_children_and_parents_hang_together() -> None:
     link, parent, part, row = edge("left_upper_arm")
     above = particles(rng, 300)
     children = link.propose_child(above, rng)
-    hang = points_of(MODEL.shapes[parent], above)[:, row]
-    top = points_of(MODEL.shapes[part], children)[:, joint_rows(MODEL.shapes[part])[0]]
+    hang = world_points(MODEL.shapes[parent], above)[:, row]
+    top = world_points(MODEL.shapes[part], children)[:, joint_rows(MODEL.shapes[part])[0]]
     assert np.median(np.linalg.norm(top - hang, axis=1) / above.scale) < 0.02
     parents = link.propose_parent(children, rng)
-    hang = points_of(MODEL.shapes[parent], parents)[:, row]
+    hang = world_points(MODEL.shapes[parent], parents)[:, row]
     assert np.median(np.linalg.norm(top - hang, axis=1) / above.scale) < 0.02
     own = np.diag(link.costs(above, children, 0.1))
     others = link.costs(above, children, 0.1)[~np.eye(300, dtype=bool)]
@@ -84,12 +89,12 @@ def test_a_part_between_two_places_reaches_both() -> None:
     rng = np.random.default_rng(2)
     link, parent, part, row = edge("right_lower_arm")
     above = particles(rng, 200)
-    near = points_of(MODEL.shapes[parent], above)[:, row]
+    near = world_points(MODEL.shapes[parent], above)[:, row]
     direction = rng.uniform(-3, 3, 200)
     length = rng.uniform(0.15, 0.26, 200) * above.scale
     far = near + length[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
     between = link.propose_between(above, far, rng)
-    ends = points_of(MODEL.shapes[part], between, joint_rows(MODEL.shapes[part]))
+    ends = world_points(MODEL.shapes[part], between, joint_rows(MODEL.shapes[part]))
     miss = np.linalg.norm(ends - np.stack([near, far], axis=1), axis=2) / above.scale[:, None]
     assert np.median(miss) < 0.01 and np.percentile(miss, 90) < 0.05
 
@@ -99,7 +104,7 @@ def test_puppets_become_particles_at_their_joints() -> None:
     puppet = MODEL.puppet_from_joints(MODEL.sample(rng).joints * 110 + 150, 110.0)
     groups = particles_of([puppet, puppet], MODEL.bone, FRONT)
     for part, group in enumerate(groups):
-        ends = points_of(MODEL.shapes[part], group, joint_rows(MODEL.shapes[part])[:2])
+        ends = world_points(MODEL.shapes[part], group, joint_rows(MODEL.shapes[part])[:2])
         expected = puppet.joints[MODEL.bone[part]]
         np.testing.assert_allclose(ends[0], expected, atol=0.03 * 110)
     # From behind, x is negated and so are the particles'.

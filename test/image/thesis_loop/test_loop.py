@@ -10,21 +10,21 @@ import pytest
 
 from flowing_puppet_ros.flow.affine import transform
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.pose.evidence import GivenPerson
-from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FlowingEnergy, FrameEvidence, carried
+from flowing_puppet_ros.image.pose.evidence import KeypointPerson
+from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FlowingEnergy, FrameEvidence, propagate_joints
 from flowing_puppet_ros.image.thesis_loop.flow_moments import FlowMoments
-from flowing_puppet_ros.image.thesis_loop.loop import LoopSettings, Start, ThesisLoop
-from flowing_puppet_ros.image.thesis_loop.upper_body import PARTS, UpperBody
-from flowing_puppet_ros.image.thesis_loop.wrist_proposals import WristMoves
-from flowing_puppet_ros.image.tracking.propagation import Grid
+from flowing_puppet_ros.image.thesis_loop.loop import InitialPose, LoopSettings, ThesisLoop
+from flowing_puppet_ros.image.thesis_loop.upper_body import PARTS, UpperBodyParameters
+from flowing_puppet_ros.image.thesis_loop.wrist_proposals import WristProposals
+from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
 
 MODEL = DeformableStructures.load()
 NAMES = MODEL.joint_names
-FRONT = UpperBody(MODEL, "front")
+FRONT = UpperBodyParameters(MODEL, "front")
 SCALE = 150.0
-GRID = Grid((320, 240), (320, 240))
+GRID = ImageScale((320, 240), (320, 240))
 ARMS = [NAMES.index(f"{side}_{name}") for side in ("right", "left") for name in ("elbow", "wrist")]
 
 
@@ -37,7 +37,7 @@ def bodies(count: int, view: View = "front") -> np.ndarray:
 
 @pytest.mark.parametrize("view", ["front", "back"])
 def test_vectors_are_bodies_and_bodies_vectors(view: View) -> None:
-    body = FRONT if view == "front" else UpperBody(MODEL, "back")
+    body = FRONT if view == "front" else UpperBodyParameters(MODEL, "back")
     joints = bodies(20, view)
     vectors = body.vectors(joints, np.full(20, SCALE))
     back, scale = body.joints(vectors, body.legs_of(joints[0]))
@@ -92,7 +92,7 @@ def test_motions_by_sums_are_those_of_the_flow() -> None:
     assert weight[0] > 500
     assert weight[1] == 0.0
     np.testing.assert_allclose(found[1], np.eye(2, 3), atol=1e-9)
-    half = Grid((640, 480), (320, 240))
+    half = ImageScale((640, 480), (320, 240))
     twice = FlowMoments.of((forward, backward), half, np.zeros(2), np.array([639.0, 479.0]))
     large = (torso + 0.5) * 2 - 0.5
     expected = (transform(affine, torso[None])[0] + 0.5) * 2 - 0.5
@@ -105,7 +105,7 @@ def test_puppets_are_carried_joint_by_joint() -> None:
     # A part that moves with the background weighs less, but there is nothing else to say how it moves.
     moments = FlowMoments.of((flow, -flow), GRID, np.zeros(2), np.array([319.0, 239.0]))
     contours, _ = MODEL.puppets_from_joints(joints, np.full(2, SCALE))
-    moved = carried(FRONT, moments, joints, contours) - joints
+    moved = propagate_joints(FRONT, moments, joints, contours) - joints
     inside = (joints > 5).all(axis=2) & (joints < (315, 235)).all(axis=2)
     upper = np.isin(np.arange(len(NAMES)), [NAMES.index(n) for n in NAMES if "knee" not in n and "ankle" not in n])
     np.testing.assert_allclose(moved[inside & upper], np.tile([4.0, 2.0], (int(np.sum(inside & upper)), 1)), atol=0.5)
@@ -115,7 +115,7 @@ class Told:
     """A detection that knows the true joints, and a false pose besides."""
 
     def __init__(self, joints: np.ndarray, modes: Sequence[np.ndarray]) -> None:
-        self._given = GivenPerson(Keypoints(NAMES, joints, np.ones(len(NAMES))), 0.4 * SCALE)
+        self._given = KeypointPerson(Keypoints(NAMES, joints, np.ones(len(NAMES))), 0.4 * SCALE)
         self._modes = modes
         self.keypoints, self.confidence = self._given.keypoints, 1.0
 
@@ -126,7 +126,7 @@ class Told:
         return self._given.joint_score(joint, xy)
 
 
-def clip(lost: int) -> tuple[list[Start], list[FrameEvidence], np.ndarray]:
+def clip(lost: int) -> tuple[list[InitialPose], list[FrameEvidence], np.ndarray]:
     """Five images of somebody who moves 3 px an image; in the image `lost` the detector says nothing of the arms."""
     first = bodies(1)[0]
     truth = first + 3.0 * np.arange(5)[:, None, None] * [1.0, 0.0]
@@ -140,7 +140,7 @@ def clip(lost: int) -> tuple[list[Start], list[FrameEvidence], np.ndarray]:
     for a, b in pairwise(frames):
         a.after = FlowMoments.of((flow, -flow), GRID, np.zeros(2), np.array([319.0, 239.0]))
         b.before = FlowMoments.of((-flow, flow), GRID, np.zeros(2), np.array([319.0, 239.0]))
-    starts = [Start(joints, SCALE) for joints in false]
+    starts = [InitialPose(joints, SCALE) for joints in false]
     return starts, frames, truth
 
 
@@ -196,7 +196,7 @@ def test_wrists_go_where_hands_are_and_arms_follow() -> None:
     box, legs = FRONT.box(vectors[0]), FRONT.legs_of(joints[0])
     neck = joints[0, NAMES.index("neck")]
     places = neck + np.array([[40.0, 60.0], [-40.0, 60.0]])
-    moves = WristMoves(FRONT, box, legs, places, (np.array([1.0, 1.0]), np.array([0.0, 1.0])))
+    moves = WristProposals(FRONT, box, legs, places, (np.array([1.0, 1.0]), np.array([0.0, 1.0])))
     moved = moves(vectors, np.random.default_rng(0))
     assert ((moved >= box.low) & (moved <= box.high)).mean() > 0.9
     after, _ = FRONT.joints(moved, legs)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from drawn_people import NAMES, CapsuleModel, detection, draw, pose, tracker  # type: ignore[import-not-found]
 
-from flowing_puppet_ros.image.tracking.appearance import clothes_of
+from flowing_puppet_ros.image.tracking.appearance import torso_appearances
 from flowing_puppet_ros.image.tracking.association import associate
-from flowing_puppet_ros.image.tracking.track import Person, TrackerSettings
+from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
 
 Place = tuple[float, float]
 
@@ -79,14 +79,14 @@ def test_people_in_different_clothes_keep_their_ids_where_one_hides_the_other(me
 def test_of_two_who_stand_as_near_the_clothes_tell_whose_the_detection_is() -> None:
     """Joints alone would give the detections to the others, by a few millimetres."""
     image = draw(pose(0, (90, 118)), pose(0, (230, 118)), shirts=[RED, BLUE])
-    red, blue = clothes_of(NAMES, image, [pose(0, (90, 118)), pose(0, (230, 118))])
+    red, blue = torso_appearances(NAMES, image, [pose(0, (90, 118)), pose(0, (230, 118))])
     assert red is not None and blue is not None
     model, joints = CapsuleModel(), pose(0)
-    people = [Person.start(name, model, joints, np.ones(len(joints)), TrackerSettings()) for name in ("red", "blue")]  # type: ignore[arg-type]
+    people = [Track.start(name, model, joints, np.ones(len(joints)), TrackerSettings()) for name in ("red", "blue")]  # type: ignore[arg-type]
     people[1].mean += 0.5
     found = [(people[1].mean + 0.2, np.ones(len(joints))), (joints - 0.2, np.ones(len(joints)))]
     assert associate(people, found, 0.5)[0] == {0: 1, 1: 0}
     for person, clothes in zip(people, (red, blue), strict=True):
-        person.wear(clothes.colours)
+        person.update_appearance(clothes.colours)
     assert associate(people, found, 0.5, [red, blue])[0] == {0: 0, 1: 1}
     assert associate(people, found, 0.5, [blue, red])[0] == {0: 1, 1: 0}

@@ -5,7 +5,7 @@ import cv2
 import numpy as np
 
 from flowing_puppet_ros.flow.estimate import OpticalFlow
-from flowing_puppet_ros.image.tracking.shot_boundary import colour_change, colours_of, is_cut, lost_flow
+from flowing_puppet_ros.image.tracking.shot_boundary import colour_change, colour_histogram, flow_inconsistency, is_cut
 
 FLOW = OpticalFlow()
 
@@ -18,7 +18,7 @@ def scene(seed: int) -> np.ndarray:
 
 
 def cut(before: np.ndarray, after: np.ndarray) -> bool:
-    return is_cut(colours_of(before), colours_of(after), FLOW.at_working_scale(before, after))
+    return is_cut(colour_histogram(before), colour_histogram(after), FLOW.at_working_scale(before, after))
 
 
 def test_another_scene_is_a_cut() -> None:
@@ -38,10 +38,10 @@ def test_motion_zoom_and_light_are_none() -> None:
 
 def test_measures_at_their_ends() -> None:
     black, white = np.zeros((40, 60, 3), np.uint8), np.full((40, 60, 3), 255, np.uint8)
-    assert colour_change(colours_of(black), colours_of(black)) == 0.0
-    assert colour_change(colours_of(black), colours_of(white)) == 1.0
-    assert colour_change(colours_of(black), colours_of(black[..., 0])) == 1.0
+    assert colour_change(colour_histogram(black), colour_histogram(black)) == 0.0
+    assert colour_change(colour_histogram(black), colour_histogram(white)) == 1.0
+    assert colour_change(colour_histogram(black), colour_histogram(black[..., 0])) == 1.0
     still = np.zeros((40, 60, 2), np.float32)
-    assert lost_flow((still, still)) == 0.0
-    assert lost_flow((still + 100, still)) == 1.0
-    assert lost_flow((still + np.nan, still)) == 1.0
+    assert flow_inconsistency((still, still)) == 0.0
+    assert flow_inconsistency((still + 100, still)) == 1.0
+    assert flow_inconsistency((still + np.nan, still)) == 1.0

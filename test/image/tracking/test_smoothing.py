@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.tracking.propagation import Grid
-from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings, joint_motion, smoothed
-from flowing_puppet_ros.image.video.offline_smoother import Clip
+from flowing_puppet_ros.image.tracking.propagation import ImageScale
+from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings, flow_at_joints, smooth_joints
+from flowing_puppet_ros.image.video.offline_smoother import OfflineSmoother
 from test.helpers.drawn_people import NAMES, CapsuleModel, detection, draw, pose, tracker
 
 SETTINGS = SmoothingSettings()
@@ -38,7 +38,7 @@ def test_it_comes_close_to_the_minimum(seed: int) -> None:
     rng = np.random.default_rng(seed)
     places, motion = rng.normal(0, 4, (8, 1, 2)), rng.normal(0, 2, (7, 1, 2))
     confidence, trust = rng.uniform(0.2, 1, (8, 1)), rng.uniform(0, 1, (7, 1))
-    joints = smoothed(places, confidence, motion, trust, places, 100.0, SETTINGS)
+    joints = smooth_joints(places, confidence, motion, trust, places, 100.0, SETTINGS)
     args = places[:, 0], confidence[:, 0], motion[:, 0], trust[:, 0]
     best = minimize(objective, joints.ravel(), args=args).fun
     assert objective(joints, *args) < 1.05 * best
@@ -48,7 +48,7 @@ def test_it_comes_close_to_the_minimum(seed: int) -> None:
 def test_places_that_move_with_the_flow_stay() -> None:
     motion = np.full((9, 2, 2), (3.0, -1.0))
     places = np.concatenate([np.zeros((1, 2, 2)), motion.cumsum(axis=0)])
-    joints = smoothed(places, np.ones((10, 2)), motion, np.ones((9, 2)), places, 100.0, SETTINGS)
+    joints = smooth_joints(places, np.ones((10, 2)), motion, np.ones((9, 2)), places, 100.0, SETTINGS)
     np.testing.assert_allclose(joints, places, atol=1e-9)
 
 
@@ -58,14 +58,14 @@ def test_a_gap_is_bridged_by_the_flow_from_both_sides() -> None:
     truth = np.concatenate([np.zeros((1, 1, 2)), motion.cumsum(axis=0)])
     places = truth.copy()
     places[3:7] = np.nan
-    joints = smoothed(places, np.ones((10, 1)), motion, np.ones((9, 1)), np.zeros_like(truth), 100.0, SETTINGS)
+    joints = smooth_joints(places, np.ones((10, 1)), motion, np.ones((9, 1)), np.zeros_like(truth), 100.0, SETTINGS)
     np.testing.assert_allclose(joints, truth, atol=1e-3)
 
 
 def test_an_outlier_is_outvoted_by_its_neighbours_and_the_flow() -> None:
     places = np.zeros((9, 1, 2))
     places[4] = 60.0
-    joints = smoothed(places, np.ones((9, 1)), np.zeros((8, 1, 2)), np.ones((8, 1)), places, 100.0, SETTINGS)
+    joints = smooth_joints(places, np.ones((9, 1)), np.zeros((8, 1, 2)), np.ones((8, 1)), places, 100.0, SETTINGS)
     assert np.abs(joints).max() < 3
 
 
@@ -73,16 +73,18 @@ def test_where_nothing_is_known_the_start_stays() -> None:
     start = np.random.default_rng(0).normal(0, 50, (5, 2, 2))
     unknown = np.full((5, 2, 2), np.nan)
     nothing = np.zeros((4, 2, 2)), np.zeros((4, 2))
-    np.testing.assert_allclose(smoothed(unknown, np.zeros((5, 2)), *nothing, start, 100.0, SETTINGS), start, atol=1e-9)
+    np.testing.assert_allclose(
+        smooth_joints(unknown, np.zeros((5, 2)), *nothing, start, 100.0, SETTINGS), start, atol=1e-9
+    )
 
 
 @given(st.floats(-5, 5), st.floats(-5, 5), st.sampled_from([(64, 48), (32, 24), (16, 24)]))
 def test_motion_of_a_uniform_flow_is_that_flow_in_image_pixels(x: float, y: float, work: tuple[int, int]) -> None:
-    grid = Grid((64, 48), work)
+    grid = ImageScale((64, 48), work)
     shift = np.array([x, y])
     field = np.broadcast_to((shift * grid.factor).astype(np.float32), (work[1], work[0], 2)).copy()
     before = np.array([[20.0, 20.0], [40.5, 10.25], [np.nan, 3.0], [-9.0, 5.0]])
-    motion, trust = joint_motion((field, -field), grid, before, before + shift)
+    motion, trust = flow_at_joints((field, -field), grid, before, before + shift)
     np.testing.assert_allclose(motion[:2], [shift, shift], atol=1e-5)
     np.testing.assert_allclose(trust, [1, 1, 0, 0], atol=1e-9)
     np.testing.assert_array_equal(motion[2:], 0)
@@ -90,7 +92,9 @@ def test_motion_of_a_uniform_flow_is_that_flow_in_image_pixels(x: float, y: floa
 
 def test_flows_that_do_not_return_are_trusted_less() -> None:
     forth, back = np.full((2, 40, 40, 2), 4.0, np.float32)
-    _, trust = joint_motion((forth, back), Grid((40, 40), (40, 40)), np.full((1, 2), 9.0), np.full((1, 2), 13.0))
+    _, trust = flow_at_joints(
+        (forth, back), ImageScale((40, 40), (40, 40)), np.full((1, 2), 9.0), np.full((1, 2), 13.0)
+    )
     assert trust[0] < 0.05
 
 
@@ -101,7 +105,7 @@ def noisy(truth: np.ndarray, rng: np.random.Generator) -> Keypoints:
 def test_a_drawn_persons_noisy_joints_come_closer_and_calmer() -> None:
     rng = np.random.default_rng(3)
     truth = np.array([pose(t) for t in range(12)])
-    follower, clip = tracker(), Clip(CapsuleModel(), SETTINGS)  # type: ignore[arg-type]
+    follower, clip = tracker(), OfflineSmoother(CapsuleModel(), SETTINGS)  # type: ignore[arg-type]
     given = [noisy(joints, rng) for joints in truth]
     for t, joints in enumerate(truth):
         clip.add(follower.step(draw(joints), t, [given[t]]))
@@ -124,7 +128,7 @@ def test_a_drawn_persons_noisy_joints_come_closer_and_calmer() -> None:
 
 
 def test_people_come_and_go() -> None:
-    follower, clip = tracker(missed_detections=1), Clip(CapsuleModel(), SETTINGS)  # type: ignore[arg-type]
+    follower, clip = tracker(missed_detections=1), OfflineSmoother(CapsuleModel(), SETTINGS)  # type: ignore[arg-type]
     one, other = pose(0, (90, 118)), pose(0, (230, 118))
     seen = [[], [one], [one, other], [one, other], [other], [other], []]
     for t, people in enumerate(seen):
@@ -138,7 +142,7 @@ def test_people_come_and_go() -> None:
 
 
 def test_joints_that_nobody_saw_are_where_the_body_model_puts_them() -> None:
-    follower, clip = tracker(), Clip(CapsuleModel(), SETTINGS)  # type: ignore[arg-type]
+    follower, clip = tracker(), OfflineSmoother(CapsuleModel(), SETTINGS)  # type: ignore[arg-type]
     live = []
     for t in range(4):
         keypoints = detection(pose(t))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drawn_people import NAMES, SCALE, SIZE, CapsuleModel, Floats, detection, draw, error, pose, tracker  # type: ignore[import-not-found]
 
-from flowing_puppet_ros.ids import letters
+from flowing_puppet_ros.ids import letters_of_seed
 
 
 def test_flow_alone_carries_a_moving_forearm() -> None:
@@ -197,7 +197,7 @@ def test_larger_people_are_nearer() -> None:
 
 
 def test_ids_begin_with_the_seed() -> None:
-    assert [letters(seed) for seed in (0, 1, 25, 26, 701, 702)] == ["a", "b", "z", "aa", "zz", "aaa"]
+    assert [letters_of_seed(seed) for seed in (0, 1, 25, 26, 701, 702)] == ["a", "b", "z", "aa", "zz", "aaa"]
     (puppet,) = tracker(seed=2).step(draw(pose(0)), 0, [detection(pose(0))]).puppets
     assert puppet.id == "c1"
 

@@ -4,16 +4,16 @@
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.image.detector.detection import Place
-from flowing_puppet_ros.image.video.tracklets import ClipPeople
+from flowing_puppet_ros.image.detector.detection import PersonCandidate
+from flowing_puppet_ros.image.video.tracklets import TrackletLinker
 
 
-def place(x: float, y: float = 50.0, scale: float = 40.0, log_odds: float = 1.0) -> Place:
-    return Place(np.array([x, y]), np.array([x, y - 0.5 * scale]), scale, log_odds)
+def place(x: float, y: float = 50.0, scale: float = 40.0, log_odds: float = 1.0) -> PersonCandidate:
+    return PersonCandidate(np.array([x, y]), np.array([x, y - 0.5 * scale]), scale, log_odds)
 
 
-def people(looks: list[list[Place]], step: int = 1, least: float = 0.3, most: int = 8) -> ClipPeople:
-    clip = ClipPeople(least, most, step)
+def people(looks: list[list[PersonCandidate]], step: int = 1, least: float = 0.3, most: int = 8) -> TrackletLinker:
+    clip = TrackletLinker(least, most, step)
     for number, places in enumerate(looks):
         clip.add(number * step, places)
     return clip
@@ -45,14 +45,18 @@ def test_a_missed_look_is_filled_in_and_places_between_looks_are_means() -> None
 
 
 def test_before_and_after_the_path_the_person_must_show_to_be_believed() -> None:
-    looks: list[list[Place]] = [*[[] for _ in range(20)], *[[place(100)] for _ in range(4)], *[[] for _ in range(20)]]
+    looks: list[list[PersonCandidate]] = [
+        *[[] for _ in range(20)],
+        *[[place(100)] for _ in range(4)],
+        *[[] for _ in range(20)],
+    ]
     path = people(looks, step=3).paths()[0]
     for image in (58, 60, 69, 71):
         found = path.at(image)
-        assert found is not None and found.least == -np.inf
+        assert found is not None and found.min_score == -np.inf
     for image in (57, 72, 15, 114):
         supposed = path.at(image)
-        assert supposed is not None and supposed.neck[0] == 100.0 and supposed.least < supposed.score
+        assert supposed is not None and supposed.neck[0] == 100.0 and supposed.min_score < supposed.score
     assert path.at(14) is None and path.at(115) is None
 
 
@@ -79,5 +83,5 @@ def test_a_path_does_not_jump() -> None:
 @pytest.mark.parametrize(
     "looks", [[], [[]], [[], []], [[place(1, log_odds=-9.0)]], [[place(1, log_odds=-3.5 + 1e-3)]] * 2]
 )
-def test_nobody(looks: list[list[Place]]) -> None:
+def test_nobody(looks: list[list[PersonCandidate]]) -> None:
     assert people(looks).paths() == []

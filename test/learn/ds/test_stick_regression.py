@@ -9,7 +9,7 @@ import pytest
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import SHOULDER_OUTWARDS, TRUNK_LOWERED, joints_from_keypoints
 from flowing_puppet_ros.image.formats.stick_regression import TORSO, UPPER_ARMS, StickRegression
-from flowing_puppet_ros.image.formats.stickmen import sticks_of, write_sticks
+from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints, write_sticks
 from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
 from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.learn.anny.poses import PoseSampler
@@ -37,7 +37,7 @@ def joints(body: AnnyBody) -> np.ndarray:
 def test_joints_and_scale_of_bodies_come_back_from_their_sticks(joints: np.ndarray) -> None:
     scales, off = [], []
     for one in joints:
-        found, scale = REGRESSION(sticks_of(MODEL.joint_names, one), marked=False)
+        found, scale = REGRESSION(sticks_from_joints(MODEL.joint_names, one), marked=False)
         scales.append(scale / SCALE)
         off.append(np.linalg.norm(found - one, axis=1) / SCALE)
     by_joint = dict(zip(MODEL.joint_names, np.median(off, axis=0), strict=True))
@@ -50,7 +50,7 @@ def test_joints_and_scale_of_bodies_come_back_from_their_sticks(joints: np.ndarr
 
 
 def test_marked_sticks_are_mapped_to_the_puppets_shoulders(joints: np.ndarray) -> None:
-    own = sticks_of(MODEL.joint_names, joints[0])
+    own = sticks_from_joints(MODEL.joint_names, joints[0])
     marked = own.copy()
     trunk = (own[TORSO, 1] - own[TORSO, 0]) * TRUNK_LOWERED
     marked[TORSO] -= trunk
@@ -64,9 +64,9 @@ def test_marked_sticks_are_mapped_to_the_puppets_shoulders(joints: np.ndarray) -
 
 
 def test_people_seen_from_behind_and_with_unknown_ends(joints: np.ndarray) -> None:
-    sticks = sticks_of(MODEL.joint_names, joints[1])
+    sticks = sticks_from_joints(MODEL.joint_names, joints[1])
     mirrored = joints[1] * (-1.0, 1.0) + (320.0, 0.0)
-    back, _ = REGRESSION(sticks_of(MODEL.joint_names, mirrored), marked=False)
+    back, _ = REGRESSION(sticks_from_joints(MODEL.joint_names, mirrored), marked=False)
     front, _ = REGRESSION(sticks, marked=False)
     np.testing.assert_allclose(back * (-1.0, 1.0) + (320.0, 0.0), front, atol=1e-6)
     sticks[3, 1] = np.nan
@@ -79,7 +79,7 @@ def test_people_seen_from_behind_and_with_unknown_ends(joints: np.ndarray) -> No
 
 
 def test_files_of_sticks_start_people(joints: np.ndarray, tmp_path: Path) -> None:
-    sticks = sticks_of(MODEL.joint_names, joints[2])
+    sticks = sticks_from_joints(MODEL.joint_names, joints[2])
     write_sticks(tmp_path / "s.txt", {4: [sticks]})
     ((person,),) = read_keypoints(tmp_path / "s.txt").values()
     found, confidence = joints_from_keypoints(MODEL, person)

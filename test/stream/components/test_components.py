@@ -77,7 +77,7 @@ def test_the_order_of_image_and_detection_does_not_matter(images: list[Any], det
     found = []
     for first in ("image", "detections"):
         component = tracker()
-        component.expects("detections", True)
+        component.set_expected("detections", True)
         found.append(puppets(drive(component, interleaved(images, detections, first))))
         assert component.counters["images without detection"] == len(images) - len(detections)
     assert len(found[0]) == len(images)
@@ -86,7 +86,7 @@ def test_the_order_of_image_and_detection_does_not_matter(images: list[Any], det
 
 def test_an_image_waits_for_its_detection_but_not_for_ever(images: list[Any], detections: dict[int, Any]) -> None:
     component = tracker(wait=2)
-    component.expects("detections", True)
+    component.set_expected("detections", True)
     assert component.handle("image", images[0]) == []
     assert component.handle("image", images[1]) == []
     first = component.handle("detections", detections[stamp_ns(images[0])])
@@ -114,14 +114,14 @@ def test_lazy_outputs_are_made_on_demand_only(images: list[Any], detections: dic
     loud = tracker(overlay_side=96)
     for port in loud.outputs:
         if port.lazy:
-            loud.wants(port.name, True)
+            loud.set_subscribed(port.name, True)
     made = dict(drive(loud, stream))
     assert set(made) == {port.name for port in loud.outputs}
     assert decode_image(made["overlay"]).shape == (96, 77, 3)
     assert decode_image(made["puppet_flow/preview"]).shape == (240, 2 * 192, 3)
     assert stamp_ns(made["flow/preview"]) == stamp_ns(images[0])
     with pytest.raises(ValueError, match="no port 'hat'"):
-        loud.wants("hat", True)
+        loud.set_subscribed("hat", True)
 
 
 def test_the_flow_node_and_the_tracker_agree(images: list[Any], detections: dict[int, Any]) -> None:
@@ -129,7 +129,7 @@ def test_the_flow_node_and_the_tracker_agree(images: list[Any], detections: dict
     flows = OpticalFlowComponent(FlowSettings(), FACTORY)
     joined, alone = tracker(), tracker()
     for port in ("flow/forward", "flow/backward", "detections"):
-        joined.expects(port, True)
+        joined.set_expected(port, True)
     stream: Stream = []
     for image in images[:5]:
         stream += [("image", image), *flows.handle("image", image)]
@@ -139,7 +139,7 @@ def test_the_flow_node_and_the_tracker_agree(images: list[Any], detections: dict
     backward = [stamp_ns(message) for port, message in stream if port == "flow/backward"]
     assert forward == [stamp_ns(image) for image in images[:4]]
     assert backward == [stamp_ns(image) for image in images[1:5]]
-    alone.expects("detections", True)
+    alone.set_expected("detections", True)
     own = drive(alone, [item for item in stream if not item[0].startswith("flow")])
     assert puppets(drive(joined, stream)) == puppets(own)
     assert joined.counters["images without flow"] == 0
@@ -149,7 +149,7 @@ def test_a_flow_topic_that_stops_is_told_of_and_made_up_for(images: list[Any], d
     flows = OpticalFlowComponent(FlowSettings(), FACTORY)
     follower = tracker()
     for port in ("flow/forward", "flow/backward", "detections"):
-        follower.expects(port, True)
+        follower.set_expected(port, True)
     stream: Stream = []
     for number, image in enumerate(images[:6]):
         made = flows.handle("image", image)
@@ -182,7 +182,7 @@ def test_flow_points_along_the_motion_and_starts_anew_after_a_jump_back() -> Non
 
 def test_a_recording_that_starts_again_gives_the_same_joints(images: list[Any], detections: dict[int, Any]) -> None:
     component = tracker()
-    component.expects("detections", True)
+    component.set_expected("detections", True)
     once = interleaved(images, detections, "image")
     found = [message for port, message in drive(component, once + once) if port == "puppets"]
     assert len(found) == 2 * len(images)
@@ -212,7 +212,7 @@ def hull_stream(recorded: dict[str, list[Any]], skip: tuple[str, ...] = ()) -> S
     stream: Stream = [("/tf_static", message) for message in recorded["/tf_static"]]
     for name in ("cam1", "cam2"):
         component = tracker()
-        component.wants("part_labels", True)
+        component.set_subscribed("part_labels", True)
         stream += [(f"{name}/camera_info", message) for message in recorded[f"/{name}/camera_info"][:1]]
         by_stamp = {stamp_ns(message): message for message in recorded[f"/{name}/detections"]}
         seen = recorded[f"/{name}/image/compressed"][:2]
@@ -270,7 +270,7 @@ def test_silhouettes_go_on_without_a_camera_that_is_dead_or_not_calibrated(recor
     stream = hull_stream(recorded)
     for spoilt in ("dead", "uncalibrated"):
         component = VisualHullComponent(VisualHullSettings(cameras="cam3,cam1,cam2"), FACTORY)
-        component.wants("silhouettes", True)
+        component.set_subscribed("silhouettes", True)
         third = [(port.replace("cam2", "cam3"), message) for port, message in stream if port.startswith("cam2")]
         info = FACTORY.make(CAMERA_INFO, header=third[0][1].header, width=192, height=240)
         third[0] = ("cam3/camera_info", info)
@@ -290,7 +290,7 @@ def test_silhouettes_are_made_only_when_somebody_listens(recorded: dict[str, lis
 
 def test_silhouettes_that_cannot_be_used_are_one_sentence(recorded: dict[str, list[Any]]) -> None:
     hull = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2"), FACTORY)
-    hull.wants("silhouettes", True)
+    hull.set_subscribed("silhouettes", True)
     first, second = (message for _, message in drive(hull, hull_stream(recorded)))
     fitter = BodyFitterComponent(BodyFitterSettings(outline_steps=2), FACTORY)
     first.silhouettes[1].info.width = 100

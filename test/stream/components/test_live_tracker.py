@@ -15,12 +15,12 @@ import pytest
 from benchmarks.drawn_person import JOINTS, DrawnPerson
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.image.arms.hypotheses import ArmFilter
-from flowing_puppet_ros.image.detector.detection import Place
+from flowing_puppet_ros.image.detector.detection import PersonCandidate
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
-from flowing_puppet_ros.image.video.detection_jobs import Seen
-from flowing_puppet_ros.image.video.detection_memory import Watch
-from flowing_puppet_ros.image.video.live_tracker import FRAME_NS, Lookout, LookoutSettings, carried
+from flowing_puppet_ros.image.video.detection_jobs import DetectedPerson
+from flowing_puppet_ros.image.video.detection_memory import KnownPeople
+from flowing_puppet_ros.image.video.live_tracker import FRAME_NS, LiveTracker, LiveTrackerSettings, propagate_points
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
@@ -57,46 +57,52 @@ class TrueLooker:
     glanced: list[tuple[int, int]] = field(default_factory=list)
     unseen: tuple[int, ...] = ()
 
-    def search(self, image: Any, watch: Watch, number: int) -> list[Seen]:
+    def detect_full_frame(self, image: Any, watch: KnownPeople, number: int) -> list[DetectedPerson]:
         self.searched.append(int(image[0, 0, 0]))
         return self._people(image)
 
-    def glance(
-        self, image: Any, places: Sequence[Place], puppets: Sequence[TrackedPuppet], arms: Mapping[str, ArmFilter]
-    ) -> list[Seen]:
+    def detect_in_rois(
+        self,
+        image: Any,
+        places: Sequence[PersonCandidate],
+        puppets: Sequence[TrackedPuppet],
+        arms: Mapping[str, ArmFilter],
+    ) -> list[DetectedPerson]:
         self.glanced.append((int(image[0, 0, 0]), len(places)))
         people = self._people(image)
-        near = [min(people, key=lambda person: person.place.apart(place)) for place in places if people]
+        near = [min(people, key=lambda person: person.candidate.neck_distance(place)) for place in places if people]
         return [self._with_arms(person, puppets) for person in near]
 
-    def _with_arms(self, person: Seen, puppets: Sequence[TrackedPuppet]) -> Seen:
+    def _with_arms(self, person: DetectedPerson, puppets: Sequence[TrackedPuppet]) -> DetectedPerson:
         neck = person.keypoints.xy[JOINTS.index("neck")]
         near = [puppet.id for puppet in puppets if np.hypot(*(puppet.joints[0] - neck)) < 30]
         if not near:
             return person
         wrist = person.keypoints.xy[JOINTS.index("left_wrist")]
-        return Seen(person.detection, person.keypoints, near[0], {MODEL.joint_names.index("left_wrist"): (wrist, 0.7)})
+        return DetectedPerson(
+            person.detection, person.keypoints, near[0], {MODEL.joint_names.index("left_wrist"): (wrist, 0.7)}
+        )
 
-    def _people(self, image: Any) -> list[Seen]:
+    def _people(self, image: Any) -> list[DetectedPerson]:
         number = int(image[0, 0, 0])
         if number in self.unseen or image[60:].max() < 100:
             return []
         shifts = [0.0] if image.shape[1] == 320 else [0.0, 320.0]
         places = [joints(0 if len(shifts) == 2 else number) + np.array([shift, 0.0]) for shift in shifts]
-        return [Seen(detection(xy), Keypoints(JOINTS, xy, np.full(len(JOINTS), 0.9))) for xy in places]
+        return [DetectedPerson(detection(xy), Keypoints(JOINTS, xy, np.full(len(JOINTS), 0.9))) for xy in places]
 
 
 def detection(xy: np.ndarray) -> Any:
-    place = Place(xy[JOINTS.index("neck")], xy[JOINTS.index("face")], 45.0, 3.0)
+    place = PersonCandidate(xy[JOINTS.index("neck")], xy[JOINTS.index("face")], 45.0, 3.0)
     return SimpleNamespace(place=place, confidence=0.95, scale=45.0)
 
 
 MODEL = DeformableStructures.load()
 
 
-def watching(**settings: Any) -> tuple[Lookout, TrueLooker]:
+def watching(**settings: Any) -> tuple[LiveTracker, TrueLooker]:
     looker = TrueLooker()
-    return Lookout(LookoutSettings(**settings), FlowingPuppetTracker(MODEL), Counter(), looker), looker  # type: ignore[arg-type]
+    return LiveTracker(LiveTrackerSettings(**settings), FlowingPuppetTracker(MODEL), Counter(), looker), looker  # type: ignore[arg-type]
 
 
 def neck_of(result: TrackResult) -> np.ndarray:
@@ -168,7 +174,7 @@ def test_stamps_that_stand_still_or_go_back_do_not_stop_the_looks(stamps: list[i
 
 def test_who_is_sure_enough_can_change_between_searches() -> None:
     lookout, _ = watching(least_person=0.3)
-    lookout.adopt(LookoutSettings(least_person=0.8))
+    lookout.reconfigure(LiveTrackerSettings(least_person=0.8))
     assert lookout._watch.searches.least == 0.8
 
 
@@ -184,10 +190,10 @@ def test_places_are_carried_in_shares_of_the_image_and_lost_or_kept_where_the_fl
     field = np.zeros((16, 25, 2), np.float32)
     field[..., 0] = 0.05
     field[:, 20:] = np.nan
-    moved = carried(places, [field, field], (100, 64))
+    moved = propagate_points(places, [field, field], (100, 64))
     np.testing.assert_allclose(moved, np.array([[20, 20], [np.nan, np.nan], [np.nan, np.nan]]), atol=1e-4)
-    np.testing.assert_allclose(carried(places, [field], (100, 64), keep=True)[2], (90, 20), atol=1e-4)
-    assert carried(np.zeros((0, 2)), [field], (100, 64)).shape == (0, 2)
+    np.testing.assert_allclose(propagate_points(places, [field], (100, 64), keep=True)[2], (90, 20), atol=1e-4)
+    assert propagate_points(np.zeros((0, 2)), [field], (100, 64)).shape == (0, 2)
 
 
 class LastMoment(Executor):

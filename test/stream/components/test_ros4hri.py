@@ -17,11 +17,11 @@ from flowing_puppet_ros.stream.component import Port
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.components.ros4hri import (
     SKELETON,
-    Humans,
-    HumansSettings,
+    Ros4HriPublisher,
+    Ros4HriSettings,
     box_around,
     make_skeleton2d,
-    token,
+    name_component,
 )
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image
@@ -77,11 +77,11 @@ def test_boxes_are_inside_the_image() -> None:
     ("identity", "name"), [("a1", "a1"), ("7", "p7"), ("Jo-hn/3", "Jo_hn_3"), ("ä", "p_"), ("", "p")]
 )
 def test_ids_fit_into_names_of_topics(identity: str, name: str) -> None:
-    assert token(identity) == name
+    assert name_component(identity) == name
 
 
 def test_topics_end_with_their_person() -> None:
-    humans = Humans(HumansSettings(humans=True, humans_namespace="/crowd/"), FACTORY, "urdf")
+    humans = Ros4HriPublisher(Ros4HriSettings(humans=True, humans_namespace="/crowd/"), FACTORY, "urdf")
     text = FACTORY.make("std_msgs/msg/String", data="x")
     first = humans.publish(HEADER, ["a1", "a2"], {"a1": {"urdf": text}})
     assert [(name, getattr(message, "ids", "-")) for name, message in first] == [
@@ -92,7 +92,7 @@ def test_topics_end_with_their_person() -> None:
     assert humans.publish(HEADER, [], {})[0] == ("/crowd/bodies/a1/urdf", None)
     ((name, empty),) = humans.publish(HEADER, [], {})
     assert name == "/crowd/bodies/tracked" and empty.ids == []
-    assert Humans(HumansSettings(), FACTORY, "urdf").ports == ()
+    assert Ros4HriPublisher(Ros4HriSettings(), FACTORY, "urdf").ports == ()
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +110,7 @@ def recorded() -> tuple[list[Any], dict[int, Any]]:
 def test_the_puppets_of_an_image_are_humans(recorded: tuple[list[Any], dict[int, Any]]) -> None:
     images, detections = recorded
     component = PuppetTrackerComponent(PuppetTrackerSettings(humans=True), FACTORY)
-    component.expects("detections", True)
+    component.set_expected("detections", True)
     component.handle("detections", detections[stamp_ns(images[0])])
     made = dict(component.handle("image", images[0]))
     (puppet,) = made["puppets"].puppets

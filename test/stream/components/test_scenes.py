@@ -62,7 +62,7 @@ class Stage:
             BodyFitterSettings(view="full", cloud_points=1000, track_points=500, track_steps=2, threads=1, **settings),
             FACTORY,
         )
-        self.component.wants("body_meshes", True)
+        self.component.set_subscribed("body_meshes", True)
         self.tenths = 0
         self.made: dict[str, Any] = {}
 

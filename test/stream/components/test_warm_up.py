@@ -33,7 +33,7 @@ for name, kind, settings in (
     component.warm_up()
     for port in component.outputs:
         if port.lazy:
-            component.wants(port.name, True)
+            component.set_subscribed(port.name, True)
 traces = {name: dict(component.counters) for name, component in components.items()}
 before = state()
 
@@ -41,9 +41,9 @@ def fail(*names):
     raise AssertionError(f"weights are loaded late: {names}")
 
 weights.load = fail
-components["told"].expects("detections", True)
+components["told"].set_expected("detections", True)
 for name in ("cam1", "cam2"):
-    components[name].expects("detections", True)
+    components[name].set_expected("detections", True)
 with open_bag(Path("bags/golden/golden.mcap")) as bag:
     for record in bag.messages():
         topic, message = record.topic.removesuffix("/compressed"), record.message
@@ -60,7 +60,7 @@ with open_bag(Path("bags/golden/golden.mcap")) as bag:
                     components["hull"].handle(f"{name}/{made}", item)
         if name == "cam1" and port == "image":
             components["flow"].handle(port, message)
-            components["told"].expects("detections", False)  # its own detector looks
+            components["told"].set_expected("detections", False)  # its own detector looks
             components["told"].handle(port, message)
 after = state()
 late = {name: kinds for name, kinds in after.items() if kinds != before.get(name)}
