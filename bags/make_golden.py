@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Make the golden bag: a tiny synthetic recording of a body in four cameras, its truth, and what a replay makes of it.
 
-The body is Anny (see learn/anny/body.py), never a sample of the learned puppets. `--expected` replays the bag that is
-there and writes the expected results; do that when an algorithm changes on purpose, and look at the difference.
+The body is Anny (see learn/anny/body.py), never a sample of the learned puppets. `--expected` replays the existing
+bag and writes the expected results; do that when an algorithm changes on purpose, and review the difference.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from flowing_puppet_ros.stream.messages import geometry, images, message_types
 HERE = Path(__file__).resolve().parent
 FOLDER = HERE / "golden"
 FRAMES = 8
-RATE = 30
-SIZE = (192, 240)
-FOCAL = 215.0
+RATE_HZ = 30
+SIZE_PX = (192, 240)
+FOCAL_PX = 215.0
 START_NS = 1_600_000_000 * geometry.NANOSECONDS
 DETECTOR_DELAY_NS = 5_000_000
-PHASES = 1.2  # radians of the swing that the recording shows
-UNDETECTED = (3, 6)  # frames in which the detector said nothing: there the flow must carry the puppet
-DETECTOR_NOISE = 1.0  # pixels
+PHASES = 1.2  # range of the swing in the recording, rad
+UNDETECTED_FRAMES = (3, 6)  # frames without a detection, through which the flow must propagate the puppet
+DETECTOR_NOISE_PX = 1.0  # standard deviation
 SEED = 7
-SETTINGS = {"visual_hull": {"every": 4}}
+SETTINGS = {"visual_hull": {"hull_every": 4}}
 COCO = (
     *("nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow"),
     *("right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee"),
@@ -48,8 +48,8 @@ COCO = (
 )
 
 
-def pose_rotations(body: AnnyBody, phase: float) -> NDArray[np.float64]:
-    """Return the bone rotations (B,3,3) of a person who walks on the spot with swinging arms; phase in radians."""
+def make_pose(body: AnnyBody, phase: float) -> NDArray[np.float64]:
+    """Make bone rotations (B, 3, 3) of a person who walks on the spot with swinging arms; phase in radians."""
     turns = {
         "LeftArm": (-0.35, -0.7 * np.sin(phase), 0.0),
         "RightArm": (0.35, 0.7 * np.sin(phase), 0.0),
@@ -63,12 +63,12 @@ def pose_rotations(body: AnnyBody, phase: float) -> NDArray[np.float64]:
     }
     vectors = np.zeros((len(body.bone_names), 3))
     for name, vector in turns.items():
-        vectors[body.bone(name)] = vector
+        vectors[body.bone_index(name)] = vector
     return np.asarray(rotation.exp(vectors))
 
 
-def cameras() -> dict[str, Camera]:
-    """Return four cameras around the origin, 3 m away, that look slightly down."""
+def make_cameras() -> dict[str, Camera]:
+    """Make four cameras around the origin, 3 m away, that look slightly down."""
     found = {}
     for k, azimuth in enumerate(np.radians((25.0, 110.0, 205.0, 290.0))):
         place = np.array([3.0 * np.cos(azimuth), 3.0 * np.sin(azimuth), 0.5])
@@ -77,20 +77,20 @@ def cameras() -> dict[str, Camera]:
         right = np.cross(forward, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(forward, right), forward])
-        matrix = np.array([[FOCAL, 0, SIZE[0] / 2 - 0.5], [0, FOCAL, SIZE[1] / 2 - 0.5], [0, 0, 1]])
-        found[f"cam{k + 1}"] = Camera(matrix, np.zeros(5), SIZE, axes, -axes @ place)
+        matrix = np.array([[FOCAL_PX, 0, SIZE_PX[0] / 2 - 0.5], [0, FOCAL_PX, SIZE_PX[1] / 2 - 0.5], [0, 0, 1]])
+        found[f"cam{k + 1}"] = Camera(matrix, np.zeros(5), SIZE_PX, axes, -axes @ place)
     return found
 
 
-def texture(rng: np.random.Generator, shape: tuple[int, int], colour: float) -> NDArray[np.uint8]:
-    """Return a smooth random picture (H,W,3) around a grey level."""
+def make_texture(rng: np.random.Generator, shape: tuple[int, int], colour: float) -> NDArray[np.uint8]:
+    """Make a smooth random image (H, W, 3) around a grey level."""
     coarse = rng.uniform(-1, 1, (shape[0] // 12 + 1, shape[1] // 12 + 1, 3)).astype(np.float32)
     fine = cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
     return np.asarray(np.clip(colour + 45 * fine, 0, 255), np.uint8)
 
 
-def clothing(rest: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return vertex colours (V,3): skin above, a striped shirt, dark trousers; decided in the rest pose (V,3)."""
+def make_clothing(rest: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Make vertex colours (V, 3) from the rest pose (V, 3): skin, a striped shirt, dark trousers."""
     z, stripe = rest[:, 2], np.sin(40 * rest[:, 2]) * np.sin(25 * rest[:, 1]) > 0
     skin, shirt, trousers = np.array([224.0, 172, 140]), np.array([200.0, 60, 50]), np.array([40.0, 50, 90])
     colours = np.where(stripe[:, None], shirt, shirt * 0.6)
@@ -98,12 +98,12 @@ def clothing(rest: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where((z > 0.58)[:, None] | (np.abs(rest[:, 1]) > 0.48)[:, None], skin, colours)
 
 
-class Recording:
-    """Writes the messages of the golden bag."""
+class GoldenBagWriter:
+    """Writer of the golden bag's messages."""
 
     def __init__(self, writer: BagWriter) -> None:
         """Announce the topics and write the poses of the cameras."""
-        self.writer, self.factory, self.cameras = writer, BagMessageFactory(), cameras()
+        self.writer, self.factory, self.cameras = writer, BagMessageFactory(), make_cameras()
         writer.add_topic("/tf_static", message_types.TRANSFORMS, "latched")
         world = geometry.make_header(self.factory, START_NS, "world")
         poses = []
@@ -122,21 +122,21 @@ class Recording:
         info = self.factory.make(
             message_types.CAMERA_INFO,
             header=header,
-            height=SIZE[1],
-            width=SIZE[0],
+            height=SIZE_PX[1],
+            width=SIZE_PX[0],
             distortion_model="plumb_bob",
             d=np.zeros(5),
             k=matrix,
             r=np.eye(3),
             p=np.hstack([matrix, np.zeros((3, 1))]),
         )
-        data = images.jpeg(rgb, 90)
+        data = images.encode_jpeg(rgb, 90)
         image = self.factory.make(message_types.COMPRESSED_IMAGE, header=header, format="jpeg", data=data)
         self.writer.write(f"/{name}/camera_info", stamp, info)
         self.writer.write(f"/{name}/image/compressed", stamp, image)
 
     def write_detection(self, name: str, stamp: int, pixels: NDArray[np.float64]) -> None:
-        """Write COCO keypoints (17,2) as a detector of one person says them."""
+        """Write COCO keypoints (17, 2) px as the output of a single-person detector."""
         joints = [
             self.factory.make("flowing_puppet_msgs/msg/PuppetJoint", name=joint, x=x, y=y, confidence=0.8)
             for joint, (x, y) in zip(COCO, pixels, strict=True)
@@ -151,33 +151,35 @@ def make_bag() -> None:
     """Render and write bags/golden/golden.mcap and truth.json."""
     rng = np.random.default_rng(SEED)
     body = AnnyBody("neutral")
-    rest = body.rest(body.sample_phenotype(rng))
-    colours = clothing(rest.vertices)
+    rest = body.make_rest_body(body.sample_phenotype(rng))
+    colours = make_clothing(rest.vertices)
     truth = {}
     with BagWriter(FOLDER / "golden.mcap") as writer:
-        recording = Recording(writer)
-        backgrounds = {name: texture(rng, SIZE[::-1], 120.0) for name in recording.cameras}
+        recording = GoldenBagWriter(writer)
+        backgrounds = {name: make_texture(rng, SIZE_PX[::-1], 120.0) for name in recording.cameras}
         for frame in range(FRAMES):
-            stamp = START_NS + frame * geometry.NANOSECONDS // RATE
-            vertices, joints = body.pose(rest, pose_rotations(body, PHASES * (frame / (FRAMES - 1) - 0.5)))
-            named = body.landmarks(vertices, joints)
+            stamp = START_NS + frame * geometry.NANOSECONDS // RATE_HZ
+            vertices, joints = body.pose(rest, make_pose(body, PHASES * (frame / (FRAMES - 1) - 0.5)))
+            named = body.locate_landmarks(vertices, joints)
             truth[str(stamp)] = {joint: np.round(place, 5).tolist() for joint, place in named.items()}
             places = np.stack([named[joint] for joint in COCO])
             for name, camera in recording.cameras.items():
-                picture = render(vertices, body.triangles, camera, SIZE, colours=colours, background=backgrounds[name])
+                picture = render(
+                    vertices, body.triangles, camera, SIZE_PX, colours=colours, background=backgrounds[name]
+                )
                 recording.write_image(name, stamp, picture.rgb)
             for name, camera in recording.cameras.items():
-                noise = rng.normal(0, DETECTOR_NOISE, (len(COCO), 2))
-                if frame not in UNDETECTED:
+                noise = rng.normal(0, DETECTOR_NOISE_PX, (len(COCO), 2))
+                if frame not in UNDETECTED_FRAMES:
                     recording.write_detection(name, stamp, camera.project(places)[0] + noise)
     (FOLDER / "truth.json").write_text(json.dumps(truth, indent=1) + "\n", "utf8")
 
 
-def results(path: Path) -> dict[str, Any]:
-    """Return joints by topic and stamp of a replayed bag: {"puppets": ..., "bodies": ...}, pixels and metres."""
+def read_results(path: Path) -> dict[str, Any]:
+    """Read the joints of a replayed bag by topic and stamp: {"puppets": ..., "bodies": ...}, pixels and metres."""
     found: dict[str, Any] = {"puppets": {}, "bodies": {}}
     with open_bag(path) as bag:
-        for record in bag.messages([f"/{name}/puppets" for name in cameras()] + ["/bodies"]):
+        for record in bag.messages([f"/{name}/puppets" for name in make_cameras()] + ["/bodies"]):
             stamp = str(geometry.stamp_ns(record.message))
             if record.topic == "/bodies":
                 found["bodies"][stamp] = [
@@ -198,13 +200,15 @@ def make_expected() -> None:
         summary = replay(FOLDER / "golden.mcap", out, ReplayOptions(settings=SETTINGS))
         for warning in summary["warnings"]:
             print(f"make_golden: {warning}", file=sys.stderr)
-        (FOLDER / "expected.json").write_text(json.dumps(results(out), indent=1) + "\n", "utf8")
+        (FOLDER / "expected.json").write_text(json.dumps(read_results(out), indent=1) + "\n", "utf8")
 
 
 def main() -> int:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--expected", action="store_true", help="write the expected results only, from the bag there")
+    parser.add_argument(
+        "--expected", action="store_true", help="only write the expected results, from the existing bag"
+    )
     arguments = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
     if not arguments.expected:

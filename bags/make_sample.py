@@ -150,7 +150,9 @@ class Recipe:
             r=np.eye(3),
             p=np.hstack([matrix, np.zeros((3, 1))]),
         )
-        image = self.factory.make(message_types.COMPRESSED_IMAGE, header=header, format="jpeg", data=images.jpeg(rgb))
+        image = self.factory.make(
+            message_types.COMPRESSED_IMAGE, header=header, format="jpeg", data=images.encode_jpeg(rgb)
+        )
         self.writer.write(f"/{camera}/camera_info", stamp, info)
         self.writer.write(f"/{camera}/image/compressed", stamp, image)
 

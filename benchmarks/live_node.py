@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Feed a node over DDS with prepared images or clouds and measure what comes back: rate, latency, lock-on, memory.
+"""Feed a node prepared images or clouds over DDS and measure its results: rate, latency, lock-on, memory.
 
 `python -m benchmarks.live_node NODE INPUT.npz --rate HZ --seconds S [-- ROS arguments of the node]` starts
-the node as a process of its own, publishes the array `images` (N,H,W,3) or `clouds` (N,P,3) of the file to and fro with
-the present time as stamps, and prints one JSON object. Input travels reliably: of images of a megabyte a best-effort
-subscriber of Fast DDS as it is shipped misses a quarter.
+the node as its own process, publishes the array `images` (N, H, W, 3) or `clouds` (N, P, 3) of the file back and forth,
+stamped with the current time, and prints one JSON object. Input is reliable, because a best-effort subscriber of Fast
+DDS in its default configuration misses a quarter of images of a megabyte.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ STREAMS = {
 }
 """Node -> array of the input file, input topic and type, output topic and type."""
 NAMESPACE = "/measured"
-PATIENCE = 120.0
-"""Seconds that a node may take to start."""
-SETTLING = 60.0
-"""Seconds after which memory should not grow any more."""
+START_TIMEOUT_S = 120.0
+"""Maximum time for a node to start."""
+SETTLING_S = 60.0
+"""Time after which memory should no longer grow."""
 
 
 class Feeder(Node):
-    """Publishes the input and notes what comes back."""
+    """Publishes the input and records the results."""
 
     def __init__(self, name: str, arrays: Any) -> None:
         """Make the messages; only their stamps change later."""
@@ -60,9 +60,9 @@ class Feeder(Node):
         self.feed = self.create_publisher(message_type(kind), topic, QoSProfile(depth=2))
         self.people = output
         self.sent = 0
-        self.came: list[tuple[float, float, int]] = []
+        self.arrivals: list[tuple[float, float, int]] = []
         """Arrival (s, monotonic), latency (s) and number of people of every result."""
-        self.create_subscription(message_type(output_kind), output, self._result, QoSProfile(depth=50))
+        self.create_subscription(message_type(output_kind), output, self._record_result, QoSProfile(depth=50))
 
     def send(self) -> None:
         """Publish the next message, stamped now."""
@@ -71,13 +71,13 @@ class Feeder(Node):
         self.feed.publish(message)
         self.sent += 1
 
-    def _result(self, message: Any) -> None:
+    def _record_result(self, message: Any) -> None:
         latency = (self.get_clock().now().nanoseconds - header_ns(message.header)) * 1e-9
-        self.came.append((time.monotonic(), latency, len(getattr(message, self.people))))
+        self.arrivals.append((time.monotonic(), latency, len(getattr(message, self.people))))
 
 
 def measure(name: str, arrays: Any, rate: float, seconds: float, ros_arguments: list[str]) -> dict[str, Any]:
-    """Run the node for `seconds` of input and return what was measured; RuntimeError when it does not start."""
+    """Run the node on `seconds` of input and return the figures; RuntimeError if it does not start."""
     reliable = f"qos_overrides.{NAMESPACE}/{STREAMS[name][1]}.subscription.reliability:=reliable"
     command = [sys.executable, "-m", "flowing_puppet_ros.node.main", name, "--ros-args"]
     command += ["-r", f"__ns:={NAMESPACE}", "-p", reliable]
@@ -86,21 +86,21 @@ def measure(name: str, arrays: Any, rate: float, seconds: float, ros_arguments: 
     executor.add_node(feeder)
     with subprocess.Popen([*command, *ros_arguments], stdin=subprocess.DEVNULL) as process:
         try:
-            _wait(feeder, executor, process)
-            return {"node": name, "input_hz": rate, **_run(feeder, executor, process.pid, rate, seconds)}
+            _wait_for_node(feeder, executor, process)
+            return {"node": name, "input_hz": rate, **_feed(feeder, executor, process.pid, rate, seconds)}
         finally:
             process.send_signal(signal.SIGINT)
 
 
-def _wait(feeder: Feeder, executor: SingleThreadedExecutor, process: subprocess.Popen[bytes]) -> None:
-    until = time.monotonic() + PATIENCE
+def _wait_for_node(feeder: Feeder, executor: SingleThreadedExecutor, process: subprocess.Popen[bytes]) -> None:
+    until = time.monotonic() + START_TIMEOUT_S
     while not feeder.feed.get_subscription_count():
         if process.poll() is not None or time.monotonic() > until:
             raise RuntimeError("the node did not start")
         executor.spin_once(timeout_sec=0.1)
 
 
-def _run(feeder: Feeder, executor: SingleThreadedExecutor, pid: int, rate: float, seconds: float) -> dict[str, Any]:
+def _feed(feeder: Feeder, executor: SingleThreadedExecutor, pid: int, rate: float, seconds: float) -> dict[str, Any]:
     memory: list[tuple[float, float]] = []
     start = time.monotonic()
     while (now := time.monotonic()) < start + seconds:
@@ -108,16 +108,16 @@ def _run(feeder: Feeder, executor: SingleThreadedExecutor, pid: int, rate: float
         if now >= due:
             feeder.send()
         if not memory or now > memory[-1][0] + 1.0:
-            memory.append((now, _megabytes(pid)))
+            memory.append((now, _resident_megabytes(pid)))
         executor.spin_once(timeout_sec=max(0.0, min(due - now, 0.05)))
-    found = [arrival for arrival, _, people in feeder.came if people]
+    found = [arrival for arrival, _, people in feeder.arrivals if people]
     lock_on = found[0] if found else float("inf")
-    steady = [(arrival, latency) for arrival, latency, _ in feeder.came if arrival > lock_on]
+    steady = [(arrival, latency) for arrival, latency, _ in feeder.arrivals if arrival > lock_on]
     latencies = sorted(1000 * latency for _, latency in steady)
-    settled = [megabytes for at, megabytes in memory if at >= start + min(SETTLING, seconds / 2)]
+    settled = [megabytes for at, megabytes in memory if at >= start + min(SETTLING_S, seconds / 2)]
     return {
         "sent": feeder.sent,
-        "results": len(feeder.came),
+        "results": len(feeder.arrivals),
         "with_people": len(found),
         "lock_on_s": round(lock_on - start, 2) if found else None,
         "output_hz": round(len(steady) / (start + seconds - lock_on), 2) if found else 0.0,
@@ -128,14 +128,14 @@ def _run(feeder: Feeder, executor: SingleThreadedExecutor, pid: int, rate: float
     }
 
 
-def _megabytes(pid: int) -> float:
-    """Resident memory of a process."""
+def _resident_megabytes(pid: int) -> float:
+    """Return the resident memory of a process in megabytes."""
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS"))
 
 
 def main() -> int:
-    """Measure as the command line says and print the figures."""
+    """Measure according to the command line and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("node", choices=STREAMS)
     parser.add_argument("input", type=Path)

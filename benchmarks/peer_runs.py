@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same tasks done by what people use today, each in a virtual environment of its own that is made when asked for.
+"""The same tasks done by common alternatives, each in a virtual environment of its own that is made on demand.
 
-Peers are no part of the package and nothing of them is imported here: their scripts stand in `peers`, and speak JSON.
-Times are processor seconds, so that what else the machine does disturbs little.
+Peers are not part of the package and are not imported here: their scripts are in `peers` and print JSON. Times are
+processor seconds, which other programs on the machine disturb little.
 """
 
 from __future__ import annotations
@@ -22,35 +22,36 @@ import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.evaluate.body.bodies import drawn_scans, scored_fit
+from flowing_puppet_ros.evaluate.body.bodies import draw_scans, score_fit
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.tables import Row
-from flowing_puppet_ros.evaluate.video.errors import ClipErrors, TrackedPerson, clip_errors, summary
-from flowing_puppet_ros.evaluate.video.methods import ClipRun, VideoSettings, run_method
+from flowing_puppet_ros.evaluate.video.errors import ClipErrors, TrackedPerson, measure_clip, summarise
+from flowing_puppet_ros.evaluate.video.methods import ClipRun, run_method
 from flowing_puppet_ros.evaluate.video.truth import find_clips, read_people
 from flowing_puppet_ros.image.formats.video_reader import open_frames
+from flowing_puppet_ros.image.video.clip import ClipSettings
 from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 SCRIPTS = Path(__file__).resolve().parent / "peers"
-# Left behind by the ROS wheels' start-up hook; another environment's Python must not see them.
-HIDDEN = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH")
-PEER_POINTS = 2500  # of the cloud, for the gradients: more make them slower, not better
-SHAPES, SHAPE_COUNT = 200, 10  # people, and components of their shapes, that the gradients may use
-STEPS, EVERY = 1000, 20
+# Set by the ROS wheels' start-up hook; the Python of another environment must not inherit them.
+HIDDEN_VARIABLES = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH")
+PEER_POINTS = 2500  # of the cloud, for the gradient fit: more points make it slower, not better
+SHAPE_SAMPLES, SHAPE_COMPONENTS = 200, 10  # people, and principal components of their shapes, of the gradient fit
+GRADIENT_STEPS, STEPS_PER_RECORD = 1000, 20  # of the gradient fit, and of its curve
 
 
 @dataclass(frozen=True, slots=True)
 class Peer:
-    """A script and what it needs."""
+    """A script and its requirements."""
 
     name: str
     script: str
     requirements: tuple[str, ...]
 
-    def python(self, folder: Path) -> Path:
-        """Return the Python of the peer's environment below `folder`, which is made if it is not there."""
+    def ensure_python(self, folder: Path) -> Path:
+        """Return the Python of the peer's environment below `folder`, which is made if missing."""
         if not (SCRIPTS / self.script).is_file():
             raise InputError(f"bench peers needs the source tree: {SCRIPTS / self.script} is not there")
         home = folder / self.name
@@ -63,40 +64,42 @@ class Peer:
         return python
 
     def run(self, folder: Path, *arguments: str) -> Any:
-        """Run the script and return what it prints, read as JSON; PuppetError with its last line when it fails."""
-        return json.loads(_run([str(self.python(folder)), str(SCRIPTS / self.script), *arguments]).splitlines()[-1])
+        """Run the script and return its output parsed as JSON; PuppetError with its last line if it fails."""
+        return json.loads(
+            _run([str(self.ensure_python(folder)), str(SCRIPTS / self.script), *arguments]).splitlines()[-1]
+        )
 
 
 GRADIENT = Peer("gradient", "gradient_fit.py", ("jax", "scipy"))
 MEDIAPIPE = Peer("mediapipe", "mediapipe_pose.py", ("mediapipe==0.10.21",))
 
 
-def gradient(folder: Path, count: int, seed: int, mocap: Path | None) -> list[Row]:
-    """Fits to whole scans of `count` people against gradient fitting of the Anny body with a chamfer loss.
+def compare_gradient(folder: Path, count: int, seed: int, mocap: Path | None) -> list[Row]:
+    """Compare fits to whole scans of `count` people with gradient fitting of the Anny body with a chamfer loss.
 
-    The gradients fit the very model that the people were drawn from, the puppet does not. Rows: mean vertex error of
-    both, of the gradients at the puppet's time and at their end; the time that the gradients take to come as close.
+    The gradient fit uses the model that the people were drawn from; the puppet does not. Rows have the mean vertex
+    error of both, that of the gradient fit at the puppet's time and at its end, and its time to reach the puppet's.
     """
     fitter, source = BodyFitter(StitchedPuppet.load(), FitterSettings(threads=1)), BodySource(mocap)
     warm = True
-    body, rows = gradient_body(seed), []
-    for person, scene, cloud in drawn_scans("whole", source, count, seed):
+    body, rows = export_body(seed), []
+    for person, scene, cloud in draw_scans("whole", source, count, seed):
         if warm:
-            scored_fit(fitter, person, scene, cloud, source.joint_names)
+            score_fit(fitter, person, scene, cloud, source.joint_names)
             warm = False
-        _, score = scored_fit(fitter, person, scene, cloud, source.joint_names)
+        _, score = score_fit(fitter, person, scene, cloud, source.joint_names)
         chosen = np.random.default_rng(seed).permutation(len(cloud.points))[:PEER_POINTS]
         truth = person.template_vertices(fitter.model.name)
         with tempfile.TemporaryDirectory() as place:
             path = Path(place) / "task.npz"
             task: dict[str, Any] = {**body, "cloud": cloud.points[chosen], "truth": truth}
             np.savez(path, **task)
-            curve = np.array(GRADIENT.run(folder, str(path), str(STEPS), str(EVERY))["curve"])
-        rows.append(gradient_row(score.vertex_error, score.seconds, curve))
+            curve = np.array(GRADIENT.run(folder, str(path), str(GRADIENT_STEPS), str(STEPS_PER_RECORD))["curve"])
+        rows.append(compare_curve(score.vertex_error, score.seconds, curve))
     return rows
 
 
-def gradient_row(error: float, seconds: float, curve: np.ndarray) -> Row:
+def compare_curve(error: float, seconds: float, curve: np.ndarray) -> Row:
     """Compare a fit (metres, seconds) with a `curve` (n, 2 or more) of seconds and errors."""
     then = curve[curve[:, 0] <= seconds]
     as_good = curve[curve[:, 1] <= error]
@@ -110,18 +113,20 @@ def gradient_row(error: float, seconds: float, curve: np.ndarray) -> Row:
     }
 
 
-def gradient_body(seed: int) -> dict[str, np.ndarray]:
-    """The Anny body as arrays: rest vertices of the puppet's template and joints, linear in shape coefficients.
+def export_body(seed: int) -> dict[str, np.ndarray]:
+    """Return the Anny body as arrays: rest vertices of the puppet's template and joints, linear in shape coefficients.
 
-    The components are those of SHAPES random people, so that the gradients have as fine shapes as the puppet has.
+    The components are those of SHAPE_SAMPLES random people, so that its shapes are as fine as the puppet's.
     """
     anny, rng = AnnyBody("neutral"), np.random.default_rng(seed)
     chosen = weights.load("sp", "neutral")["anny_vertex"]
-    people = [anny.rest(anny.sample_phenotype(rng)) for _ in range(SHAPES)]
+    people = [anny.make_rest_body(anny.sample_phenotype(rng)) for _ in range(SHAPE_SAMPLES)]
     rows = np.array([np.concatenate([person.vertices[chosen], person.joints]).ravel() for person in people])
     mean = rows.mean(axis=0)
     _, values, axes = np.linalg.svd(rows - mean, full_matrices=False)
-    basis = (axes[:SHAPE_COUNT] * values[:SHAPE_COUNT, None] / np.sqrt(SHAPES)).T.reshape(-1, 3, SHAPE_COUNT)
+    basis = (axes[:SHAPE_COMPONENTS] * values[:SHAPE_COMPONENTS, None] / np.sqrt(SHAPE_SAMPLES)).T.reshape(
+        -1, 3, SHAPE_COMPONENTS
+    )
     split, mean = len(chosen), mean.reshape(-1, 3)
     return {
         "vertices": mean[:split],
@@ -133,26 +138,26 @@ def gradient_body(seed: int) -> dict[str, np.ndarray]:
     }
 
 
-def mediapipe(folder: Path, clips: Path, truth: Path, names: Sequence[str]) -> list[Row]:
-    """Elbows and wrists of annotated clips by MediaPipe and by the tracker, live and over whole clips.
+def compare_mediapipe(folder: Path, clips: Path, truth: Path, names: Sequence[str]) -> list[Row]:
+    """Compare elbows and wrists of annotated clips by MediaPipe and by the tracker, live and over whole clips.
 
-    MediaPipe's "full" model is the one whose weights are in its wheel.
+    MediaPipe's "full" model is the one with weights in its wheel.
     """
     places = find_clips(clips, names)
     people = read_people(truth, places)
     made = MEDIAPIPE.run(folder, *(str(places[name]) for name in people))
     errors = {
-        name: clip_errors(_tracked(made["clips"][places[name].stem]), true, _size(places[name]))
+        name: measure_clip(_read_track(made["clips"][places[name].stem]), true, _image_size(places[name]))
         for name, true in people.items()
     }
-    rows = [{"method": "MediaPipe full"} | _figures(errors, made["milliseconds_a_frame"])]
+    rows = [{"method": "MediaPipe full"} | _make_row(errors, made["milliseconds_a_frame"])]
     for method in ("live", "default"):
         errors, spent, frames = {}, 0.0, 0
         for number, (name, true) in enumerate(people.items()):
             images = list(open_frames(places[name]))
-            run = ClipRun.load(images, None, VideoSettings())
+            run = ClipRun.load(images, None, ClipSettings())
             if number == 0:
-                run_method(method, ClipRun.load(images[:3], None, VideoSettings()))
+                run_method(method, ClipRun.load(images[:3], None, ClipSettings()))
             started = time.process_time()
             track = run_method(method, run)
             spent, frames = spent + time.process_time() - started, frames + len(images)
@@ -160,16 +165,16 @@ def mediapipe(folder: Path, clips: Path, truth: Path, names: Sequence[str]) -> l
                 frame.index: [TrackedPerson.of(run.joint_names, one.joints, one.confidence) for one in seen]
                 for frame, seen in zip(images, track, strict=True)
             }
-            errors[name] = clip_errors(found, true, _size(places[name]))
-        rows.append({"method": f"puppets, {method}"} | _figures(errors, 1000 * spent / frames))
+            errors[name] = measure_clip(found, true, _image_size(places[name]))
+        rows.append({"method": f"puppets, {method}"} | _make_row(errors, 1000 * spent / frames))
     return rows
 
 
-def _figures(errors: Mapping[str, ClipErrors], milliseconds: float) -> Row:
-    return {"clips": len(errors)} | summary(errors) | {"milliseconds_a_frame": milliseconds}
+def _make_row(errors: Mapping[str, ClipErrors], milliseconds: float) -> Row:
+    return {"clips": len(errors)} | summarise(errors) | {"milliseconds_a_frame": milliseconds}
 
 
-def _tracked(data: Mapping[str, Any]) -> dict[int, list[TrackedPerson]]:
+def _read_track(data: Mapping[str, Any]) -> dict[int, list[TrackedPerson]]:
     found = {}
     for index, persons in data["frames"].items():
         rows = [np.array(person, np.float64) for person in persons]
@@ -177,13 +182,13 @@ def _tracked(data: Mapping[str, Any]) -> dict[int, list[TrackedPerson]]:
     return found
 
 
-def _size(clip: Path) -> tuple[int, int]:
+def _image_size(clip: Path) -> tuple[int, int]:
     height, width = next(iter(open_frames(clip))).image.shape[:2]
     return width, height
 
 
 def _run(command: list[str]) -> str:
-    clean = {name: value for name, value in os.environ.items() if name not in HIDDEN}
+    clean = {name: value for name, value in os.environ.items() if name not in HIDDEN_VARIABLES}
     done = subprocess.run(command, env=clean, capture_output=True, text=True)
     if done.returncode:
         last = (done.stderr.strip().splitlines() or ["it printed nothing"])[-1]

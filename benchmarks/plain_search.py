@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The search for a body written plainly with NumPy and SciPy: what the fast one must equal, and is measured against.
+"""A reference implementation of the body search in plain NumPy and SciPy, for tests and speed ratios.
 
 The same equations in the same order as the modules of `body.search` and `inference.diverse`, one particle and one pair
-at a time, without compiled code. With the grid's own closest points the answers are the same up
-to rounding; by itself it asks a cKDTree.
+at a time, without compiled code. With the grid's closest points the results are equal up to rounding; by default it
+queries a cKDTree.
 """
 
 from __future__ import annotations
@@ -15,23 +15,29 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch
-from flowing_puppet_ros.body.search.energy import TOO_CLOSE, JointTargets, ScoredParticles
-from flowing_puppet_ros.body.search.levenberg import CONTRADICTING_WEIGHT, DAMPING, DAMPING_FACTOR, MAX_TURN, POSE_PRIOR
+from flowing_puppet_ros.body.search.energy import MIN_CENTRE_DISTANCE_M, JointTargets, ScoredParticles
+from flowing_puppet_ros.body.search.levenberg import (
+    CONTRADICTING_WEIGHT,
+    DAMPING_FACTOR,
+    INITIAL_DAMPING,
+    MAX_ROTATION_STEP_RAD,
+    POSE_PRIOR_WEIGHT,
+)
 from flowing_puppet_ros.body.search.part_points import PartPoints
 from flowing_puppet_ros.body.search.particles import Particles
 from flowing_puppet_ros.body.search.schedule import Stage
 from flowing_puppet_ros.evidence.cloud.data_term import DISTANCE_OFFSET, DISTANCE_POWER, MISMATCH_COSINE, CloudGrid
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product, message_foundation
 from flowing_puppet_ros.model import rotation as so3
-from flowing_puppet_ros.model.sp import DEVIATIONS
+from flowing_puppet_ros.model.sp import MAX_DEVIATIONS
 
-# From points (n, 3) to the indices (n,) of the cloud's points that are nearest to them.
+# From points (n, 3) to the indices (n,) of the nearest points of the cloud.
 Nearest = Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlainCloud:
-    """A cloud (N, 3) with unit normals (N, 3) and how its closest points are found."""
+    """A cloud `points` (N, 3) m with unit `normals` (N, 3), and a function that finds `nearest` points."""
 
     points: np.ndarray
     normals: np.ndarray
@@ -39,13 +45,13 @@ class PlainCloud:
 
     @classmethod
     def of_tree(cls, points: np.ndarray, normals: np.ndarray) -> PlainCloud:
-        """Closest points by a cKDTree, exactly."""
+        """Make a cloud whose closest points are found exactly, by a cKDTree."""
         tree = cKDTree(points)
         return cls(points, normals, lambda asked: tree.query(asked)[1])
 
     @classmethod
     def of_grid(cls, grid: CloudGrid) -> PlainCloud:
-        """Closest points as a grid has them."""
+        """Make a cloud whose closest points are those of a grid."""
 
         def nearest(asked: np.ndarray) -> np.ndarray:
             cells = np.floor((asked - grid.origin) / grid.cell + 0.5).astype(np.int64)
@@ -57,30 +63,30 @@ class PlainCloud:
     def data_cost(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """See `CloudGrid.data_cost`."""
         cost, mismatch = np.zeros(len(points)), np.zeros(len(points))
-        for particle, (own, turned) in enumerate(zip(points, normals, strict=True)):
+        for particle, (own, own_normals) in enumerate(zip(points, normals, strict=True)):
             found = self.nearest(own)
             squared = ((own - self.points[found]) ** 2).sum(axis=1)
             cost[particle] = ((squared + DISTANCE_OFFSET) ** DISTANCE_POWER).mean()
-            mismatch[particle] = ((turned * self.normals[found]).sum(axis=1) < MISMATCH_COSINE).mean()
+            mismatch[particle] = ((own_normals * self.normals[found]).sum(axis=1) < MISMATCH_COSINE).mean()
         return cost, mismatch
 
 
 class PlainSearch(BodyParticleSearch):
-    """`Search` with plain moves, stitching costs and selection."""
+    """`BodyParticleSearch` with plain moves, stitching costs and selection."""
 
-    def _improved(self, part: int, new: Particles, grid: PlainCloud, targets: JointTargets) -> ScoredParticles:  # type: ignore[override]
+    def _improve(self, part: int, new: Particles, grid: PlainCloud, targets: JointTargets) -> ScoredParticles:  # type: ignore[override]
         moved = improve(self._points[part], new, grid, targets, self._weights.lm_steps, self._weights.lm_points)
-        return ScoredParticles.judge(self._points[part], moved, grid, targets)
+        return ScoredParticles.score(self._points[part], moved, grid, targets)
 
-    def _solve(self, judged: list[ScoredParticles], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
+    def _solve(self, scored: list[ScoredParticles], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
         nodes = [
-            beta * (group.distance + self._weights.mismatch * group.mismatch) + group.pull
-            for beta, group in zip(stage.data, judged, strict=True)
+            beta * (group.distance + self._weights.mismatch * group.mismatch) + group.joint_cost
+            for beta, group in zip(stage.data, scored, strict=True)
         ]
         edges = []
         for edge, (parent, child) in enumerate(self._model.tree.edges):
             weight = self._model.interfaces[edge].weight
-            cost = stitching_costs(weight, judged[parent], judged[child], edge, self._weights.stitch)
+            cost = stitching_costs(weight, scored[parent], scored[child], edge, self._weights.stitch)
             edges.append(stage.stitch[edge] * cost)
         return max_product(self._model.tree, nodes, edges), edges
 
@@ -94,23 +100,23 @@ class PlainSearch(BodyParticleSearch):
 def improve(
     points: PartPoints, particles: Particles, cloud: PlainCloud, targets: JointTargets, steps: int, count: int
 ) -> Particles:
-    """See `levenberg.improve`."""
+    """See `levenberg.levenberg_marquardt`."""
     center, rotation, pose = particles.center.copy(), particles.rotation.copy(), particles.pose.copy()
     for p in range(len(particles)):
         problem = _Problem(points, particles.shape[p], cloud, targets, count)
-        damping, (cost, hessian, gradient) = DAMPING, problem.normal_equations(center[p], rotation[p], pose[p])
+        damping, (cost, hessian, gradient) = INITIAL_DAMPING, problem.normal_equations(center[p], rotation[p], pose[p])
         for _ in range(steps):
             damped = hessian + np.diag(damping * np.diag(hessian) + 1e-9)
             step = np.linalg.solve(damped, -gradient)
-            step *= min(1.0, MAX_TURN / max(float(np.linalg.norm(step[:3])), 1e-12))
-            tried = (
+            step *= min(1.0, MAX_ROTATION_STEP_RAD / max(float(np.linalg.norm(step[:3])), 1e-12))
+            trial = (
                 center[p] + rotation[p] @ step[3:6],
                 rotation[p] @ so3.exp(step[:3]),
-                np.clip(pose[p] + step[6:], -DEVIATIONS, DEVIATIONS),
+                np.clip(pose[p] + step[6:], -MAX_DEVIATIONS, MAX_DEVIATIONS),
             )
-            new_cost, new_hessian, new_gradient = problem.normal_equations(*tried)
+            new_cost, new_hessian, new_gradient = problem.normal_equations(*trial)
             if new_cost < cost:
-                (center[p], rotation[p], pose[p]), damping = tried, damping / DAMPING_FACTOR
+                (center[p], rotation[p], pose[p]), damping = trial, damping / DAMPING_FACTOR
                 cost, hessian, gradient = new_cost, new_hessian, new_gradient
             else:
                 damping *= DAMPING_FACTOR
@@ -118,14 +124,16 @@ def improve(
 
 
 class _Problem:
-    """The least squares of one particle: its points, in the part's frame, against their closest cloud points."""
+    """The least-squares problem of one particle: its points, in the part's frame, against the closest cloud points."""
 
     def __init__(
         self, points: PartPoints, shape: np.ndarray, cloud: PlainCloud, targets: JointTargets, count: int
     ) -> None:
         surface, joints = points.surface, points.joints
         self._count = min(count, len(surface))
-        self._mean = np.concatenate([surface.shaped(shape[None])[0, : self._count], joints.shaped(shape[None])[0]])
+        self._mean = np.concatenate(
+            [surface.apply_shape(shape[None])[0, : self._count], joints.apply_shape(shape[None])[0]]
+        )
         self._basis = np.concatenate([surface.pose_basis[: self._count], joints.pose_basis])
         self._normals = points.normals[: self._count]
         believed = targets.weight[points.joint_index]
@@ -136,7 +144,7 @@ class _Problem:
     def normal_equations(
         self, center: np.ndarray, rotation: np.ndarray, pose: np.ndarray
     ) -> tuple[float, np.ndarray, np.ndarray]:
-        """Half the weighted sum of squares, J^T W J and J^T W r (Eqs. 57 to 64)."""
+        """Return half the weighted sum of squares, J^T W J and J^T W r (Eqs. 57-64)."""
         local = self._mean + self._basis @ pose
         world = local @ rotation.T + center
         found = self._cloud.nearest(world[: self._count])
@@ -154,27 +162,27 @@ class _Problem:
         rows, weights = jacobian.reshape(3 * len(local), -1), np.repeat(weight, 3)
         hessian = (rows * weights[:, None]).T @ rows
         gradient = rows.T @ (weights * residual.ravel())
-        hessian[6:, 6:] += POSE_PRIOR * np.eye(len(pose))
-        gradient[6:] += POSE_PRIOR * pose
-        cost = 0.5 * float((weight * (residual**2).sum(axis=1)).sum() + POSE_PRIOR * (pose**2).sum())
+        hessian[6:, 6:] += POSE_PRIOR_WEIGHT * np.eye(len(pose))
+        gradient[6:] += POSE_PRIOR_WEIGHT * pose
+        cost = 0.5 * float((weight * (residual**2).sum(axis=1)).sum() + POSE_PRIOR_WEIGHT * (pose**2).sum())
         return cost, hessian, gradient
 
 
 def stitching_costs(
     weight: np.ndarray, parent: ScoredParticles, child: ScoredParticles, edge: int, strength: float
 ) -> np.ndarray:
-    """See `energy.stitching_costs`: every pair of particles by itself."""
+    """See `energy.stitching_costs`; computes every pair of particles separately."""
     share = weight / weight.sum()
     costs = np.empty((len(parent.particles), len(child.particles)))
     for i, own in enumerate(parent.interfaces[edge]):
         for j, other in enumerate(child.interfaces[edge]):
             apart = np.linalg.norm(parent.particles.center[i] - child.particles.center[j])
-            costs[i, j] = strength * (share * ((own - other) ** 2).sum(axis=1)).sum() + (apart < TOO_CLOSE)
+            costs[i, j] = strength * (share * ((own - other) ** 2).sum(axis=1)).sum() + (apart < MIN_CENTRE_DISTANCE_M)
     return costs
 
 
 def select_diverse(foundation: np.ndarray, count: int, kept: int, temperature: float) -> np.ndarray:
-    """See `diverse.select_diverse`: at every turn the gain of every candidate is computed anew."""
+    """See `diverse.select_diverse`; recomputes the gain of every candidate in each round."""
     weights = np.exp((foundation.min(axis=1, keepdims=True) - foundation) / temperature)
     chosen, covered = [kept], weights[:, kept]
     while len(chosen) < count:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of the 2D tracker by image size and people, on puppets drawn over noise, and of the replay of a recording.
+"""Speed of the 2D tracker by image size and number of people, on puppets drawn over noise, and of a replay.
 
 Processor time of the whole process, after a first run that compiles.
 """
@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
-from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.tables import Row
 from flowing_puppet_ros.flow.estimate import FlowSettings
@@ -22,56 +21,56 @@ from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order, render_labels
+from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
-SIZES = ((320, 240), (640, 480), (1280, 960))
+SIZES = ((320, 240), (640, 480), (1280, 960))  # width and height, px
 PEOPLE = (1, 2, 4, 8)
-MIDDLE, ALONE = (640, 480), 1
-FRAMES, STEP = 6, 3.0  # images, and pixels a person moves from one to the next
-GOLDEN = Path(__file__).resolve().parent.parent.parent / "bags" / "golden"
+MIDDLE, ALONE = (640, 480), 1  # size at which people vary, and people at which the size varies
+FRAMES, STEP_PX = 6, 3.0  # images, and a person's motion between them
+GOLDEN = Path(__file__).resolve().parent.parent / "bags" / "golden"
 
-type People = list[tuple[np.ndarray, float]]  # joints (J,2) px, scale px/m
-
-
-def tracking(seed: int) -> list[Row]:
-    """Milliseconds of the tracker an image, with `preset: fast`, by the size of the image and by people."""
-    rows = [_tracked(size, ALONE, seed) for size in SIZES]
-    return rows + [_tracked(MIDDLE, people, seed) for people in PEOPLE if people != ALONE]
+type PlacedPeople = list[tuple[np.ndarray, float]]  # joints (J, 2) px, scale px/m
 
 
-def _tracked(size: tuple[int, int], people: int, seed: int) -> Row:
+def measure_tracking(seed: int) -> list[Row]:
+    """Measure milliseconds per image of the tracker with `preset: fast`, by image size and number of people."""
+    rows = [_measure_size(size, ALONE, seed) for size in SIZES]
+    return rows + [_measure_size(MIDDLE, people, seed) for people in PEOPLE if people != ALONE]
+
+
+def _measure_size(size: tuple[int, int], people: int, seed: int) -> Row:
     model, rng = DeformableStructures.load(), np.random.default_rng(seed)
     ground = cv2.resize(rng.integers(0, 255, (48, 64, 3)).astype(np.uint8), size, interpolation=cv2.INTER_CUBIC)
-    crowd = _crowd(model, size, people)
+    placed_people = _arrange_people(model, size, people)
     tracker = FlowingPuppetTracker(model, None, FlowSettings(preset="fast"))
     seconds = []
-    cv2.setNumThreads(1)
-    with one_blas_thread():
+    with one_blas_thread(), one_opencv_thread():
         for number in range(FRAMES):
-            moved = [(joints + np.array([STEP * number, 0.0]), scale) for joints, scale in crowd]
-            image = _drawn(model, np.asarray(ground), moved)
+            moved = [(joints + np.array([STEP_PX * number, 0.0]), scale) for joints, scale in placed_people]
+            image = _draw_people(model, np.asarray(ground), moved)
             certain = np.ones(len(model.joint_names))
             detections = [Keypoints(model.joint_names, joints, certain) for joints, _ in moved] if not number else None
             started = time.process_time()
             result = tracker.step(image, number * 33_000_000, detections)
             seconds.append(time.process_time() - started)
-    # The first image starts the people, the second may compile.
+    # The first image starts the tracks, the second may compile.
     spent = 1000 * float(np.median(seconds[2:]))
     row = {"width": size[0], "height": size[1], "people": people, "tracked": len(result.puppets)}
     return row | {"milliseconds_an_image": spent}
 
 
-def _crowd(model: DeformableStructures, size: tuple[int, int], count: int) -> People:
-    """People beside each other who fill two thirds of the height, or as much as so many can."""
-    joints = model.likely().joints
+def _arrange_people(model: DeformableStructures, size: tuple[int, int], count: int) -> PlacedPeople:
+    """Arrange people side by side, filling two thirds of the height, or less if they need the width."""
+    joints = model.likely_puppet().joints
     joints = joints - joints.min(axis=0)
     width, height = joints.max(axis=0)
-    room = (size[0] - STEP * FRAMES) / count
+    room = (size[0] - STEP_PX * FRAMES) / count
     scale = min(0.66 * size[1] / height, 0.9 * room / width)
     corners = [np.array([room * (k + 0.5) - scale * width / 2, 0.2 * size[1]]) for k in range(count)]
     return [(joints * scale + corner, scale) for corner in corners]
 
 
-def _drawn(model: DeformableStructures, ground: np.ndarray, people: People) -> np.ndarray:
+def _draw_people(model: DeformableStructures, ground: np.ndarray, people: PlacedPeople) -> np.ndarray:
     image, colours = ground.copy(), np.random.default_rng(0).integers(0, 255, (len(model.tree), 3))
     for joints, scale in people:
         contours = model.puppet_from_joints(joints, scale).contours
@@ -80,8 +79,8 @@ def _drawn(model: DeformableStructures, ground: np.ndarray, people: People) -> n
     return image
 
 
-def replaying(seed: int) -> list[Row]:
-    """Replay of the repository's small recording of four cameras, with all that it writes: images, bodies, times."""
+def measure_replay(seed: int) -> list[Row]:
+    """Measure the replay of the repository's small recording of four cameras, including all output."""
     if not GOLDEN.is_dir():
         raise InputError(f"the replay is measured on {GOLDEN}, which only the source tree has")
     with tempfile.TemporaryDirectory() as folder:

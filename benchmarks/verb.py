@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure speed as ratios taken in one run: look-ups, steps, search, growth, tracking, whole fits, images, replay.
+"""Measure speed as ratios in one run: look-ups, steps, search, growth, tracking, whole fits, images, replay.
 
-`bench peers` compares with what people use today, and the part `live` runs the nodes over DDS.
+`bench peers` compares with common alternatives; the part `live` runs the nodes over DDS.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ import sys
 from benchmarks import live
 from benchmarks.speed import Bench
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.tables import text_table
+from flowing_puppet_ros.evaluate.tables import format_table
 
 SUBVERBS = {"peers": "benchmarks.peers_verb"}
 PARTS = {
-    "look-ups": Bench.look_ups,
-    "steps": Bench.steps,
-    "search": Bench.search,
-    "growth": Bench.growth,
-    "tracking": Bench.tracking,
-    "fits": Bench.fits,
-    "images": Bench.images,
-    "replay": Bench.replay,
+    "look-ups": Bench.measure_look_ups,
+    "steps": Bench.measure_steps,
+    "search": Bench.measure_search,
+    "growth": Bench.measure_growth,
+    "tracking": Bench.measure_tracking,
+    "fits": Bench.measure_fits,
+    "images": Bench.measure_images,
+    "replay": Bench.measure_replay,
 }
 LIVE = "live"
-LEAST_SECONDS = 5.0
+MIN_SECONDS = 5.0  # of feeding a node
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,11 +42,11 @@ def run(arguments: argparse.Namespace) -> int:
     """Measure the chosen parts, print the figures and return the exit status."""
     unknown = next((part for part in arguments.parts if part not in (*PARTS, LIVE)), None)
     if unknown is not None:
-        raise InputError(f"{unknown!r} is no part of the bench; choose from {', '.join((*PARTS, LIVE))}")
+        raise InputError(f"{unknown!r} is not a part of the bench; choose from {', '.join((*PARTS, LIVE))}")
     if arguments.seed < 0:
         raise InputError(f"--seed is {arguments.seed}; it must be 0 or more")
-    if not LEAST_SECONDS <= arguments.seconds < float("inf"):
-        raise InputError(f"--seconds is {arguments.seconds:g}; it must be {LEAST_SECONDS:g} or more")
+    if not MIN_SECONDS <= arguments.seconds < float("inf"):
+        raise InputError(f"--seconds is {arguments.seconds:g}; it must be {MIN_SECONDS:g} or more")
     bench, figures = Bench(arguments.seed), {}
     for part in arguments.parts or PARTS:
         print(f"measuring {part}", file=sys.stderr)
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
         figures[part] = live.run(arguments.seconds, arguments.seed) if is_live else PARTS[part](bench)
         if not arguments.json:
             what = live.__doc__ if is_live else PARTS[part].__doc__
-            print(f"{part}: {what}\n{text_table(figures[part])}\n", flush=True)
+            print(f"{part}: {what}\n{format_table(figures[part])}\n", flush=True)
     if arguments.json:
         print(json.dumps(figures))
     return 0

@@ -24,7 +24,11 @@ copyright = "flowing_puppet_ros contributors, Apache-2.0"
 version = release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-exclude_patterns = ["_tools", "_static", "generated/nodes", "generated/bench"]
+# Tables that pages include are no pages of their own.
+exclude_patterns = [
+    *("_tools", "_static"),
+    *("generated/architecture", "generated/bench", "generated/method", "generated/nodes"),
+]
 myst_enable_extensions = ["dollarmath", "deflist"]
 myst_heading_anchors = 3
 # Names of attributes that several classes have, in "Attributes:" of a docstring, are no references.

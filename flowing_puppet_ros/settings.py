@@ -2,9 +2,13 @@
 """One source for settings: frozen dataclasses from which ROS parameters, YAML and command-line flags are made.
 
 @dataclass(frozen=True, slots=True)
-class FlowSettings(Settings):
-    preset: str = setting("medium", "DIS preset", choices=("ultrafast", "fast", "medium"))
-    max_side: int = setting(640, "longest image side the flow is computed at", unit="px", low=32, high=8192)
+class FilterSettings(Settings):
+    kind: str = setting("median", "kind of filter", choices=("mean", "median"))
+    window: int = setting(5, "width of the window", unit="px", low=1, high=99)
+
+@dataclass(frozen=True)
+class ExampleNodeSettings(Settings):
+    filter: FilterSettings = nested(FilterSettings, window=7)  # `filter.kind`, `filter.window`
 """
 
 from __future__ import annotations
@@ -14,6 +18,7 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 from pathlib import Path
 from typing import Any, Self, get_type_hints
 
@@ -28,9 +33,19 @@ def setting(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
+    advanced: bool = False,
 ) -> Any:
-    """Declare a dataclass field with the help text, unit, inclusive range or choices that every front end shows."""
-    return field(default=default, metadata={"help": help, "unit": unit, "low": low, "high": high, "choices": choices})
+    """Declare a dataclass field with the help text, unit, inclusive range or choices that every front end shows.
+
+    An `advanced` one is not offered: front ends take it when it is given by name, and reference pages list it apart.
+    """
+    shown = {"help": help, "unit": unit, "low": low, "high": high, "choices": choices, "advanced": advanced}
+    return field(default=default, metadata=shown)
+
+
+def nested(kind: type[Settings], **changed: Any) -> Any:
+    """Declare a dataclass field for the settings of a part, with `changed` defaults; their names are `field.name`."""
+    return field(default=kind(**changed))
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +60,7 @@ class SettingInfo:
     low: float | None
     high: float | None
     choices: tuple[str, ...]
+    advanced: bool
 
     @property
     def description(self) -> str:
@@ -58,7 +74,7 @@ class SettingInfo:
             limits.append("one of " + ", ".join(self.choices))
         return f"{self.help} ({'; '.join(limits)})" if limits else self.help
 
-    def checked(self, value: Any) -> Any:
+    def check(self, value: Any) -> Any:
         """Return `value` as this setting's type; raise InputError when it has another type or is out of range."""
         if self.type is float and isinstance(value, int) and not isinstance(value, bool):
             value = float(value)
@@ -86,43 +102,93 @@ class Settings:
     def __post_init__(self) -> None:
         """Check types and ranges; raise InputError with the name and value of the first bad setting."""
         for info in self.describe():
-            object.__setattr__(self, info.name, info.checked(getattr(self, info.name)))
+            if "." not in info.name:
+                object.__setattr__(self, info.name, info.check(getattr(self, info.name)))
 
     @classmethod
     def describe(cls) -> Iterator[SettingInfo]:
-        """Yield the settings in the order of their declaration."""
+        """Yield the settings in the order of their declaration; those of a part have names like `flow.preset`."""
         types = get_type_hints(cls)
         for item in dataclasses.fields(cls):  # type: ignore[arg-type]
-            yield SettingInfo(item.name, types[item.name], item.default, **item.metadata)
+            kind = types[item.name]
+            if not issubclass(kind, Settings):
+                yield SettingInfo(item.name, kind, item.default, **item.metadata)
+                continue
+            for info in kind.describe():
+                name, default = f"{item.name}.{info.name}", item.default.value(info.name)
+                yield dataclasses.replace(info, name=name, default=default)
 
     @classmethod
     def from_mapping(cls, values: Mapping[str, Any]) -> Self:
-        """Make an instance from a parameter file or another mapping; unknown names are refused by name."""
-        known = {info.name for info in cls.describe()}
-        unknown = sorted(set(values) - known)
+        """Make an instance from a parameter file or another mapping; unknown names are refused by name.
+
+        The settings of a part are a mapping of their own, or have dotted names.
+        """
+        return cls().with_values(values)
+
+    def value(self, name: str) -> Any:
+        """Return the value of the setting of this name."""
+        return reduce(getattr, name.split("."), self)
+
+    def values(self) -> dict[str, Any]:
+        """Return all settings by name."""
+        return {info.name: self.value(info.name) for info in self.describe()}
+
+    def with_values(self, values: Mapping[str, Any]) -> Self:
+        """Return these settings with some of them changed; InputError for a name or a value that cannot be."""
+        known = {info.name: info for info in self.describe()}
+        flat = dict(_flatten(values, {name.rpartition(".")[0] for name in known}))
+        unknown = sorted(set(flat) - set(known))
         if unknown:
             raise InputError(f"unknown setting {unknown[0]!r}; known are {', '.join(sorted(known))}")
-        return cls(**values)
+        return self._replace({name: known[name].check(value) for name, value in flat.items()})
+
+    def _replace(self, flat: Mapping[str, Any]) -> Self:
+        own: dict[str, Any] = {}
+        inner: dict[str, dict[str, Any]] = {}
+        for name, value in flat.items():
+            head, dot, rest = name.partition(".")
+            if dot:
+                inner.setdefault(head, {})[rest] = value
+            else:
+                own[head] = value
+        own |= {head: getattr(self, head)._replace(values) for head, values in inner.items()}
+        return dataclasses.replace(self, **own)  # type: ignore[type-var]
 
     @classmethod
-    def add_arguments(cls, parser: argparse.ArgumentParser, skip: tuple[str, ...] = ()) -> None:
-        """Add one `--name` flag a setting to `parser`."""
+    def add_arguments(cls, parser: argparse.ArgumentParser, skip: tuple[str, ...] = (), main: str = "") -> None:
+        """Add a flag for each setting to `parser`; advanced ones are not listed in the help.
+
+        That of `flow.max_side` is `--flow-max-side`; those of the part called `main` are named without it.
+        """
         for info in cls.describe():
             if info.name in skip:
                 continue
-            flag = "--" + info.name.replace("_", "-")
+            flag = "--" + info.name.removeprefix(f"{main}.").replace("_", "-").replace(".", "-")
             text = f"{info.description} [{info.default}]".replace("%", "%%")
+            shown: dict[str, Any] = {"dest": info.name, "default": info.default}
+            shown["help"] = argparse.SUPPRESS if info.advanced else text
             if info.type is bool:
-                action = argparse.BooleanOptionalAction
-                parser.add_argument(flag, dest=info.name, action=action, default=info.default, help=text)
+                parser.add_argument(flag, action=argparse.BooleanOptionalAction, **shown)
             else:
-                parser.add_argument(flag, dest=info.name, type=info.type, default=info.default, help=text)
+                parser.add_argument(flag, type=info.type, **shown)
 
     @classmethod
     def from_arguments(cls, arguments: argparse.Namespace) -> Self:
         """Make an instance from the flags that `add_arguments` added; flags that were skipped keep their defaults."""
-        names = {info.name for info in cls.describe()}
-        return cls(**{name: value for name, value in vars(arguments).items() if name in names})
+        given = vars(arguments)
+        names = [info.name for info in cls.describe()]
+        return cls.from_mapping({name: given[name] for name in names if name in given})
+
+
+def _flatten(values: Mapping[str, Any], parts: set[str], before: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield dotted names and values of a mapping that may hold mappings of `parts`."""
+    for key, value in values.items():
+        name = f"{before}{key}"
+        if name in parts and isinstance(value, Mapping):
+            yield from _flatten(value, parts, f"{name}.")
+        else:
+            yield name, value
 
 
 def make_out_folder(path: Path) -> None:

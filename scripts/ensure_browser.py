@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""See to a Chromium for the browser tests, by apt where we are root; `make test` runs this."""
+"""Install Chromium for the browser tests, by apt if we are root; `make test` runs this."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ COMMAND = ("apt-get", "install", "-y", "--no-install-recommends", "chromium")
 
 
 def main() -> None:
-    """Install Chromium if there is none and it can be installed; the tests that need one are skipped without it."""
+    """Install Chromium if it is missing and can be installed; without it, the browser tests are skipped."""
     if any(map(shutil.which, NAMES)):
         return
     if os.geteuid() == 0 and shutil.which("apt-get"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Resolve requirements/*.txt anew and write the exact versions to requirements/lock.txt (`make lock`)."""
+"""Resolve requirements/*.txt again and write the exact versions to requirements/lock.txt (`make lock`)."""
 
 import json
 import subprocess
@@ -13,7 +13,7 @@ HEADER = """# SPDX-License-Identifier: Apache-2.0
 
 
 def main() -> None:
-    """Ask pip what it would install into an empty environment and write that down."""
+    """Write down what pip would install into an empty environment."""
     names = ("runtime", "learn", "cluster", "dev", "docs", "build", "ros")
     lists = [part for name in names for part in ("-r", str(FOLDER / f"{name}.txt"))]
     command = [sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", "--ignore-installed", "--report", "-"]

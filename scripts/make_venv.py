@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make or bring up to date the virtual environment `.venv`; `make venv` runs this with a Python 3.12.
+"""Make or update the virtual environment `.venv`; `make venv` runs this with a Python 3.12.
 
-Each step leaves a stamp with the hash of its inputs in `.venv/.setup`: a step whose inputs are unchanged is skipped,
-and a run that failed goes on where it stopped. Only the standard library is used.
+Each step leaves a stamp with the hash of its inputs in `.venv/.setup`: a step with unchanged inputs is skipped, and a
+failed run resumes where it stopped. Only the standard library is used.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STATE = VENV / ".setup"
 PYTHON = VENV / "bin" / "python"
 SITE_PACKAGES = VENV / "lib" / "python3.12" / "site-packages"
 INTERFACES = (ROOT / "msg_defs", ROOT / "standins" / "tf2_msgs", ROOT / "standins" / "hri_msgs")
-# Shared libraries that the wheels load and do not bring along, and the Debian and Ubuntu packages that have them.
+# Shared libraries that the wheels need but do not contain, and the Debian and Ubuntu packages that provide them.
 SHARED_LIBRARIES = {
     "libusb-1.0.so.0": "libusb-1.0-0",
     "libGL.so.1": "libgl1",
@@ -35,22 +35,22 @@ SHARED_LIBRARIES = {
     "libidn2.so.0": "libidn2-0",
     "libz.so.1": "zlib1g",
 }
-# Include folders of the machine that built the ROS wheels, which stand in their CMake files.
+# Include folders of the machine that built the ROS wheels, which their CMake files name.
 WHEEL_PYTHON_INCLUDE = "/opt/python/cp312-cp312/include/python3.12"
 WHEEL_NUMPY_INCLUDE = "/opt/python/cp312-cp312/lib/python3.12/site-packages/numpy/_core/include"
-# The ROS wheels' start-up hook sets this, and LD_LIBRARY_PATH, for every program that their Python starts; where the
-# guard is inherited the hook of another environment would not run.
+# The ROS wheels' start-up hook sets this, and LD_LIBRARY_PATH, for every program that their Python starts. A program
+# that inherits the guard would not run the hook of its own environment.
 BOOTSTRAP_GUARD = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 ROS_VARIABLES = ("AMENT_PREFIX_PATH", "CMAKE_PREFIX_PATH", "COLCON_PREFIX_PATH", "PYTHONPATH", "ROS_DISTRO")
 
 
 class SetupError(Exception):
-    """What went wrong and the way out, in one sentence."""
+    """A failed set-up: the cause and the way out, in one sentence."""
 
 
 @dataclass(frozen=True)
 class Step:
-    """A part of the set-up that is done again only when its inputs, or a step before it, have changed."""
+    """A step of the set-up that is repeated only if its inputs, or an earlier step, have changed."""
 
     name: str
     title: str
@@ -72,7 +72,7 @@ def sourced_ros() -> tuple[Path, ...]:
 
 
 def child_environment(ros: tuple[Path, ...]) -> dict[str, str]:
-    """Return the environment for the programs this starts: only the chosen ROS is seen, and .venv's programs first."""
+    """Return the environment of child processes: only the chosen ROS is visible, and .venv's programs come first."""
     dropped = {"PYTHONHOME", "VIRTUAL_ENV", BOOTSTRAP_GUARD}
     if not ros:
         dropped |= {"LD_LIBRARY_PATH", *ROS_VARIABLES}
@@ -105,8 +105,8 @@ def run(command: Iterable[str | Path], environment: dict[str, str], log: str, fa
 
 
 def ensure_system_packages() -> None:
-    """Install by apt what the machine lacks where we are root, otherwise say which command does it."""
-    missing = {library: package for library, package in SHARED_LIBRARIES.items() if not loads(library)}
+    """Install missing system packages by apt if we are root, otherwise name the command that does it."""
+    missing = {library: package for library, package in SHARED_LIBRARIES.items() if not can_load(library)}
     if not any(map(shutil.which, ("c++", "g++", "clang++"))):
         missing["a C++ compiler"] = "g++"
     if shutil.which("make") is None:
@@ -128,8 +128,8 @@ def ensure_system_packages() -> None:
             raise SetupError(f"apt-get failed; {advice}")
 
 
-def loads(library: str) -> bool:
-    """Tell whether the dynamic linker finds `library`."""
+def can_load(library: str) -> bool:
+    """Return whether the dynamic linker finds `library`."""
     try:
         ctypes.CDLL(library)
     except OSError:
@@ -138,7 +138,7 @@ def loads(library: str) -> bool:
 
 
 def make_virtual_environment(ros: tuple[Path, ...], environment: dict[str, str]) -> None:
-    """Make .venv, unless a Python 3.12 of the right kind already runs in it."""
+    """Make .venv, unless a suitable Python 3.12 already runs in it."""
     configuration = VENV / "pyvenv.cfg"
     if VENV.exists() and not configuration.is_file():
         raise SetupError(f"{VENV} exists and is no virtual environment: move it away and run make again.")
@@ -176,7 +176,7 @@ def fix_include_paths(environment: dict[str, str]) -> None:
 
 
 def build_interfaces(ros: tuple[Path, ...], environment: dict[str, str]) -> None:
-    """Build and install into .venv the interface packages that the sourced ROS, if any, has not got."""
+    """Build the interface packages that the sourced ROS, if any, lacks, and install them into .venv."""
     for source in INTERFACES:
         name = "flowing_puppet_msgs" if source.name == "msg_defs" else source.name
         if any((prefix / "share" / name / "package.xml").is_file() for prefix in ros):
@@ -207,13 +207,13 @@ def install_package(environment: dict[str, str]) -> None:
 
 
 def check_imports(environment: dict[str, str]) -> None:
-    """Import what the package stands on, so that a broken installation is told now."""
+    """Import the package's dependencies, to detect a broken installation now."""
     code = "import cv2, numba, open3d, rclpy, rosbags, scipy, flowing_puppet_msgs.msg, hri_msgs.msg, tf2_msgs.msg"
     run([PYTHON, "-c", code + ", flowing_puppet_ros"], environment, "check", "An installed package does not import")
 
 
-def steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]:
-    """Return the steps in their order."""
+def make_steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]:
+    """Return the steps in order."""
     names = ("runtime", "learn", "dev", "docs", "build", *(() if ros else ("ros",)))
     lists = [ROOT / "requirements" / f"{name}.txt" for name in (*names, "learn-assets", "lock")]
     package = [ROOT / name for name in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "launch", "config")]
@@ -234,7 +234,7 @@ def steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]:
     return [step for step in every if not (ros and step.name == "headers")]
 
 
-def digest(previous: str, inputs: Iterable[str | Path]) -> str:
+def compute_digest(previous: str, inputs: Iterable[str | Path]) -> str:
     """Return the hash of the previous step's hash, of strings, and of files and folders with their contents."""
     total = hashlib.sha256(previous.encode())
     for item in inputs:
@@ -248,16 +248,16 @@ def digest(previous: str, inputs: Iterable[str | Path]) -> str:
 
 
 def main() -> int:
-    """Do the steps that are due; return the exit status."""
+    """Run the steps that are due; return the exit status."""
     started = time.monotonic()
     try:
         ros = sourced_ros()
         environment = child_environment(ros)
         ensure_system_packages()
         previous, done = "", 0
-        todo = steps(ros, environment)
+        todo = make_steps(ros, environment)
         for number, step in enumerate(todo, 1):
-            previous = digest(previous, step.inputs)
+            previous = compute_digest(previous, step.inputs)
             stamp = STATE / step.name
             if stamp.is_file() and stamp.read_text() == previous:
                 continue

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Say whether this tree may become a release (`make release-check`): versions, changelog, licences, tag, packages.
+"""Check whether this tree can be released (`make release-check`): versions, changelog, licences, tag, packages.
 
-`--quick` leaves out what builds or asks git for tags. Every finding is one sentence; the exit status is their number.
+`--quick` skips the checks that build packages or read git's state. Every finding is one sentence; the exit status is
+their number.
 """
 
 from __future__ import annotations
@@ -24,18 +25,18 @@ LICENSE = "Apache-2.0"
 SPDX = f"SPDX-License-Identifier: {LICENSE}"
 SOURCES = (".py", ".sh", ".js", ".css", ".yaml", ".toml", "CMakeLists.txt", "package.xml", "Makefile", ".ci/run")
 NOT_COPIED = (".*", "build", "install", "log", "out", "docs", "test", "bags", "*.egg-info", "__pycache__")
-# What a package without would install and then not work.
-CARRIED = ("weights/*.npz", "weights/*.md", "annotate/page/*", "interfaces/*/*/*.msg", "py.typed")
+# Data files without which an installed package would not work.
+DATA_FILES = ("weights/*.npz", "weights/*.md", "annotate/page/*", "interfaces/*/*/*.msg", "py.typed")
 
 
-def package_version(root: Path) -> str:
+def read_version(root: Path) -> str:
     """Return the version in the package itself."""
     return re.findall(r'__version__ = "(.+)"', (root / NAME / "__init__.py").read_text())[0]
 
 
 def check_versions(root: Path) -> Iterator[str]:
-    """The version is the same in every manifest, and a number of three parts."""
-    version = package_version(root)
+    """Check that the version has three parts and is the same in every manifest."""
+    version = read_version(root)
     if not re.fullmatch(r"\d+\.\d+\.\d+", version):
         yield f"the version {version!r} of {NAME}/__init__.py is not of the form 1.2.3"
     for manifest in MANIFESTS:
@@ -45,8 +46,8 @@ def check_versions(root: Path) -> Iterator[str]:
 
 
 def check_changelog(root: Path, released: bool) -> Iterator[str]:
-    """The changelog has a heading for the version, which a release does not call unreleased, and says something."""
-    version = package_version(root)
+    """Check that the changelog has a section for the version, not empty and, for a release, not called unreleased."""
+    version = read_version(root)
     sections = re.split(r"^## ", (root / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[1:]
     mine = next((section for section in sections if section.split()[:1] == [version]), None)
     if mine is None:
@@ -58,28 +59,28 @@ def check_changelog(root: Path, released: bool) -> Iterator[str]:
 
 
 def check_licences(root: Path) -> Iterator[str]:
-    """Sources carry the licence line; LICENSE and the manifests agree with it."""
+    """Check that sources have the licence line, and that LICENSE and the manifests agree with it."""
     if "Apache License" not in (root / "LICENSE").read_text():
         yield "LICENSE is not the Apache License"
     for manifest in MANIFESTS:
         if f"<license>{LICENSE}</license>" not in (root / manifest).read_text():
             yield f"{manifest} does not say {LICENSE}"
-    for path in tracked(root):
+    for path in list_tracked(root):
         if path.name.endswith(SOURCES) and SPDX not in "\n".join(path.read_text().splitlines()[:3]):
             yield f"{path.relative_to(root)} has no line {SPDX}"
 
 
 def check_tree(root: Path) -> Iterator[str]:
-    """Nothing is uncommitted and the tag of the version is free."""
-    if git(root, "status", "--porcelain"):
+    """Check that nothing is uncommitted and that the version's tag is free."""
+    if run_git(root, "status", "--porcelain"):
         yield "there are changes that are not committed"
-    tag = f"v{package_version(root)}"
-    if git(root, "tag", "--list", tag):
+    tag = f"v{read_version(root)}"
+    if run_git(root, "tag", "--list", tag):
         yield f"the tag {tag} is taken; raise the version"
 
 
 def check_packages(root: Path) -> Iterator[str]:
-    """The source archive and the wheel build, and hold weights, page files and interface definitions."""
+    """Check that source archive and wheel build and contain weights, page files and interface definitions."""
     with tempfile.TemporaryDirectory() as folder:
         # A copy, since a `build` folder of earlier packages would lend them its files.
         copy = shutil.copytree(root, Path(folder) / "copy", ignore=shutil.ignore_patterns(*NOT_COPIED))
@@ -92,27 +93,27 @@ def check_packages(root: Path) -> Iterator[str]:
             source = {name.partition("/")[2] for name in archive.getnames()}
         with zipfile.ZipFile(next(Path(folder).glob("*.whl"))) as wheel:
             installed = set(wheel.namelist())
-    for pattern in CARRIED:
+    for pattern in DATA_FILES:
         for path in sorted((root / NAME).glob(pattern)):
             name = str(path.relative_to(root))
             yield from (f"{kind} lacks {name}" for kind, names in (("sdist", source), ("wheel", installed))
                         if name not in names)  # fmt: skip
 
 
-def tracked(root: Path) -> list[Path]:
+def list_tracked(root: Path) -> list[Path]:
     """Return the files under version control."""
-    return [path for name in git(root, "ls-files", "-z").split("\0") if name and (path := root / name).is_file()]
+    return [path for name in run_git(root, "ls-files", "-z").split("\0") if name and (path := root / name).is_file()]
 
 
-def git(root: Path, *arguments: str) -> str:
-    """Return what git prints."""
+def run_git(root: Path, *arguments: str) -> str:
+    """Run git and return its output."""
     return subprocess.run(["git", *arguments], cwd=root, check=True, capture_output=True, text=True).stdout.strip()
 
 
 def main(given: list[str]) -> int:
     """Print every finding; return how many there are."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="neither build packages nor look at git's state")
+    parser.add_argument("--quick", action="store_true", help="neither build packages nor read git's state")
     quick = parser.parse_args(given).quick
     findings = [*check_versions(ROOT), *check_changelog(ROOT, released=not quick), *check_licences(ROOT)]
     if not quick:
@@ -120,7 +121,7 @@ def main(given: list[str]) -> int:
     for finding in findings:
         print(f"release check: {finding}", file=sys.stderr)
     if not findings:
-        print(f"{NAME} {package_version(ROOT)}: nothing found")
+        print(f"{NAME} {read_version(ROOT)}: nothing found")
     return min(len(findings), 99)
 
 

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every test runs under: an own ROS domain on this machine only, one thread a library, one browser."""
 
+import fcntl
 import os
 import shutil
+import signal
+import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
+import hypothesis
 import pytest
 from playwright.sync_api import Browser, sync_playwright
 
@@ -14,11 +18,35 @@ from scripts.ensure_browser import NAMES
 if TYPE_CHECKING:
     from flowing_puppet_ros.model.sp import StitchedPuppet
 
-# Below 102 no domain's ports meet the ports that Linux gives to other programs.
-os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+
+def lock_ros_domain() -> int:
+    """Return a ROS domain that no other test process of this machine uses; a lock holds it until this one ends."""
+    # Below 102 no domain's ports meet the ports that Linux gives to other programs.
+    for number in range(os.getpid(), os.getpid() + 100):
+        domain = 1 + number % 100
+        try:
+            lock = os.open(f"{tempfile.gettempdir()}/flowing_puppet_ros_domain_{domain}.lock", os.O_CREAT | os.O_RDWR)
+        except PermissionError:
+            continue
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(lock)
+        else:
+            return domain
+    raise RuntimeError("every ROS domain from 1 to 100 is in use by tests")
+
+
+os.environ["ROS_DOMAIN_ID"] = str(lock_ros_domain())
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
+# A shell's background job ignores interrupts, and so would the programs that the tests start and interrupt.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# How long an example takes depends on what else the machine does.
+hypothesis.settings.register_profile("here", deadline=None)
+hypothesis.settings.load_profile("here")
 
 # Without these Chromium asks its maker's servers for updates, and needs a sandbox that root has not got.
 BROWSER_FLAGS = (

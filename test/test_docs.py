@@ -1,20 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the documentation site is made of: generated pages hold what the code has, figures are those that are drawn."""
 
+import pkgutil
 import re
 from pathlib import Path
 
 import docstrings  # type: ignore[import-not-found]
+import equations  # type: ignore[import-not-found]
 import figures_2d  # type: ignore[import-not-found]
 import figures_3d  # type: ignore[import-not-found]
 import interfaces  # type: ignore[import-not-found]
+import layers  # type: ignore[import-not-found]
 import mathml  # type: ignore[import-not-found]
+import numpy as np
 import pages  # type: ignore[import-not-found]
 import pytest
 from docutils import nodes
 from sphinx.errors import SphinxError
 
+from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.search.particles import states_to_particles
+from flowing_puppet_ros.body.search.schedule import four_stages
 from flowing_puppet_ros.cli import VERBS
+from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.stream.components.registry import COMPONENTS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -74,6 +82,71 @@ def test_formulas_become_mathml_or_stop_the_build() -> None:
         mathml.mathml(nodes.math(text=r"\nosuch{x}"), False)
 
 
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [
+        ("the data term (thesis Eq. 53) of 16 parts", [53]),
+        ("Eqs. 55-58", [55, 56, 57, 58]),
+        ("Eqs. 20 to 22", [20, 21, 22]),
+        ("Eqs. 52, 53 and 54", [52, 53, 54]),
+        ("Eqs. 48 and 50-52, see\nEqs. 16,\n17, and 19", [16, 17, 19, 48, 50, 51, 52]),
+        ("Eq. 21, 3 px", [21]),
+        ("Eq. 10's mean angle", [10]),
+        ("Freq. 12, Eq 13", []),
+    ],
+)
+def test_citations_are_read_number_by_number(text: str, numbers: list[int]) -> None:
+    assert equations.cited(text) == numbers
+
+
+@pytest.mark.parametrize("wrong", ["Eq. 65", "Eq. 0", "Eqs. 58-55", "Eqs. 63 to 65"])
+def test_citations_of_equations_that_do_not_exist_are_refused(wrong: str) -> None:
+    with pytest.raises(ValueError, match=wrong.split()[-1]):
+        equations.cited(wrong)
+
+
+def test_every_equation_is_computed_or_said_not_to_be() -> None:
+    precise, _ = equations.citations()
+    wanted = set(range(equations.FIRST, equations.LAST + 1))
+    assert wanted - set(precise) == set(equations.NOT_COMPUTED)
+    assert precise[55] == ["body.search.levenberg.levenberg_marquardt", "body.search.levenberg.assemble"]
+
+
+def test_the_table_of_equations_has_each_once_and_names_what_exists(written: Path) -> None:
+    rows = re.findall(r"^\| (\d+) \| (.+) \|$", (written / "method" / "equations.md").read_text(), re.MULTILINE)
+    assert [int(number) for number, _ in rows] == list(range(equations.FIRST, equations.LAST + 1))
+    for _, names in rows:
+        for target in re.findall(r"<flowing_puppet_ros\.([\w.]+)>", names):
+            assert pkgutil.resolve_name(in_package(target)).__doc__
+
+
+def in_package(dotted: str) -> str:
+    """Return the name of a class or function of the package as `pkgutil.resolve_name` takes it: module:object."""
+    parts = ["flowing_puppet_ros", *dotted.split(".")]
+    length = max(n for n in range(1, len(parts) + 1) if ROOT.joinpath(*parts[:n]).with_suffix(".py").is_file())
+    return f"{'.'.join(parts[:length])}:{'.'.join(parts[length:])}"
+
+
+def test_the_table_of_layers_has_every_room_once(written: Path) -> None:
+    contract = layers.load_contract()
+    rooms = re.findall(r"^\| \d+ \| \[?`([\w.]+)`", (written / "architecture" / "layers.md").read_text(), re.MULTILINE)
+    assert sorted(rooms) == sorted(room for room in contract.MAY_IMPORT if contract.files_in(room))
+
+
+def test_the_files_and_modules_that_pages_name_are_there() -> None:
+    package = ROOT / "flowing_puppet_ros"
+    rooms = "|".join(path.parent.name for path in package.glob("*/__init__.py"))
+    written = [page for page in (ROOT / "docs").rglob("*.md") if "generated" not in page.parts]
+    text = "".join(page.read_text() for page in [ROOT / "README.md", *written])
+    files = {f"{name}.py" for name in re.findall(rf"`((?:{rooms})/[\w/]+)\.py`", text)}
+    assert len(files) > 10
+    assert [name for name in sorted(files) if not (package / name).is_file()] == []
+    parameters = {info.name for component in COMPONENTS.values() for info in component.settings_type.describe()}
+    modules = set(re.findall(rf"`((?:{rooms})\.[a-z_.]+)`", text)) - parameters
+    missing = [name for name in sorted(modules) if not list(package.glob(f"{name.replace('.', '/')}*"))]
+    assert missing == []
+
+
 def test_pages_show_the_figures_that_are_drawn() -> None:
     drawn = {path.stem for path in (ROOT / "docs" / "drawn").iterdir()}
     shown: set[str] = set()
@@ -89,6 +162,15 @@ def test_the_tests_that_pages_name_are_there() -> None:
     named = set(re.findall(r"test/[\w/]+\.py", text))
     assert len(named) > 20
     assert [name for name in sorted(named) if not (ROOT / name).is_file()] == []
+
+
+def test_the_figure_of_a_search_records_every_round() -> None:
+    made = figures_3d.Bodies()
+    grid = CloudGrid.build(made.points, made.normals)
+    start = states_to_particles(made.model, [made.body, made.model.rest_state()])
+    targets, stages = JointTargets.none(made.model), four_stages(made.model.tree)
+    made.recorded.optimise(start, grid, targets, stages, 3, np.random.default_rng(0))
+    assert len(made.recorded.bodies) == len(made.recorded.particles) == 3
 
 
 def test_a_figure_is_a_picture_with_something_on_it() -> None:

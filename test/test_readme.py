@@ -86,6 +86,7 @@ def test_readme_and_docs_have_blocks_that_run() -> None:
     assert len(TESTED) > 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", TESTED, ids=name)
 def test_tested_blocks_run(page: Path, folder: Path) -> None:
     for info, code in blocks(page.read_text()):

@@ -71,7 +71,7 @@ def test_steps_resume_and_skip(setup_script: ModuleType, monkeypatch: pytest.Mon
 
         return setup_script.Step(name, name, [inputs[name]], work)
 
-    monkeypatch.setattr(setup_script, "steps", lambda ros, environment: [step(name) for name in inputs])
+    monkeypatch.setattr(setup_script, "make_steps", lambda ros, environment: [step(name) for name in inputs])
     monkeypatch.setattr(setup_script, "ensure_system_packages", lambda: None)
     assert setup_script.main() == 1
     broken.clear()
@@ -120,6 +120,7 @@ def test_sourced_ros_is_used_only_when_it_is_jazzy(
     assert not {"LD_LIBRARY_PATH", "ROS_DISTRO"} & set(setup_script.child_environment(()))
 
 
+@pytest.mark.slow
 @pytest.mark.ros
 def test_colcon_builds_both_packages(tmp_path: Path) -> None:
     """`colcon build --base-paths . msg_defs` works, and what it installs runs."""

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fit the Anny body to a cloud by gradients of a chamfer distance, with JAX; `flowing-puppet bench peers` runs this.
 
-Runs in an environment of its own (jax, numpy, scipy). Reads an .npz with the body (rest vertices and joints as linear
+Runs in its own environment (jax, numpy, scipy). Reads an .npz with the body (rest vertices and joints as linear
 functions of shape coefficients, skin weights, parents), the cloud and the true vertices; prints one JSON object with
 the error of the best hypothesis, by its own chamfer distance, over processor time.
 
-Adam over the rotations of all bones, place and shape of several headings at once; closest points, both ways, by a
-cKDTree and renewed at every step; weak priors on bones and shape. Compilation is not counted.
+Adam optimises the rotations of all bones, position and shape from several headings at once. Closest points, both ways,
+are updated by a cKDTree at every step; priors on bones and shape are weak. Compilation is not counted.
 """
 
 import json
@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import cKDTree
 
-HEADINGS, PRIOR_POSE, PRIOR_SHAPE = 4, 1e-4, 1e-4
-RATES = 0.03, 0.003  # step size at the start and at the end, falling exponentially
-DECAY = (0.9, 0.999)
+HEADINGS, PRIOR_POSE, PRIOR_SHAPE = 4, 1e-4, 1e-4  # start headings, and weights of the priors
+LEARNING_RATES = 0.03, 0.003  # step size at the start and at the end, falling exponentially
+ADAM_DECAY = (0.9, 0.999)
 
 
-def rotations(vectors: Any) -> Any:
-    """Rotation matrices (..., 3, 3) of axis-angle vectors (..., 3)."""
+def rotation_matrices(vectors: Any) -> Any:
+    """Return the rotation matrices (..., 3, 3) of axis-angle vectors (..., 3)."""
     angle = jnp.sqrt((vectors**2).sum(-1) + 1e-12)[..., None, None]
     x, y, z = jnp.moveaxis(vectors, -1, 0)
     zero = jnp.zeros_like(x)
@@ -33,12 +33,12 @@ def rotations(vectors: Any) -> Any:
     return jnp.eye(3) + jnp.sin(angle) / angle * cross + (1 - jnp.cos(angle)) / angle**2 * (cross @ cross)
 
 
-def posed(unknowns: Any, body: Any) -> Any:
-    """Vertices (V, 3) of one hypothesis by linear blend skinning."""
+def pose_body(unknowns: Any, body: Any) -> Any:
+    """Return the vertices (V, 3) m of one hypothesis by linear blend skinning."""
     bones, place, shape = unknowns
     vertices = body["vertices"] + jnp.tensordot(body["vertex_basis"], shape, 1)
     heads = body["joints"] + jnp.tensordot(body["joint_basis"], shape, 1)
-    local = rotations(bones)
+    local = rotation_matrices(bones)
     world, joints = [], []
     for bone, parent in enumerate(body["parents"]):
         if parent < 0:
@@ -47,15 +47,15 @@ def posed(unknowns: Any, body: Any) -> Any:
         else:
             world.append(world[parent] @ local[bone])
             joints.append(joints[parent] + world[parent] @ (heads[bone] - heads[parent]))
-    turned, offsets = jnp.stack(world), jnp.stack(joints)
-    offsets = offsets - jnp.einsum("bij,bj->bi", turned, heads)
-    blended = jnp.einsum("vb,bij->vij", body["weights"], turned)
+    rotations, offsets = jnp.stack(world), jnp.stack(joints)
+    offsets = offsets - jnp.einsum("bij,bj->bi", rotations, heads)
+    blended = jnp.einsum("vb,bij->vij", body["weights"], rotations)
     return jnp.einsum("vij,vj->vi", blended, vertices) + body["weights"] @ offsets
 
 
 def loss(unknowns: Any, body: Any, cloud: Any, of_vertex: Any, of_point: Any) -> Any:
-    """Chamfer distance, both ways, for given closest points, and the priors."""
-    vertices = posed(unknowns, body)
+    """Return the two-way chamfer distance for given closest points, plus the priors."""
+    vertices = pose_body(unknowns, body)
     there = ((vertices - cloud[of_vertex]) ** 2).sum(-1).mean()
     back = ((cloud - vertices[of_point]) ** 2).sum(-1).mean()
     return there + back + PRIOR_POSE * (unknowns[0][1:] ** 2).mean() + PRIOR_SHAPE * (unknowns[2] ** 2).mean()
@@ -71,7 +71,7 @@ def main(path: str, steps: int, every: int) -> None:
     bones[:, 0, 2] = np.arange(HEADINGS) * 2 * np.pi / HEADINGS
     place = np.tile(cloud.mean(axis=0) - data["vertices"].mean(axis=0), (HEADINGS, 1))
     unknowns = (jnp.asarray(bones), jnp.asarray(place), jnp.zeros((HEADINGS, data["vertex_basis"].shape[2])))
-    pose = jax.jit(jax.vmap(lambda each: posed(each, body)))
+    pose = jax.jit(jax.vmap(lambda each: pose_body(each, body)))
     gradient_of = jax.jit(
         jax.vmap(jax.grad(lambda u, a, b: loss(u, body, jnp.asarray(cloud), a, b)), in_axes=(0, 0, 0))
     )
@@ -92,10 +92,10 @@ def main(path: str, steps: int, every: int) -> None:
             error = float(np.linalg.norm(vertices[best] - truth, axis=1).mean())
             curve.append([time.process_time() - started, error, float(there[best] + back[best]) / 2])
         slope = gradient_of(unknowns, of_vertex, of_point)
-        first = jax.tree.map(lambda m, g: DECAY[0] * m + (1 - DECAY[0]) * g, first, slope)
-        second = jax.tree.map(lambda v, g: DECAY[1] * v + (1 - DECAY[1]) * g * g, second, slope)
-        rate = RATES[0] * (RATES[1] / RATES[0]) ** (step / steps)
-        scale = rate * np.sqrt(1 - DECAY[1] ** step) / (1 - DECAY[0] ** step)
+        first = jax.tree.map(lambda m, g: ADAM_DECAY[0] * m + (1 - ADAM_DECAY[0]) * g, first, slope)
+        second = jax.tree.map(lambda v, g: ADAM_DECAY[1] * v + (1 - ADAM_DECAY[1]) * g * g, second, slope)
+        rate = LEARNING_RATES[0] * (LEARNING_RATES[1] / LEARNING_RATES[0]) ** (step / steps)
+        scale = rate * np.sqrt(1 - ADAM_DECAY[1] ** step) / (1 - ADAM_DECAY[0] ** step)
         moves = jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + 1e-8), first, second)
         unknowns = tuple(old - scale * move for old, move in zip(unknowns, moves, strict=True))
     print(json.dumps({"curve": curve}))

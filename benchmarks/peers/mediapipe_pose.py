@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Track the people of video clips with MediaPipe's pose; `flowing-puppet bench peers` runs this.
 
-Runs in an environment of its own (mediapipe 0.10.21). Arguments: clips. Prints one JSON object: for each clip the
-joints of every frame in the form of keypoints.json, and the processor milliseconds a frame takes; the first of every
-clip is left out, since it loads the model.
+Runs in its own environment (mediapipe 0.10.21). Arguments: clips. Prints one JSON object: for each clip the joints of
+every frame in the form of keypoints.json, and the processor milliseconds per frame without the first of every clip,
+which loads the model.
 """
 
 import json
@@ -29,7 +29,7 @@ NAMES = {
 }
 
 
-def frames(clip: str) -> Iterator[np.ndarray]:
+def read_frames(clip: str) -> Iterator[np.ndarray]:
     """Yield the RGB images of a video."""
     video = cv2.VideoCapture(clip)
     while True:
@@ -46,7 +46,7 @@ def main(clips: list[str]) -> None:
     for clip in clips:
         pose = mediapipe.solutions.pose.Pose(model_complexity=1)
         people = {}
-        for index, image in enumerate(frames(clip)):
+        for index, image in enumerate(read_frames(clip)):
             started = time.process_time()
             found = pose.process(image).pose_landmarks
             if index:

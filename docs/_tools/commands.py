@@ -7,7 +7,7 @@ import argparse
 import re
 from collections.abc import Iterator
 
-from flowing_puppet_ros.cli import VERBS, verb_module, verb_with_parser
+from flowing_puppet_ros.cli import VERBS, import_verb, make_verb_parser
 
 
 def pages() -> Iterator[tuple[str, str]]:
@@ -15,7 +15,7 @@ def pages() -> Iterator[tuple[str, str]]:
     parts = [
         "# Command line\n",
         "`flowing-puppet VERB --help` prints the same. Exit status: 0 done, 1 the work failed, 2 unusable arguments or "
-        "input, told in one sentence on standard error. `--json` prints one JSON object per input on standard output; "
+        "input, with one sentence on standard error. `--json` prints one JSON object per input on standard output; "
         "progress goes to standard error.\n",
     ]
     for verb, summary in VERBS.items():
@@ -27,9 +27,9 @@ def pages() -> Iterator[tuple[str, str]]:
 
 def parsers(verb: str) -> Iterator[tuple[str, argparse.ArgumentParser]]:
     """Yield the parser of a verb, of its sub-verbs and of its sub-commands, with the words that lead there."""
-    subverbs = getattr(verb_module(verb), "SUBVERBS", {})
+    subverbs = getattr(import_verb(verb), "SUBVERBS", {})
     for given in ([], *([name] for name in subverbs)):
-        _, parser, _ = verb_with_parser(verb, list(given))
+        _, parser, _ = make_verb_parser(verb, list(given))
         yield from below(" ".join([verb, *given]), parser)
 
 

@@ -19,7 +19,7 @@ WIDEST = 1400  # px
 
 
 def narrowed(picture: np.ndarray) -> np.ndarray:
-    """A picture no wider than a page shows it."""
+    """Return a picture no wider than a page shows it."""
     factor = WIDEST / picture.shape[1]
     if factor >= 1:
         return picture
@@ -27,7 +27,7 @@ def narrowed(picture: np.ndarray) -> np.ndarray:
 
 
 def main(names: list[str]) -> int:
-    """Draw and say how long each took."""
+    """Draw the named figures, or all, and print how long each took."""
     known = {**figures_2d.FIGURES, **figures_3d.FIGURES}
     unknown = set(names) - set(known)
     if unknown:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of the 2D model, of puppet flow and of tracking, on people that are drawn here."""
+"""Figures of the 2D model, of puppet flow and of tracking, on a synthetic person."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import Any
 import cv2
 import numpy as np
 
-from flowing_puppet_ros.cli.sample.ds import picture as puppet_picture
+from flowing_puppet_ros.cli.sample.ds import draw_picture
 from flowing_puppet_ros.draw.flow_colour import flow_scale, flow_to_rgb
 from flowing_puppet_ros.draw.overlay import DrawnPuppet, draw_puppets
 from flowing_puppet_ros.draw.palette import part_colours
-from flowing_puppet_ros.draw.pictures import contact_sheet, row
-from flowing_puppet_ros.draw.plots import Series, line_plot
+from flowing_puppet_ros.draw.pictures import join_row, make_contact_sheet
+from flowing_puppet_ros.draw.plots import Series, draw_line_plot
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.model.ds.multiview import VIEW_HEADINGS, MultiViewStructures
@@ -32,13 +32,13 @@ Picture = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class DrawnPerson:
-    """A person whose left forearm swings while they walk, each part with a texture that moves with it."""
+    """A synthetic person who walks swinging the left forearm; every part has a texture that moves with it."""
 
     seed: int = 4
 
     @cached_property
     def model(self) -> DeformableStructures:
-        """The model that draws them."""
+        """The model that draws the person."""
         return DeformableStructures.load()
 
     @cached_property
@@ -59,9 +59,9 @@ class DrawnPerson:
         return np.asarray(cv2.resize(small, SIZE, interpolation=cv2.INTER_CUBIC))
 
     def joints(self, time: float) -> np.ndarray:
-        """Joints (J,2) px at a time in frames."""
+        """Return the joints (J, 2) px at a time in frames."""
         names = list(self.model.joint_names)
-        likely = self.model.likely().joints
+        likely = self.model.likely_puppet().joints
         joints = (likely - likely[names.index("neck")]) * SCALE + NECK + [1.2 * time, 0.0]
         elbow, wrist = names.index("left_elbow"), names.index("left_wrist")
         angle = -0.9 + 0.8 * np.sin(0.16 * time)
@@ -70,11 +70,11 @@ class DrawnPerson:
         return np.asarray(joints)
 
     def shape(self, time: float) -> PuppetShape:
-        """The puppet on those joints."""
+        """Return the puppet on those joints."""
         return self.model.puppet_from_joints(self.joints(time), SCALE)
 
     def image(self, time: float) -> Picture:
-        """The picture (H,W,3) at a time in frames."""
+        """Draw the image (H, W, 3) at a time in frames."""
         image, shape = self._ground.copy(), self.shape(time)
         for part in depth_order(self.model):
             a, b = shape.joints[self.model.bone[part]]
@@ -86,7 +86,7 @@ class DrawnPerson:
         return image
 
     def drawn(self, time: float) -> DrawnPuppet:
-        """The puppet as the overlay draws it."""
+        """Return the puppet as the overlay draws it."""
         shape = self.shape(time)
         certain = np.ones(len(shape.joints))
         names, parts = self.model.joint_names, self.model.tree.names
@@ -94,13 +94,13 @@ class DrawnPerson:
 
 
 def ds_samples() -> Picture:
-    """Eight random puppets."""
+    """Draw eight random puppets."""
     model, rng = DeformableStructures.load(), np.random.default_rng(3)
-    return contact_sheet([puppet_picture(model, model.sample(rng)) for _ in range(8)], 8)
+    return make_contact_sheet([draw_picture(model, model.sample(rng)) for _ in range(8)], 8)
 
 
 def ds_bend() -> Picture:
-    """One arm at five angles of the elbow."""
+    """Draw one arm at five angles of the elbow."""
     person, pictures = DrawnPerson(), []
     names, parts = list(person.model.joint_names), person.model.tree.names
     arm = [parts.index("left_upper_arm"), parts.index("left_lower_arm")]
@@ -119,29 +119,29 @@ def ds_bend() -> Picture:
         chosen = ("left_shoulder", "left_elbow", "left_wrist")
         drawn = DrawnPuppet("", chosen, shown, certain, tuple(parts[part] for part in arm), contours, (0, 1))
         pictures.append(draw_puppets(np.full((210, 210, 3), 255, np.uint8), [drawn], opacity=0.8, labels=False))
-    return contact_sheet(pictures, 5)
+    return make_contact_sheet(pictures, 5)
 
 
 def ds_views() -> Picture:
-    """The likely puppet of every view."""
+    """Draw the most probable puppet of every view."""
     sides = MultiViewStructures.load()
     pictures = [
-        puppet_picture(side, side.likely(), angle) for side, angle in zip(sides.views, VIEW_HEADINGS, strict=True)
+        draw_picture(side, side.likely_puppet(), angle) for side, angle in zip(sides.views, VIEW_HEADINGS, strict=True)
     ]
-    return contact_sheet(pictures, 9)
+    return make_contact_sheet(pictures, 9)
 
 
 def labels() -> Picture:
-    """A puppet on an image and its label image."""
+    """Draw a puppet on an image and its label image."""
     person = DrawnPerson()
     image = draw_puppets(person.image(0), [person.drawn(0)], labels=False)
     found = render_labels(person.shape(0).contours, depth_order(person.model), SIZE[::-1])
     colours = np.vstack([[[30, 30, 30]], part_colours(person.model.tree.names)]).astype(np.uint8)
-    return row([person.image(0), image, colours[found]], SIZE[1])
+    return join_row([person.image(0), image, colours[found]], SIZE[1])
 
 
 def contour() -> Picture:
-    """Where the contour term looks along one arm."""
+    """Draw the cells of the contour term along one arm."""
     person, factor = DrawnPerson(), 3
     image = np.asarray(cv2.resize(person.image(0), None, fx=factor, fy=factor, interpolation=cv2.INTER_CUBIC))
     for name in ("left_upper_arm", "left_lower_arm"):
@@ -164,7 +164,7 @@ def contour() -> Picture:
 
 
 def puppet_flow() -> Picture:
-    """Two frames, the flow between them, and the puppet flow."""
+    """Draw two frames, the flow between them, and the puppet flow."""
     person = DrawnPerson()
     times = (0.0, 2.0)
     tracker = FlowingPuppetTracker(person.model)
@@ -174,23 +174,23 @@ def puppet_flow() -> Picture:
     assert moved is not None and result.flow is not None
     scale = flow_scale(result.flow[0])
     frames = [person.image(times[0]), draw_puppets(person.image(times[1]), [shown(person, result)], labels=False)]
-    return row([*frames, flow_to_rgb(result.flow[0], scale), flow_to_rgb(moved.field, scale)], 300)
+    return join_row([*frames, flow_to_rgb(result.flow[0], scale), flow_to_rgb(moved.field, scale)], 300)
 
 
 def shown(person: DrawnPerson, result: TrackResult) -> DrawnPuppet:
-    """A tracked puppet as the overlay draws it."""
+    """Return a tracked puppet as the overlay draws it."""
     (puppet,) = result.puppets
     template = person.drawn(0)
     return replace(template, joints=puppet.joints, confidence=puppet.confidence, contours=puppet.contours)
 
 
 def detection(person: DrawnPerson, time: float, shift: np.ndarray | float = 0.0) -> Keypoints:
-    """The person as a detector reports it."""
+    """Return the person as a detector reports it."""
     return Keypoints(person.model.joint_names, person.joints(time) + shift, np.full(len(person.joints(0)), 0.9))
 
 
 def tracking() -> str:
-    """Error of the swinging wrist: detections, flow alone, both."""
+    """Plot the error of the swinging wrist: detections, flow alone, both."""
     person, rng, frames = DrawnPerson(), np.random.default_rng(8), 48
     wrist = person.model.joint_names.index("left_wrist")
     alone, fused = FlowingPuppetTracker(person.model), FlowingPuppetTracker(person.model)
@@ -208,11 +208,13 @@ def tracking() -> str:
     names = ("detections", "flow alone", "both")
     x = np.arange(frames, dtype=float)
     lines = [Series(f"{name} ({errors[k].mean():.1f} px)", x, errors[k]) for k, name in enumerate(names)]
-    return standalone(line_plot(lines, "error of the left wrist", "frame", "error, px"), [line.name for line in lines])
+    return standalone(
+        draw_line_plot(lines, "error of the left wrist", "frame", "error, px"), [line.name for line in lines]
+    )
 
 
 def standalone(plot: str, names: list[str]) -> str:
-    """A plot of `draw.plots` as an SVG file, with colours and a legend of its own."""
+    """Return a plot of `draw.plots` as an SVG file, with its own colours and legend."""
     svg = plot[: plot.index("</svg>")].replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1)
     colours = ("#b23a48", "#2f6f9f", "#2a9d5c")
     style = "text{font:12px sans-serif;fill:#333}.line{fill:none;stroke-width:1.8}.grid{stroke:#ddd}"

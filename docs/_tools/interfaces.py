@@ -22,7 +22,7 @@ def pages() -> Iterator[tuple[str, str]]:
 def definition(path: Path, kind: str) -> str:
     """Return one interface as a section with a table of fields for each of its parts."""
     lines = [f"## `{path.stem}`\n"]
-    head, *sections = leading_comment(path.read_text())
+    head, sections = leading_comment(path.read_text())
     lines.append(head + "\n")
     for title, section in zip(SECTIONS[kind], sections, strict=True):
         if title:
@@ -31,7 +31,7 @@ def definition(path: Path, kind: str) -> str:
     return "\n".join(lines)
 
 
-def leading_comment(text: str) -> list[str | list[str]]:  # type: ignore[misc]
+def leading_comment(text: str) -> tuple[str, list[list[str]]]:
     """Return the comment before the first field, then the rows of each section."""
     comment: list[str] = []
     sections: list[list[str]] = [[]]
@@ -45,7 +45,7 @@ def leading_comment(text: str) -> list[str | list[str]]:  # type: ignore[misc]
             comment.append(meaning)
         elif meaning:
             raise ValueError(f"a comment between fields belongs behind one: {line!r}")
-    return [" ".join(comment), *sections]
+    return " ".join(comment), sections
 
 
 def row(code: str, meaning: str) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pages and tables that are generated from the code, so that they cannot fall behind it."""
+"""Pages and tables generated from the code, so that they cannot fall behind it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import commands
+import equations
 import interfaces
+import layers
 
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
-from flowing_puppet_ros.settings import Settings
+from flowing_puppet_ros.settings import SettingInfo, Settings
 from flowing_puppet_ros.stream.component import Component, Port
 from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_settings
 
@@ -36,8 +38,8 @@ API = {
     "draw": "Pictures",
     "report": "Reports",
 }
-# Settings that open every topic of a component.
-EVERYTHING = {"cameras": "CAMERA,other", "humans": True}
+# Settings with which a component has all of its topics.
+EVERYTHING = {"cameras": "CAMERA,other", "ros4hri.publish": True}
 QOS = {
     "sensor": "sensor data: best effort, keep last 5",
     "reliable": "reliable, keep last 10",
@@ -52,6 +54,8 @@ def write(folder: Path) -> None:
         *bench_tables(),
         *interfaces.pages(),
         *commands.pages(),
+        *equations.pages(API),
+        *layers.pages(API),
         *api_pages(),
         *model_cards(),
     ]:
@@ -80,15 +84,17 @@ def node_tables() -> Iterator[tuple[str, str]]:
 
 
 def ports(component: type[Component]) -> tuple[tuple[Port, ...], tuple[Port, ...]]:
-    """Return the inputs and outputs of a component that publishes all it can; one camera stands for all."""
+    """Return the inputs and outputs of a component that publishes all it can; one camera stands for all of them."""
     known = {info.name for info in component.settings_type.describe()}
-    settings = component.settings_type(**{name: value for name, value in EVERYTHING.items() if name in known})
+    settings = component.settings_type.from_mapping(
+        {name: value for name, value in EVERYTHING.items() if name in known}
+    )
     made = component(settings, BagMessageFactory())
     return tuple(port for port in made.inputs if not port.name.startswith("other/")), made.outputs
 
 
 def port_row(port: Port, humans: bool = False) -> list[str]:
-    """Return one line of a table of topics; `humans` are those that are published only on request."""
+    """Return one row of a table of topics; `humans` marks those that are published only on request."""
     package, _, message = port.type.split("/")
     notes = []
     if port.transport:
@@ -96,20 +102,29 @@ def port_row(port: Port, humans: bool = False) -> list[str]:
     if port.optional:
         notes.append("optional")
     if port.lazy:
-        notes.append("made only while somebody listens")
+        notes.append("made only while subscribed to")
     if humans:
-        notes.append("with `humans:=true`")
+        notes.append("with `ros4hri.publish:=true`")
     if port.per_person:
-        notes.append("one topic a person")
+        notes.append("one topic per person")
     linked = package == "flowing_puppet_msgs"
     shown = f"[`{package}/{message}`](/generated/messages.md)" if linked else f"`{package}/{message}`"
     return [f"`{port.name}`", shown, QOS[port.qos], ", ".join(notes)]
 
 
 def parameter_table(*settings: type[Settings]) -> str:
-    """Return the parameters that come from settings."""
+    """Return the table of the parameters that come from settings."""
+    infos = [info for kind in settings for info in kind.describe()]
+    offered, advanced = ([info for info in infos if info.advanced is kind] for kind in (False, True))
+    if not advanced:
+        return _setting_rows(offered)
+    heading = "Advanced; declared only if given at the start:"
+    return f"{_setting_rows(offered)}\n{heading}\n\n{_setting_rows(advanced)}"
+
+
+def _setting_rows(infos: Iterable[SettingInfo]) -> str:
     rows = []
-    for info in (info for kind in settings for info in kind.describe()):
+    for info in infos:
         limits = ", ".join(f"`{choice}`" for choice in info.choices)
         if info.low is not None or info.high is not None:
             limits = " to ".join("any" if bound is None else f"{bound:g}" for bound in (info.low, info.high))
@@ -119,7 +134,7 @@ def parameter_table(*settings: type[Settings]) -> str:
 
 
 def bench_tables() -> Iterator[tuple[str, str]]:
-    """Yield the tables of what `flowing-puppet bench` measured, as it was kept in docs/measured."""
+    """Yield the tables of what `flowing-puppet bench` measured, from the files in docs/measured."""
     for path in sorted(MEASURED.glob("*.json")):
         for part, rows in json.loads(path.read_text()).items():
             heads = [head.replace("_", " ") for head in rows[0]]
@@ -127,21 +142,21 @@ def bench_tables() -> Iterator[tuple[str, str]]:
 
 
 def figure(value: object) -> str:
-    """Return a measured value to three digits; None, which stands for no finite number, is never."""
+    """Return a measured value to three digits, or "never" for None, which stands for no finite number."""
     if value is None:
         return "never"
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
 def api_pages() -> Iterator[tuple[str, str]]:
-    """Yield the API reference: a page a subpackage, and their index."""
+    """Yield the API reference: a page per subpackage, and their index."""
     yield (
         "api/index.md",
         "\n".join(
             [
                 "# API reference",
                 "",
-                "Generated from the docstrings. Names that begin with an underscore are left out: they may change.",
+                "Generated from the docstrings. Names that begin with an underscore are private and left out.",
                 "",
                 "```{toctree}\n:maxdepth: 1\n",
                 *API,
@@ -151,7 +166,7 @@ def api_pages() -> Iterator[tuple[str, str]]:
         ),
     )
     beside = [path.stem for path in sorted(PACKAGE.glob("*.py")) if not path.stem.startswith("__")]
-    yield "api/settings.md", api_page("settings", "Settings, errors and what else all parts share", beside)
+    yield "api/settings.md", api_page("settings", "Settings, errors and whatever else all parts share", beside)
     for part, title in API.items():
         files = sorted(path for path in (PACKAGE / part).rglob("*.py") if path.stem != "__init__")
         modules = [".".join(file.relative_to(PACKAGE).with_suffix("").parts) for file in files]
@@ -167,11 +182,11 @@ def api_page(part: str, title: str, modules: Iterable[str]) -> str:
 
 
 def model_cards() -> Iterator[tuple[str, str]]:
-    """Yield the model cards, their headings one level down, on one page."""
+    """Yield the model cards on one page, their headings one level down."""
     cards = sorted((PACKAGE / "weights").glob("*.md"))
     shifted = [re.sub(r"^(#+) ", r"#\1 ", card.read_text().strip(), flags=re.MULTILINE) for card in cards]
     heading = (
         "# Model cards\n\nThe learned models that ship in the package, `flowing_puppet_ros/weights`. "
-        "`flowing-puppet learn` makes all of them anew.\n"
+        "`flowing-puppet learn` reproduces all of them.\n"
     )
     yield "cards.md", heading + "\n" + "\n\n".join(shifted) + "\n"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page asks of the body model: a puppet to begin with, the outline of a posed one, one carried by the flow."""
+"""Puppets for the page: a new one, the outline of a posed one, and one propagated by the flow from the image before."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order
 from flowing_puppet_ros.model.ds.shape import View
 
-START_HEIGHT = 0.9  # of the image that a new puppet's trunk, head and arms take
+START_HEIGHT_SHARE = 0.9  # of the image, covered by a new puppet's trunk, head and arms
 
 
 @cache
-def body(gender: str, parts: int) -> DeformableStructures:
-    """The body model of a gender."""
+def load_model(gender: str, parts: int) -> DeformableStructures:
+    """Load the body model of a gender, once."""
     return DeformableStructures.load(gender, parts)
 
 
-def new_person(parts: int, gender: str, view: View, size: tuple[int, int]) -> Person:
-    """A person in the middle of an image of `size` (width, height), upper body inside it, legs below."""
-    model = body(gender, parts)
+def make_person(parts: int, gender: str, view: View, size: tuple[int, int]) -> Person:
+    """Make a person in the middle of an image of `size` (width, height): upper body inside, legs below."""
+    model = load_model(gender, parts)
     joints = model.mean_joints() * (1 if view == "front" else -1, 1)
     upper = joints[[k for k, name in enumerate(model.joint_names) if not name.endswith(("knee", "ankle", "foot"))]]
     low, high = upper.min(axis=0), upper.max(axis=0)
-    scale = START_HEIGHT * float(min(np.array(size) / (high - low + 0.3)))
+    scale = START_HEIGHT_SHARE * float(min(np.array(size) / (high - low + 0.3)))
     placed = (joints - (low + high) / 2) * scale + np.array(size) / 2
     return {"joints": [[*map(float, joint), 1] for joint in placed], "gender": gender, "view": view}
 
 
-def outline(parts: int, person: Person) -> dict[str, Any]:
-    """Contours of the most probable puppet on a person's joints, in the order in which they are painted (Eqs. 23-30).
+def draw_outline(parts: int, person: Person) -> dict[str, Any]:
+    """Return the contours of the most probable puppet on a person's joints, in paint order (Eqs. 23-30).
 
-    InputError when the joints cannot be a person's, say all in one place.
+    InputError when the joints cannot be a person's, for example all in one place.
     """
-    model = body(person["gender"], parts)
+    model = load_model(person["gender"], parts)
     given = np.array(person["joints"], dtype=np.float64)
     scale = model.estimate_scale(given[:, :2], np.where(given[:, 2] > 0, 1.0, 0.3))
     shape = model.puppet_from_joints(given[:, :2], scale, person["view"])
@@ -55,25 +55,25 @@ def outline(parts: int, person: Person) -> dict[str, Any]:
     return {"scale": scale, "parts": painted}
 
 
-def carried(parts: int, people: list[Person], before: U8, image: U8) -> list[Person]:
-    """The people of the image `before` (H, W, 3) where the puppet flow takes them in `image`.
+def propagate_people(parts: int, people: list[Person], previous: U8, image: U8) -> list[Person]:
+    """Propagate people by puppet flow from the previous image to `image`, both (H, W, 3).
 
-    InputError when the images differ in size or are too small for a flow.
+    InputError when the images differ in size or are too small for optical flow.
     """
-    if before.shape != image.shape:
-        raise InputError("the image before has another size; puppets are carried between images of one size")
-    flow = OpticalFlow().at_working_scale(before, image)
-    moved = []
+    if previous.shape != image.shape:
+        raise InputError("the previous image has another size; puppets can be copied between images of one size only")
+    flow = OpticalFlow().estimate_at_working_scale(previous, image)
+    propagated = []
     for person in people:
-        model = body(person["gender"], parts)
+        model = load_model(person["gender"], parts)
         tracker = FlowingPuppetTracker(model, TrackerSettings())
         joints = np.array(person["joints"], dtype=np.float64)
         given = Keypoints(model.joint_names, joints[:, :2], np.ones(len(joints)))
-        tracker.step(before, 0, [given])
-        found = tracker.step(image, 1, flow=flow).puppets
-        if found:
-            at = np.where(np.isfinite(found[0].joints), found[0].joints, joints[:, :2])
-            moved.append(
-                person | {"joints": [[*map(float, xy), int(v)] for xy, v in zip(at, joints[:, 2], strict=True)]}
+        tracker.step(previous, 0, [given])
+        puppets = tracker.step(image, 1, flow=flow).puppets
+        if puppets:
+            joints_now = np.where(np.isfinite(puppets[0].joints), puppets[0].joints, joints[:, :2])
+            propagated.append(
+                person | {"joints": [[*map(float, xy), int(v)] for xy, v in zip(joints_now, joints[:, 2], strict=True)]}
             )
-    return moved
+    return propagated

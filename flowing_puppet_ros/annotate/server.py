@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The annotation tool's web application: one page, the folder's images, and the annotations.
 
-It answers this machine's browser only: requests under another host's name (DNS rebinding) or from another site's page
+It answers only this machine's browser: requests under another host name (DNS rebinding) or from another site's page
 are refused, and only files that were listed at the start can be named.
 """
 
@@ -16,11 +16,11 @@ from werkzeug.exceptions import HTTPException
 
 from flowing_puppet_ros.annotate import puppets
 from flowing_puppet_ros.annotate.folder import ImageFolder
-from flowing_puppet_ros.annotate.store import GENDERS, VIEWS, AnnotationStore, ConflictError, checked_people
+from flowing_puppet_ros.annotate.store import GENDERS, VIEWS, AnnotationStore, ConflictError, check_people
 from flowing_puppet_ros.draw.palette import joint_colour, part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 
-MOST_REQUEST = 1_000_000
+MAX_REQUEST_BYTES = 1_000_000  # of a body
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
     "base-uri 'none'; frame-ancestors 'none'; form-action 'none'"
@@ -37,10 +37,10 @@ HEADERS = {
 def make_app(folder: ImageFolder, store: AnnotationStore, parts: int, hosts: tuple[str, ...]) -> Flask:
     """Build the application for a folder and its annotations.
 
-    `parts` is that of the puppets (10 or 14), `hosts` are the names (host:port) under which the page may be asked for.
+    `parts` is the number of parts of the puppets (10 or 14), `hosts` are the names (host:port) that requests may use.
     """
     app = Flask(__name__, static_folder="page", static_url_path="/page")
-    app.config["MAX_CONTENT_LENGTH"] = MOST_REQUEST
+    app.config["MAX_CONTENT_LENGTH"] = MAX_REQUEST_BYTES
     _guard(app, hosts)
     _serve_pages(app, folder, store, parts)
     _serve_puppets(app, folder, store, parts)
@@ -67,12 +67,12 @@ def _guard(app: Flask, hosts: tuple[str, ...]) -> None:
         return jsonify(error=str(error)), status
 
     @app.errorhandler(HTTPException)
-    def tell(error: HTTPException) -> tuple[Response, int]:
+    def explain_http(error: HTTPException) -> tuple[Response, int]:
         return jsonify(error=error.description), error.code or 500
 
 
 def _serve_pages(app: Flask, folder: ImageFolder, store: AnnotationStore, parts: int) -> None:
-    model = puppets.body("neutral", parts)
+    model = puppets.load_model("neutral", parts)
 
     @app.get("/")
     def page() -> Response:
@@ -84,7 +84,7 @@ def _serve_pages(app: Flask, folder: ImageFolder, store: AnnotationStore, parts:
         return jsonify(
             name=folder.root.name,
             items=folder.items,
-            counts=store.counts(),
+            counts=store.count_people(),
             joint_names=model.joint_names,
             joint_colours=[joint_colour(name) for name in model.joint_names],
             bones=bones,
@@ -95,79 +95,81 @@ def _serve_pages(app: Flask, folder: ImageFolder, store: AnnotationStore, parts:
 
     @app.get("/api/image")
     def image() -> Response:
-        return Response(folder.picture(request.args.get("key", "")), mimetype="image/jpeg")
+        return Response(folder.encode_jpeg(request.args.get("key", "")), mimetype="image/jpeg")
 
     @app.get("/api/export/json")
     def export_json() -> Response:
-        return _download(store.path.read_bytes() if store.path.exists() else b"{}", "annotations.json")
+        return _make_download(store.path.read_bytes() if store.path.exists() else b"{}", "annotations.json")
 
     @app.get("/api/export/sticks")
     def export_sticks() -> Response:
         with TemporaryDirectory() as place:
             path = Path(place) / "sticks.txt"
-            store.write_stick_figures(path, folder.items)
-            return _download(path.read_bytes(), "sticks.txt")
+            store.write_sticks(path, folder.items)
+            return _make_download(path.read_bytes(), "sticks.txt")
 
 
 def _serve_puppets(app: Flask, folder: ImageFolder, store: AnnotationStore, parts: int) -> None:
     @app.get("/api/annotation")
     def annotation() -> Response:
-        key = _known(folder, request.args.get("key", ""))
+        key = _check_key(folder, request.args.get("key", ""))
         revision, people = store.get(key)
-        height, width = folder.image(key).shape[:2]
+        height, width = folder.load_image(key).shape[:2]
         return jsonify(revision=revision, size=[width, height], people=people)
 
     @app.get("/api/revision")
     def revision() -> Response:
-        return jsonify(revision=store.get(_known(folder, request.args.get("key", "")))[0])
+        return jsonify(revision=store.get(_check_key(folder, request.args.get("key", "")))[0])
 
     @app.put("/api/annotation")
     def save() -> Response:
-        given = _body()
-        key, revision = _known(folder, given.get("key")), given.get("revision")
+        given = _request_object()
+        key, revision = _check_key(folder, given.get("key")), given.get("revision")
         if not isinstance(revision, int):
-            raise InputError("the revision is a whole number")
+            raise InputError("the revision must be a whole number")
         return jsonify(revision=store.put(key, revision, given.get("people")))
 
     @app.post("/api/outline")
     def outline() -> Response:
-        (person,) = checked_people([_body().get("person")], len(store.joint_names))
-        return jsonify(puppets.outline(parts, person))
+        (person,) = check_people([_request_object().get("person")], len(store.joint_names))
+        return jsonify(puppets.draw_outline(parts, person))
 
     @app.post("/api/new")
     def new() -> Response:
-        given = _body()
-        height, width = folder.image(_known(folder, given.get("key"))).shape[:2]
+        given = _request_object()
+        height, width = folder.load_image(_check_key(folder, given.get("key"))).shape[:2]
         gender, view = given.get("gender"), given.get("view")
         if gender not in GENDERS or view not in VIEWS:
             raise InputError(f"there is no puppet {gender!r} seen from {view!r}")
-        return jsonify(puppets.new_person(parts, gender, view, (width, height)))
+        return jsonify(puppets.make_person(parts, gender, view, (width, height)))
 
     @app.post("/api/carry")
     def carry() -> Response:
-        key = _known(folder, _body().get("key"))
-        before = folder.before(key)
-        if before is None:
-            raise InputError("this is the first image, there is none to copy from")
-        people = store.get(before)[1]
+        key = _check_key(folder, _request_object().get("key"))
+        previous = folder.previous(key)
+        if previous is None:
+            raise InputError("this is the first image; there is none to copy from")
+        people = store.get(previous)[1]
         if not people:
-            raise InputError("nobody is annotated in the image before")
-        return jsonify(people=puppets.carried(parts, people, folder.image(before), folder.image(key)))
+            raise InputError("no one is annotated in the previous image")
+        return jsonify(
+            people=puppets.propagate_people(parts, people, folder.load_image(previous), folder.load_image(key))
+        )
 
 
-def _body() -> dict[str, Any]:
+def _request_object() -> dict[str, Any]:
     given = request.get_json()
     if not isinstance(given, dict):
-        raise InputError("the request's body is a JSON object")
+        raise InputError("the request's body must be a JSON object")
     return given
 
 
-def _known(folder: ImageFolder, key: object) -> str:
+def _check_key(folder: ImageFolder, key: object) -> str:
     if not isinstance(key, str) or key not in folder:
-        raise InputError(f"{str(key)[:200]!r} is no image of this folder")
+        raise InputError(f"{str(key)[:200]!r} is not an image of this folder")
     return key
 
 
-def _download(data: bytes, name: str) -> Response:
+def _make_download(data: bytes, name: str) -> Response:
     headers = {"Content-Disposition": f'attachment; filename="{name}"'}
     return Response(data, mimetype="application/octet-stream", headers=headers)

@@ -12,16 +12,16 @@ from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame
-from flowing_puppet_ros.stream.component import base_topic, sends_depth
+from flowing_puppet_ros.stream.component import base_topic, is_compressed_depth_topic
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, IMAGE, PUPPETS
-from flowing_puppet_ros.stream.messages.puppets import keypoints_of
+from flowing_puppet_ros.stream.messages.puppets import decode_keypoints
 
 
 @dataclass(frozen=True, slots=True)
 class BagFrames:
-    """Iterate for (frame, its detections or None); `fps` from the first and last stamp, `count` images."""
+    """Iterable of (frame, detections or None); `fps` is from the first and last stamp, `count` of all images."""
 
     path: Path
     topic: str
@@ -32,9 +32,9 @@ class BagFrames:
     warn: Callable[[str], None]
 
     def __iter__(self) -> Iterator[tuple[VideoFrame, list[Keypoints] | None]]:
-        """Read the images in the order of the bag; a stamp without detections had no detector run on it.
+        """Read the images in the order of the bag; None stands for a stamp on which no detector ran.
 
-        An image that cannot be read is warned of and left out; it counts in the index.
+        An unreadable image is warned of and left out, but counts in the index.
         """
         with open_bag(self.path, self.salvage) as bag:
             for index, record in enumerate(bag.messages([self.topic])):
@@ -52,26 +52,28 @@ def open_bag_frames(
 ) -> BagFrames:
     """Open the images on `topic`, or on the first image topic whose namespace has detections.
 
-    `salvage` reads what is whole of a truncated file; `warn` hears of every message that cannot be used. InputError
-    lists the image topics when there is no such topic, and when the topic has no message.
+    `salvage` reads what is whole of a truncated file; `warn` is called for every unusable message. InputError if there
+    is no such topic (it lists the image topics) or the topic has no messages.
     """
     with open_bag(path, salvage) as bag:
         for note in bag.notes:
             warn(note)
         kinds = (IMAGE, COMPRESSED_IMAGE)
-        images = sorted(name for name, kind in bag.topics.items() if kind in kinds and not sends_depth(name))
+        images = sorted(
+            name for name, kind in bag.topics.items() if kind in kinds and not is_compressed_depth_topic(name)
+        )
         people_topics = [name for name, kind in bag.topics.items() if kind == PUPPETS and name.endswith("/detections")]
         detected = {name.removesuffix("/detections"): name for name in people_topics}
-        chosen = [topic] if topic else [name for name in images if _namespace(name) in detected]
+        chosen = [topic] if topic else [name for name in images if _camera_namespace(name) in detected]
         chosen = chosen or images
         if not chosen or chosen[0] not in images:
             listed = ", ".join(images) or "none"
             raise InputError(f"{path} has no images on {topic or 'any topic'}; its image topics are: {listed}")
-        source = detected.get(_namespace(chosen[0]), "")
+        source = detected.get(_camera_namespace(chosen[0]), "")
         people = {}
-        for message in _readable(bag, source, warn):
-            people[stamp_ns(message)] = keypoints_of(message)
-        stamps = [stamp_ns(message) for message in _readable(bag, chosen[0], lambda sentence: None)]
+        for message in _read_usable(bag, source, warn):
+            people[stamp_ns(message)] = decode_keypoints(message)
+        stamps = [stamp_ns(message) for message in _read_usable(bag, chosen[0], lambda sentence: None)]
     if not stamps:
         raise InputError(f"{path} has no message on {chosen[0]}")
     span = (max(stamps) - min(stamps)) * 1e-9
@@ -79,8 +81,8 @@ def open_bag_frames(
     return BagFrames(path, chosen[0], people, fps, bag.details[chosen[0]].count, salvage, warn)
 
 
-def _readable(bag: Bag, topic: str, warn: Callable[[str], None]) -> Iterator[Any]:
-    """Yield the messages of a topic ("" has none) that are what they claim to be, and warn of the others."""
+def _read_usable(bag: Bag, topic: str, warn: Callable[[str], None]) -> Iterator[Any]:
+    """Yield the valid messages of a topic ("" has none) and warn of the others."""
     for record in bag.messages([topic]) if topic else ():
         try:
             message = record.message
@@ -90,6 +92,6 @@ def _readable(bag: Bag, topic: str, warn: Callable[[str], None]) -> Iterator[Any
             yield message
 
 
-def _namespace(image: str) -> str:
-    """The camera's namespace: /cam01 of /cam01/image_raw/compressed."""
+def _camera_namespace(image: str) -> str:
+    """Return the camera's namespace: /cam01 for /cam01/image_raw/compressed."""
     return base_topic(image).rpartition("/")[0]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which components a recording can feed, found from its topics, and how their topics join."""
+"""The components that a recording can feed, found from its topics, and how their topics connect."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from flowing_puppet_ros.bag.depth_topics import depth_topics, holds_depth
+from flowing_puppet_ros.bag.depth_topics import holds_depth, select_depth_topics
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.multiview.camera import Camera as CameraModel
+from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.component import Component, Port, base_topic
-from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
-from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
-from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
+from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
+from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent, VisualHullSettings
 from flowing_puppet_ros.stream.messages.geometry import FrameTree
 from flowing_puppet_ros.stream.messages.message_types import (
     BODIES,
@@ -27,47 +27,48 @@ from flowing_puppet_ros.stream.messages.message_types import (
 )
 
 IMAGE_NAMES = ("image", "image_raw", "image_color", "image_rect", "image_rect_color")
-LEAST_CAMERAS = 2
-"""Calibrated cameras from which a person is fitted and a hull is built."""
+"""Last names of the image topics of cameras, in order of preference."""
+MIN_CAMERAS = 2
+"""Minimum calibrated cameras for a visual hull and the fit to its silhouettes."""
 
 
 @dataclass(slots=True, eq=False)
 class Instance:
-    """A component in the graph: the namespace of its relative topics, and topics that stand for its ports.
+    """A component in the graph: the namespace of its relative topics, and port -> topic for remapped ports.
 
-    An input that stands for no topic ("") gets nothing.
+    An input that is remapped to "" gets nothing.
     """
 
     name: str
-    component: Component
+    component: Component[Any]
     namespace: str
-    renamed: dict[str, str] = field(default_factory=dict)
+    remapped: dict[str, str] = field(default_factory=dict)
     seconds: float = 0.0
 
-    def topic(self, port: str) -> str:
+    def resolve(self, port: str) -> str:
         """Return the absolute topic of a port."""
-        if port in self.renamed:
-            return self.renamed[port]
+        if port in self.remapped:
+            return self.remapped[port]
         return port if port.startswith("/") else f"{self.namespace}/{port}"
 
 
 @dataclass(slots=True, eq=False)
 class Graph:
-    """The components over a recording, in the order in which messages reach them; `notes` say what it lacks."""
+    """The components for a recording, in the order in which messages reach them; `notes` say what is missing."""
 
     instances: list[Instance]
     notes: list[str] = field(default_factory=list)
 
-    def routes(self, recorded: Mapping[str, str]) -> dict[str, list[tuple[Instance, str]]]:
-        """Return topic -> the inputs that it feeds, `recorded` being the recording's topics and their types.
+    def find_routes(self, recorded: Mapping[str, str]) -> dict[str, list[tuple[Instance, str]]]:
+        """Return topic -> (instance, input port) it feeds; `recorded` is topic -> type of the recording.
 
-        An image's compressed form feeds the same input, unless the image itself was recorded too. A recorded topic of
+        An image's compressed topic feeds the same input, unless the raw image was recorded too. A recorded topic of
         another type than the input's feeds nothing.
         """
         found: dict[str, list[tuple[Instance, str]]] = {}
         for instance in self.instances:
             for port in instance.component.inputs:
-                topic = instance.topic(port.name)
+                topic = instance.resolve(port.name)
                 if not topic:
                     continue
                 kinds = (port.type, COMPRESSED_IMAGE) if port.transport else (port.type,)
@@ -77,13 +78,13 @@ class Graph:
                     found.setdefault(f"{topic}/{port.transport}", []).append((instance, port.name))
         return found
 
-    def outputs(self) -> dict[str, Port]:
+    def find_outputs(self) -> dict[str, Port]:
         """Return topic -> the output port that publishes it."""
-        return {instance.topic(port.name): port for instance in self.instances for port in instance.component.outputs}
+        return {instance.resolve(port.name): port for instance in self.instances for port in instance.component.outputs}
 
 
 @dataclass(frozen=True, slots=True)
-class Camera:
+class CameraTopics:
     """The topics of one camera in a recording."""
 
     namespace: str
@@ -105,34 +106,39 @@ def build_graph(
 ) -> Graph:
     """Make the components that the topics (name -> type) of a recording can feed.
 
-    One tracker a camera; a visual hull of two or more cameras that `frames` connects (`infos`: topic -> its first
-    CameraInfo); a body fitter for their silhouettes and one for every topic of clouds or depth images (`encoded`: image
-    topic -> encoding). `settings` are those of each kind of component by its name. What the recording holds of their
-    outputs is not used: it is made anew. InputError lists what there is when nothing can be used.
+    - One tracker per camera.
+    - One visual hull of two or more cameras that `frames` connects (`infos`: topic -> its first CameraInfo), and one
+      body fitter for its silhouettes.
+    - One body fitter for every topic of clouds or depth images (`encoded`: image topic -> encoding).
+
+    `settings` is component name -> setting -> value. Outputs of these components in the recording are not used but
+    made again. InputError lists the topics if nothing can be used.
     """
-    cameras = _cameras({name: kind for name, kind in topics.items() if not holds_depth(name, encoded.get(name, ""))})
+    cameras = _find_cameras(
+        {name: kind for name, kind in topics.items() if not holds_depth(name, encoded.get(name, ""))}
+    )
     clouds = [topic for topic, kind in topics.items() if kind == POINT_CLOUD and not topic.endswith("/body_vertices")]
-    depths, depth_notes = depth_topics(topics, encoded, clouds)
+    depths, depth_notes = select_depth_topics(topics, encoded, clouds)
     if not cameras and not clouds and not depths:
-        raise InputError("; ".join([_nothing_usable(topics), *depth_notes]))
-    graph = Graph([_tracker(camera, topics, settings, factory) for camera in cameras])
-    graph.notes += [*_detection_notes(graph.instances, topics), *depth_notes]
-    if len(cameras) >= LEAST_CAMERAS:
-        calibrated, note = _calibrated(cameras, frames, infos)
+        raise InputError("; ".join([_describe_unusable(topics), *depth_notes]))
+    graph = Graph([_make_tracker(camera, topics, settings, factory) for camera in cameras])
+    graph.notes += [*_note_missing_detections(graph.instances, topics), *depth_notes]
+    if len(cameras) >= MIN_CAMERAS:
+        calibrated, note = _select_calibrated(cameras, frames, infos)
         graph.notes += [note] if note else []
-        if len(calibrated) >= LEAST_CAMERAS:
-            graph.instances += _hull_and_fitter(calibrated, settings, factory)
-    made = graph.outputs()
+        if len(calibrated) >= MIN_CAMERAS:
+            graph.instances += _make_hull_and_fitter(calibrated, settings, factory)
+    made = graph.find_outputs()
     for topic in (*(cloud for cloud in clouds if cloud not in made), *depths):
         port = "depth" if topic in depths else "points"
-        fitter = _scene_fitter(port, topic, topics, settings, factory)
-        if fitter.topic("bodies") in graph.outputs():  # of another cloud in the same namespace
+        fitter = _make_scene_fitter(port, topic, topics, settings, factory)
+        if fitter.resolve("bodies") in graph.find_outputs():  # by another cloud in the same namespace
             fitter.namespace = topic
         graph.instances.append(fitter)
     return graph
 
 
-def _nothing_usable(topics: Mapping[str, str]) -> str:
+def _describe_unusable(topics: Mapping[str, str]) -> str:
     listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
     images = sorted(name for name, kind in topics.items() if kind in (IMAGE, COMPRESSED_IMAGE))
     old = images[0] if images else "OLD"
@@ -143,12 +149,12 @@ def _nothing_usable(topics: Mapping[str, str]) -> str:
     )
 
 
-def _detection_notes(trackers: list[Instance], topics: Mapping[str, str]) -> list[str]:
-    """Say in which cameras the package's own detector finds the people though the recording seems to have them."""
-    wanted = [tracker.topic("detections") for tracker in trackers]
+def _note_missing_detections(trackers: list[Instance], topics: Mapping[str, str]) -> list[str]:
+    """Return notes on cameras for which the own detector runs although the recording seems to have detections."""
+    wanted = [tracker.resolve("detections") for tracker in trackers]
     others = sorted(name for name, kind in topics.items() if kind == PUPPETS and name not in wanted)
     return [
-        f"the detector of this package finds the people in {tracker.topic('image')}: there are no keypoints "
+        f"the detector of this package finds the people in {tracker.resolve('image')}: there are no keypoints "
         f"({PUPPETS}) on {topic}"
         + (f", not {topics[topic]}" if topic in topics else "")
         + (f"; --topic-map {others[0]}:={topic} takes those that are there" if others else "")
@@ -157,7 +163,7 @@ def _detection_notes(trackers: list[Instance], topics: Mapping[str, str]) -> lis
     ]
 
 
-def _cameras(topics: Mapping[str, str]) -> list[Camera]:
+def _find_cameras(topics: Mapping[str, str]) -> list[CameraTopics]:
     found: dict[str, str] = {}
     for base in IMAGE_NAMES:
         for topic, kind in topics.items():
@@ -165,32 +171,34 @@ def _cameras(topics: Mapping[str, str]) -> list[Camera]:
             namespace, _, name = image.rpartition("/")
             if kind in (IMAGE, COMPRESSED_IMAGE) and name == base:
                 found.setdefault(namespace, image)
-    return [Camera(namespace, found[namespace]) for namespace in sorted(found)]
+    return [CameraTopics(namespace, found[namespace]) for namespace in sorted(found)]
 
 
-def _settings(kind: type[Component], name: str, settings: Mapping[str, Mapping[str, Any]], **fixed: Any) -> Settings:
-    return kind.settings_type.from_mapping({**settings.get(name, {}), **fixed})
+def _make_settings[S: Settings](kind: type[S], name: str, settings: Mapping[str, Mapping[str, Any]], **fixed: Any) -> S:
+    return kind.from_mapping({**settings.get(name, {}), **fixed})
 
 
-def _tracker(
-    camera: Camera, topics: Mapping[str, str], settings: Mapping[str, Mapping[str, Any]], factory: MessageFactory
+def _make_tracker(
+    camera: CameraTopics, topics: Mapping[str, str], settings: Mapping[str, Mapping[str, Any]], factory: MessageFactory
 ) -> Instance:
-    chosen = _settings(PuppetTrackerComponent, "puppet_tracker", settings)
-    component = PuppetTrackerComponent(chosen, factory)  # type: ignore[arg-type]
+    chosen = _make_settings(PuppetTrackerSettings, "puppet_tracker", settings)
+    component = PuppetTrackerComponent(chosen, factory)
     instance = Instance(f"{camera.name}/puppet_tracker", component, camera.namespace, {"image": camera.image})
     kinds = {"detections": PUPPETS, "flow/forward": IMAGE, "flow/backward": IMAGE}
     for port, kind in kinds.items():
-        component.set_expected(port, topics.get(instance.topic(port)) == kind)
+        component.set_expected(port, topics.get(instance.resolve(port)) == kind)
     return instance
 
 
-def _calibrated(cameras: list[Camera], frames: FrameTree, infos: Mapping[str, Any]) -> tuple[list[Camera], str]:
-    """Return the largest group of calibrated cameras whose frames hang on one root, and why others are not in it."""
-    groups: dict[str, list[Camera]] = {}
+def _select_calibrated(
+    cameras: list[CameraTopics], frames: FrameTree, infos: Mapping[str, Any]
+) -> tuple[list[CameraTopics], str]:
+    """Return the largest group of calibrated cameras with a common root frame, and why others are not in it."""
+    groups: dict[str, list[CameraTopics]] = {}
     reasons = []
     for camera in cameras:
         try:
-            groups.setdefault(_root(camera, frames, infos), []).append(camera)
+            groups.setdefault(_find_root(camera, frames, infos), []).append(camera)
         except InputError as error:
             reasons.append(f"{camera.name}: {error}")
     chosen = max(groups.values(), key=len, default=[])
@@ -199,56 +207,56 @@ def _calibrated(cameras: list[Camera], frames: FrameTree, infos: Mapping[str, An
             reasons += [f"{camera.name}: its frames end in {root!r}" for camera in group]
     if not reasons:
         return chosen, ""
-    what = "without these cameras" if len(chosen) >= LEAST_CAMERAS else f"not built, it needs {LEAST_CAMERAS} cameras"
+    what = "without these cameras" if len(chosen) >= MIN_CAMERAS else f"not built, it needs {MIN_CAMERAS} cameras"
     return chosen, f"the visual hull is {what} ({'; '.join(reasons)})"
 
 
-def _root(camera: Camera, frames: FrameTree, infos: Mapping[str, Any]) -> str:
-    """Return the frame above a camera's frame; InputError when the camera is not calibrated or hangs on nothing."""
+def _find_root(camera: CameraTopics, frames: FrameTree, infos: Mapping[str, Any]) -> str:
+    """Return the root of a camera's frame; InputError if the camera is not calibrated or its frame has no parent."""
     info = infos.get(f"{camera.namespace}/camera_info")
     if info is None:
         raise InputError(f"there is no {camera.namespace}/camera_info")
     frame = info.header.frame_id.lstrip("/")
-    root = frames.root(frame)
+    root = frames.find_root(frame)
     if root == frame:
         raise InputError(f"/tf_static has no transform to its frame {frame!r}")
-    placed = frames.pose(root, frame)
-    assert placed is not None
-    translation, rotation = placed
-    CameraModel.from_info(info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model)
+    pose = frames.lookup_pose(root, frame)
+    assert pose is not None
+    translation, rotation = pose
+    Camera.from_info(info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model)
     return root
 
 
-def _hull_and_fitter(
-    cameras: list[Camera], settings: Mapping[str, Mapping[str, Any]], factory: MessageFactory
+def _make_hull_and_fitter(
+    cameras: list[CameraTopics], settings: Mapping[str, Mapping[str, Any]], factory: MessageFactory
 ) -> list[Instance]:
     names = ",".join(camera.name for camera in cameras)
-    chosen = _settings(VisualHullComponent, "visual_hull", settings, cameras=names)
-    hull = VisualHullComponent(chosen, factory)  # type: ignore[arg-type]
-    renamed = {f"{camera.name}/image": camera.image for camera in cameras}
-    fitter = BodyFitterComponent(_settings(BodyFitterComponent, "body_fitter", settings), factory)  # type: ignore[arg-type]
-    joined = {"silhouettes": "/silhouettes", "points": "", "depth": "", "camera_info": "", "initial": ""}
-    return [Instance("visual_hull", hull, "", renamed), Instance("body_fitter", fitter, "", joined)]
+    chosen = _make_settings(VisualHullSettings, "visual_hull", settings, cameras=names)
+    hull = VisualHullComponent(chosen, factory)
+    remapped = {f"{camera.name}/image": camera.image for camera in cameras}
+    fitter = BodyFitterComponent(_make_settings(BodyFitterSettings, "body_fitter", settings), factory)
+    remapped_inputs = {"silhouettes": "/silhouettes", "points": "", "depth": "", "camera_info": "", "initial": ""}
+    return [Instance("visual_hull", hull, "", remapped), Instance("body_fitter", fitter, "", remapped_inputs)]
 
 
-def _scene_fitter(
+def _make_scene_fitter(
     port: str,
     topic: str,
     topics: Mapping[str, str],
     settings: Mapping[str, Mapping[str, Any]],
     factory: MessageFactory,
 ) -> Instance:
-    """A body fitter whose `port` (points, or depth with the camera_info beside it) is `topic`."""
+    """Return a body fitter whose `port` (points, or depth with the camera_info beside it) is `topic`."""
     namespace = topic.rpartition("/")[0]
-    fitter = BodyFitterComponent(_settings(BodyFitterComponent, "body_fitter", settings), factory)  # type: ignore[arg-type]
-    renamed = {"points": "", "depth": "", "camera_info": "", "silhouettes": "", port: topic}
+    fitter = BodyFitterComponent(_make_settings(BodyFitterSettings, "body_fitter", settings), factory)
+    remapped = {"points": "", "depth": "", "camera_info": "", "silhouettes": "", port: topic}
     if port == "depth":
-        renamed["camera_info"] = f"{namespace}/camera_info"
-    instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, namespace, renamed)
-    fitter.set_expected("initial", topics.get(instance.topic("initial")) == BODIES)
+        remapped["camera_info"] = f"{namespace}/camera_info"
+    instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, namespace, remapped)
+    fitter.set_expected("initial", topics.get(instance.resolve("initial")) == BODIES)
     return instance
 
 
-def info_topics(topics: Mapping[str, str]) -> list[str]:
+def find_info_topics(topics: Mapping[str, str]) -> list[str]:
     """Return the topics of type CameraInfo."""
     return [topic for topic, kind in topics.items() if kind == CAMERA_INFO]

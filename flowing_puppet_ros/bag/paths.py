@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What of a file system looks like a bag; imports nothing that takes time."""
+"""Recognise bags by their paths; imports nothing that takes time."""
 
 import re
 from pathlib import Path
@@ -8,9 +8,9 @@ SUFFIXES = (".mcap", ".db3")
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a file or folder looks like one bag: by its ending, or its metadata, or because one was recorded in it.
+    """Return whether a file or folder looks like one bag: by its suffix, its metadata, or the bag files in it.
 
-    A recorder that was stopped by force leaves no metadata, but its files `<folder>_0`, `<folder>_1`, ...
+    A recorder that was killed leaves no metadata, but its files are `<folder>_0`, `<folder>_1`, ...
     """
     if not path.is_dir():
         return path.suffix.lower() in SUFFIXES

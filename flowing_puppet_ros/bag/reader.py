@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read rosbag2 bags in log order: folders, lone files, files of other writers, and what is left of broken ones."""
+"""Read rosbag2 bags in log order: folders, single files, files of other writers, and the rest of broken ones."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ class Record:
 
     @property
     def message(self) -> Any:
-        """The message object; InputError when the bytes are not a message of the type, or the type is not known."""
+        """The message object; InputError if the type is unknown or the bytes are not a message of it."""
         store = typestore()
         if self.type not in store.fielddefs:
             raise InputError(f"the messages on {self.topic} have the type {self.type}, which is not known here")
         try:
             return store.deserialize_cdr(self.raw, self.type)
-        except Exception as error:  # bytes that are no message fail in the library in any way
+        except Exception as error:  # wrong bytes make the library raise anything
             raise InputError(f"a message on {self.topic} is not the {self.type} that it claims to be") from error
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """What a bag says about one topic."""
+    """Type, number of messages and QoS profiles of one topic in a bag."""
 
     type: str
     count: int
@@ -53,7 +53,7 @@ class Topic:
 
 
 class _Part(Protocol):
-    """A file, or a folder with metadata, of a bag."""
+    """One file of a bag, or a folder with metadata."""
 
     details: dict[str, Topic]
 
@@ -65,28 +65,30 @@ class _Part(Protocol):
 
 
 class _NoIndex(Exception):
-    """The index does not lead to every message."""
+    """Raised when the index does not cover every message."""
 
 
-class _Indexed:
-    """What the index of a file, or of a folder with metadata, leads to."""
+class _IndexedPart:
+    """A file, or a folder with metadata, that is read by its index."""
 
     def __init__(self, path: Path) -> None:
-        """Open it; InputError when it is no bag, _NoIndex when only a scan finds everything in order."""
+        """Open it; InputError if it is not a bag, _NoIndex if only a scan finds every message in order."""
         self.path = path
         try:
             self._reader = Reader(path)
             self._reader.open()
-        except Exception as error:  # a damaged file fails in the libraries in any way
-            raise InputError(_no_bag(path)) from error
+        except Exception as error:  # a damaged file makes the libraries raise anything
+            raise InputError(_describe_unreadable(path)) from error
         storages = getattr(self._reader.storage, "storages", [self._reader.storage])
-        # What is compressed as a whole, or message by message, only this reader can read.
+        # Only this reader can read files or messages that are compressed by rosbag2.
         self.compressed = bool(self._reader.compression_mode)
         if not self.compressed and not all(map(_is_indexed, storages)):
             self._reader.close()
             raise _NoIndex
         self.details = {
-            c.topic: Topic(c.msgtype, c.msgcount, tuple(_qos(q) for q in getattr(c.ext, "offered_qos_profiles", ())))
+            c.topic: Topic(
+                c.msgtype, c.msgcount, tuple(_qos_values(q) for q in getattr(c.ext, "offered_qos_profiles", ()))
+            )
             for c in self._reader.connections
         }
 
@@ -97,7 +99,7 @@ class _Indexed:
         try:
             for connection, log_time, raw in self._reader.messages(connections):
                 yield Record(connection.topic, connection.msgtype, log_time, bytes(raw))
-        except Exception as error:  # as above; what the caller does between two messages never lands here
+        except Exception as error:  # as above; errors of the caller between two messages do not arrive here
             reason = str(error).rstrip(".") or type(error).__name__
             raise InputError(f"{self.path} is damaged: {reason}; add --salvage to read the rest") from error
 
@@ -105,7 +107,7 @@ class _Indexed:
         self._reader.close()
 
 
-class _Scanned:
+class _ScannedPart:
     """An MCAP file that is read without an index."""
 
     def __init__(self, path: Path, salvage: bool) -> None:
@@ -118,13 +120,13 @@ class _Scanned:
             self.details[channel.topic] = Topic(self._file.types[number], count, qos)
         self.note = ""
         if salvage:
-            lost = (
+            skipped = (
                 f", {self._file.damaged} damaged places ({self._file.skipped_bytes} bytes) passed over"
                 if self._file.damaged
                 else ""
             )
             count = sum(topic.count for topic in self.details.values())
-            self.note = f"{path}: {count} messages salvaged{lost}"
+            self.note = f"{path}: {count} messages salvaged{skipped}"
 
     def messages(self, topics: set[str]) -> Iterator[Record]:
         numbers = [number for number, channel in self._file.channels.items() if channel.topic in topics]
@@ -136,9 +138,9 @@ class _Scanned:
 
 
 class Bag:
-    """An open bag. Use as a context manager; messages are streamed, not held.
+    """An open bag, used as a context manager; messages are streamed, not kept.
 
-    `notes` says what was salvaged, `compressed` whether its files or its messages are compressed one by one.
+    `notes` says what was salvaged; `compressed` is True if rosbag2 compressed the files or the messages.
     """
 
     def __init__(self, path: Path, files: Collection[Path], salvage: bool = False) -> None:
@@ -148,7 +150,7 @@ class Bag:
         self._parts: list[_Part] = []
         try:
             for file in files:
-                self._parts.append(self._opened(file, salvage))
+                self._parts.append(self._open_part(file, salvage))
         except BaseException:
             self.close()
             raise
@@ -159,26 +161,26 @@ class Bag:
                 known = self.details.get(name)
                 self.details[name] = Topic(topic.type, topic.count + (known.count if known else 0), topic.qos)
 
-    def _opened(self, path: Path, salvage: bool) -> _Part:
+    def _open_part(self, path: Path, salvage: bool) -> _Part:
         lone = path.is_file() and path.suffix != ".db3" and is_mcap(path)
         if lone and is_truncated(path) and not salvage:
             raise InputError(f"{path} is cut off before its end: add --salvage to read what is whole")
         if lone and salvage:
-            scanned = _Scanned(path, salvage)
+            scanned = _ScannedPart(path, salvage)
             if not sum(topic.count for topic in scanned.details.values()) and is_truncated(path):
                 raise InputError(f"{path} is cut off so early that it has no whole message")
             self.notes.append(scanned.note)
             return scanned
         try:
-            return _Indexed(path)
+            return _IndexedPart(path)
         except (InputError, _NoIndex):
             if not lone:
                 raise
-            return _Scanned(path, salvage=False)
+            return _ScannedPart(path, salvage=False)
 
     @property
     def topics(self) -> dict[str, str]:
-        """Type of every topic by its name; `details` tells counts and QoS too."""
+        """Type of every topic by name; `details` has counts and QoS too."""
         return {name: topic.type for name, topic in self.details.items()}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Record]:
@@ -186,15 +188,15 @@ class Bag:
         chosen = set(self.details if topics is None else topics)
         yield from heapq.merge(*(part.messages(chosen) for part in self._parts), key=lambda record: record.log_time)
 
-    def note(self, name: str) -> dict[str, str]:
-        """The texts that `BagWriter.note` put into the file's metadata under this name; empty without any."""
+    def read_metadata(self, name: str) -> dict[str, str]:
+        """Return the texts that `BagWriter.add_metadata` stored under this name; empty if there are none."""
         path = next(iter(sorted(self.path.glob("*.mcap"))), self.path) if self.path.is_dir() else self.path
         if path.suffix != ".mcap":
             return {}
         try:
             with path.open("rb") as stream:
                 return next((m.metadata for m in make_reader(stream).iter_metadata() if m.name == name), {})
-        except Exception:  # a damaged file fails in the library in any way; its messages may be whole
+        except Exception:  # a damaged file makes the library raise anything; its messages may be whole
             return {}
 
     @property
@@ -217,20 +219,20 @@ class Bag:
 
 
 def open_bag(path: Path | str, salvage: bool = False) -> Bag:
-    """Open a bag for reading; InputError in one sentence when it is missing, no bag, cut off or damaged.
+    """Open a bag for reading; InputError if it is missing, not a bag, cut off or damaged.
 
-    With `salvage` the MCAP files of a broken bag are read as far as they can be.
+    With `salvage`, the MCAP files of a broken bag are read as far as possible.
     """
     path = Path(path)
     if not path.exists():
         raise InputError(f"there is no bag {path}")
     if not path.is_dir():
         return Bag(path, [path], salvage)
-    files = sorted(path.glob("*.mcap"), key=_natural) or sorted(path.glob("*.db3"), key=_natural)
+    files = sorted(path.glob("*.mcap"), key=_natural_order) or sorted(path.glob("*.db3"), key=_natural_order)
     complete = (path / "metadata.yaml").exists()
     if not complete and not files:
-        raise InputError(f"the folder {path} is no bag: it has no metadata.yaml and 0 bag files")
-    # A recorder that was stopped by force leaves no metadata, or metadata of a file that is cut off.
+        raise InputError(f"the folder {path} is not a bag: it has no metadata.yaml and 0 bag files")
+    # A recorder that was killed leaves no metadata, or metadata of a file that is cut off.
     if files and (not complete or any(is_truncated(file) for file in files)):
         return Bag(path, files, salvage)
     try:
@@ -243,22 +245,22 @@ def open_bag(path: Path | str, salvage: bool = False) -> Bag:
     return bag
 
 
-def _natural(path: Path) -> list[Any]:
-    """Key that sorts the second file of a split bag before the tenth."""
+def _natural_order(path: Path) -> list[Any]:
+    """Return the key that sorts the second file of a split bag before the tenth."""
     return [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", path.name)]
 
 
 def _is_indexed(storage: Any) -> bool:
-    """Whether a file is a database, or an MCAP file whose chunks are all indexed."""
+    """Return whether a file is a database, or an MCAP file whose chunks are all indexed."""
     chunks = getattr(storage, "chunks", None)
     return chunks is None or (bool(chunks) and all(chunk.channel_count for chunk in chunks))
 
 
-def _no_bag(path: Path) -> str:
-    return f"{path} is no ROS 2 bag that can be read (.mcap, .db3, or a folder with metadata.yaml)"
+def _describe_unreadable(path: Path) -> str:
+    return f"{path} is not a readable ROS 2 bag (.mcap, .db3, or a folder with metadata.yaml)"
 
 
-def _qos(profile: Qos) -> dict[str, Any]:
+def _qos_values(profile: Qos) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name, value in profile._asdict().items():
         if hasattr(value, "sec"):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The `rosbags` type store of ROS 2 Jazzy with this package's messages, and a factory of its message objects.
 
-The message definitions are the `.msg` files of the interface packages in `interfaces/`. Nothing of ROS is needed.
+The message definitions are the `.msg` files of the interface packages in `interfaces/`. ROS is not needed.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _PACKAGES = ("flowing_puppet_msgs", "hri_msgs")
 
 
 def definition_files(package: str) -> tuple[Path, ...]:
-    """Return the `.msg` files of an interface package that ships with this one, sorted by name."""
+    """Return the `.msg` files of an interface package that is part of this one, sorted by name."""
     files = tuple(sorted((_INTERFACES / package / "msg").glob("*.msg")))
     if not files:
         raise PuppetError(f"the message definitions {_INTERFACES / package}/msg are missing: reinstall the package")
@@ -42,7 +42,7 @@ def typestore() -> Typestore:
 
 
 class BagMessageFactory:
-    """Makes `rosbags` messages; the counterpart of the factory of rclpy messages in the nodes."""
+    """Makes `rosbags` messages; `node.factory` makes those of rclpy."""
 
     def __init__(self) -> None:
         self._store = typestore()
@@ -53,13 +53,13 @@ class BagMessageFactory:
         for name in values:
             if name not in fields:
                 raise TypeError(f"{type_name} has no field {name!r}")
-        filled = {name: self._value(kind, values.get(name)) for name, kind in fields.items()}
+        filled = {name: self._convert(kind, values.get(name)) for name, kind in fields.items()}
         return self._store.types[type_name](**filled)
 
-    def _value(self, kind: tuple[int, Any], value: Any) -> Any:
+    def _convert(self, kind: tuple[int, Any], value: Any) -> Any:
         node, detail = kind
         if node == Nodetype.BASE:
-            return _scalar(detail[0], value)
+            return _convert_scalar(detail[0], value)
         if node == Nodetype.NAME:
             return self.make(detail) if value is None else value
         (element, element_detail), count = detail
@@ -69,18 +69,18 @@ class BagMessageFactory:
             return np.zeros(length, dtype) if value is None else np.ascontiguousarray(value, dtype).reshape(-1)
         if value is None:
             if node == Nodetype.ARRAY:
-                return [self._value((element, element_detail), None) for _ in range(count)]
+                return [self._convert((element, element_detail), None) for _ in range(count)]
             return []
         return list(value)
 
 
-def _scalar(name: str, value: Any) -> Any:
+def _convert_scalar(name: str, value: Any) -> Any:
     if name == "string":
         return "" if value is None else str(value)
     if name == "bool":
         return bool(value)
     if name == "float32":
-        # A message that travels loses these digits; without a journey it must not keep them.
+        # Serialisation drops these digits; a message that is not serialised must not keep them.
         return 0.0 if value is None else float(np.float32(value))
     if name == "float64":
         return 0.0 if value is None else float(value)

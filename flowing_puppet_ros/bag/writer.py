@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write MCAP bags as rosbag2 of ROS 2 Jazzy writes them: a lone `.mcap` file or a folder with `metadata.yaml`."""
+"""Write MCAP bags as rosbag2 of ROS 2 Jazzy does: a single `.mcap` file or a folder with `metadata.yaml`."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from ruamel.yaml import YAML
 from flowing_puppet_ros.bag.typestore import typestore
 from flowing_puppet_ros.errors import InputError
 
-_VERSION = 9  # of the rosbag2 metadata that Jazzy writes
-_CHUNK_BYTES = 1024 * 1024
-_FOREVER = {"sec": 9223372036, "nsec": 854775807}
-_DEPTH = {"latched": 1, "sensor": 5, "reliable": 10}
+_METADATA_VERSION = 9  # of the rosbag2 metadata that Jazzy writes
+_CHUNK_BYTES = 1024 * 1024  # of messages per compressed chunk
+_INFINITE_DURATION = {"sec": 9223372036, "nsec": 854775807}  # of rmw
+_QUEUE_DEPTH = {"latched": 1, "sensor": 5, "reliable": 10}
 
 
 def qos_profile(kind: str) -> dict[str, Any]:
     """Return one entry of `offered_qos_profiles` for "sensor", "reliable" or "latched" (transient local)."""
     return {
         "history": "keep_last",
-        "depth": _DEPTH[kind],
+        "depth": _QUEUE_DEPTH[kind],
         "reliability": "best_effort" if kind == "sensor" else "reliable",
         "durability": "transient_local" if kind == "latched" else "volatile",
-        "deadline": dict(_FOREVER),
-        "lifespan": dict(_FOREVER),
+        "deadline": dict(_INFINITE_DURATION),
+        "lifespan": dict(_INFINITE_DURATION),
         "liveliness": "automatic",
-        "liveliness_lease_duration": dict(_FOREVER),
+        "liveliness_lease_duration": dict(_INFINITE_DURATION),
         "avoid_ros_namespace_conventions": False,
     }
 
@@ -39,12 +39,12 @@ def qos_profile(kind: str) -> dict[str, Any]:
 class BagWriter:
     """A bag being written: profile ros2, zstd chunks, CDR messages, ros2msg schemas, statistics and index.
 
-    The bytes depend on the messages only: writing the same messages again gives the same file. The file gets its name
-    when it is complete.
+    The bytes depend only on the messages: writing the same messages again gives the same file. The file has a
+    temporary name until it is complete.
     """
 
     def __init__(self, path: Path) -> None:
-        """Open `path`: a name ending in .mcap is one file, any other a folder that must not hold anything yet."""
+        """Open `path`: one file if it ends in .mcap, otherwise a folder, which must be empty."""
         self.path = path
         self._folder: Path | None = None if path.suffix == ".mcap" else path
         target = path
@@ -73,7 +73,7 @@ class BagWriter:
         self._last = 0
 
     def add_topic(self, topic: str, type_name: str, qos: str | Sequence[dict[str, Any]] = "reliable") -> None:
-        """Announce a topic once: its type and its QoS, by kind or as the profiles it was offered with."""
+        """Add a topic: its type and its QoS, as a kind or as the profiles that were offered."""
         profiles = [qos_profile(qos)] if isinstance(qos, str) else list(qos)
         store = typestore()
         if type_name not in self._schemas:
@@ -84,7 +84,7 @@ class BagWriter:
             topic,
             "cdr",
             self._schemas[type_name],
-            {"offered_qos_profiles": _yaml(profiles) if profiles else "", "topic_type_hash": digest},
+            {"offered_qos_profiles": _to_yaml(profiles) if profiles else "", "topic_type_hash": digest},
         )
         self._topics[topic] = {
             "name": topic,
@@ -96,39 +96,39 @@ class BagWriter:
         self._counts[topic] = 0
 
     def has_topic(self, topic: str) -> bool:
-        """Whether `topic` was announced."""
+        """Return whether `topic` was added."""
         return topic in self._topics
 
     def write(self, topic: str, log_time: int, message: Any) -> None:
-        """Append one message of an announced topic, recorded at `log_time` nanoseconds."""
+        """Append one message of an added topic, recorded at `log_time` nanoseconds."""
         self.write_raw(topic, log_time, bytes(typestore().serialize_cdr(message, self._topics[topic]["type"])))
 
     def write_raw(self, topic: str, log_time: int, data: bytes) -> None:
-        """Append one message that is serialised already."""
+        """Append one serialised message."""
         count = self._counts[topic]
         self._writer.add_message(self._channels[topic], log_time, data, log_time, count)
         self._counts[topic] = count + 1
         self._first = log_time if self._first is None else min(self._first, log_time)
         self._last = max(self._last, log_time)
 
-    def note(self, name: str, values: Mapping[str, str]) -> None:
-        """Put texts by name into the file's metadata, which says how the bag was made."""
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Store texts by name in the file's metadata, which says how the bag was made."""
         self._writer.add_metadata(name, dict(values))
 
     @property
     def counts(self) -> dict[str, int]:
-        """Number of messages written a topic."""
+        """Number of messages written per topic."""
         return dict(self._counts)
 
     def close(self) -> None:
         """Write what rosbag2 reads first: the metadata record, the index, and `metadata.yaml` of a folder."""
         metadata = self._metadata()
-        self._writer.add_metadata("rosbag2", {"serialized_metadata": _yaml(metadata)})
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": _to_yaml(metadata)})
         self._writer.finish()
         self._stream.close()
         self._partial.replace(self._target)
         if self._folder is not None:
-            text = _yaml({"rosbag2_bagfile_information": metadata})
+            text = _to_yaml({"rosbag2_bagfile_information": metadata})
             (self._folder / "metadata.yaml").write_text(text, "utf8")
 
     def _metadata(self) -> dict[str, Any]:
@@ -139,7 +139,7 @@ class BagWriter:
             "message_count": sum(self._counts.values()),
         }
         return {
-            "version": _VERSION,
+            "version": _METADATA_VERSION,
             "storage_identifier": "mcap",
             "relative_file_paths": [self._target.name],
             **span,
@@ -166,7 +166,7 @@ class BagWriter:
             self._partial.unlink()
 
 
-def _yaml(value: Any) -> str:
+def _to_yaml(value: Any) -> str:
     yaml = YAML()
     yaml.default_flow_style = False
     yaml.representer.ignore_aliases = lambda *_: True

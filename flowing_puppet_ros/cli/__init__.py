@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line `flowing-puppet <verb>`: one module a verb, imported only when that verb is used.
+"""The command line `flowing-puppet <verb>`: one module per verb, imported only when that verb is used.
 
 Arguments come in; files, tables and an exit status go out. Read `fit` first: its neighbours are built alike.
 """
@@ -30,35 +30,35 @@ VERBS = {
 }
 
 
-ROOMS = ("evaluate", "sample")
-"""Verbs of several kinds: each kind is a module of its own, in a folder."""
+VERB_PACKAGES = ("evaluate", "sample")
+"""Verbs of several kinds: folders with a module per kind."""
 
 
-def verb_module(verb: str) -> ModuleType:
-    """Import the module of a verb; InputError when it is not in what was installed."""
+def import_verb(verb: str) -> ModuleType:
+    """Import the module of a verb; InputError if it is not installed."""
     if verb == "bench":
-        return _benchmarks()
-    return import_module(f"{__name__}.{verb}.verb" if verb in ROOMS else f"{__name__}.{verb}")
+        return _import_benchmarks()
+    return import_module(f"{__name__}.{verb}.verb" if verb in VERB_PACKAGES else f"{__name__}.{verb}")
 
 
-def _benchmarks() -> ModuleType:
-    """Import the benchmarks, which stand beside the package in its source tree and are not installed."""
+def _import_benchmarks() -> ModuleType:
+    """Import the benchmarks, which are beside the package in its source tree and not installed."""
     source_tree = Path(__file__).resolve().parents[2]
     if not (source_tree / "benchmarks" / "verb.py").is_file():
         raise InputError(
-            "bench compares with plain and foreign programs that are not installed; run it in a source tree"
+            "bench compares with programs that are not installed with the package; run it in a source tree"
         )
     if str(source_tree) not in sys.path:
         sys.path.append(str(source_tree))
     return import_module("benchmarks.verb")
 
 
-def verb_with_parser(verb: str, arguments: list[str]) -> tuple[ModuleType, argparse.ArgumentParser, list[str]]:
-    """Return the module of a verb, its parser, and what of its arguments is left to parse.
+def make_verb_parser(verb: str, arguments: list[str]) -> tuple[ModuleType, argparse.ArgumentParser, list[str]]:
+    """Return the module of a verb, its parser, and the arguments left to parse.
 
-    A module may name in `SUBVERBS` the modules of optional sub-verbs: a first argument that is one leads there.
+    A module may name modules of sub-verbs in `SUBVERBS`; if the first argument is one of these, its module is returned.
     """
-    module, name = verb_module(verb), verb
+    module, name = import_verb(verb), verb
     subverbs = getattr(module, "SUBVERBS", {})
     if arguments and arguments[0] in subverbs:
         name, arguments = f"{verb} {arguments[0]}", arguments[1:]
@@ -81,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     chosen = parser.parse_args(argv)
     try:
-        module, verb_parser, arguments = verb_with_parser(chosen.verb, chosen.arguments)
+        module, verb_parser, arguments = make_verb_parser(chosen.verb, chosen.arguments)
         return module.run(verb_parser.parse_args(arguments))
     except PuppetError as error:
         print(f"flowing-puppet {chosen.verb}: {error}", file=sys.stderr)
@@ -92,6 +92,6 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:
         return 1
     except OSError as error:
-        # A disk that is full or gone, which may happen wherever something is read or written.
+        # A full or missing disk may fail any read or write.
         print(f"flowing-puppet {chosen.verb}: {error.filename or 'the work'} failed: {error.strerror}", file=sys.stderr)
         return 1

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose puppets on the images and video frames of a folder, in the browser; the page works without a network.
 
-The annotations are kept in FOLDER/annotations.json, at every change.
+Every change is saved in FOLDER/annotations.json.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 import waitress
 
 from flowing_puppet_ros.annotate.folder import ImageFolder
-from flowing_puppet_ros.annotate.server import MOST_REQUEST, make_app
+from flowing_puppet_ros.annotate.server import MAX_REQUEST_BYTES, make_app
 from flowing_puppet_ros.annotate.store import AnnotationStore
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
@@ -26,16 +26,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this verb."""
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="images and videos, also in folders below it")
     parser.add_argument(
-        "--host", default="127.0.0.1", help="address to listen at; others let the network in [127.0.0.1]"
+        "--host", default="127.0.0.1", help="address to listen on; any but 127.0.0.1 admits the network [127.0.0.1]"
     )
-    parser.add_argument("--port", type=int, default=8008, help="port to listen at, 0 for a free one [8008]")
+    parser.add_argument("--port", type=int, default=8008, help="port to listen on, 0 for a free one [8008]")
     parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until interrupted."""
     if arguments.host in WILDCARDS:
-        raise InputError(f"--host {arguments.host} names no machine; give the address that the browser will use")
+        raise InputError(f"--host {arguments.host} does not name a machine; give the address that the browser will use")
     folder = ImageFolder(arguments.folder)
     store = AnnotationStore(folder.root, JOINT_NAMES[arguments.parts])
     listening = _listen(arguments.host, arguments.port)
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     app = make_app(folder, store, arguments.parts, tuple(f"{name}:{port}" for name in sorted(names)))
     print(f"{len(folder.items)} images; open http://{host}:{port}/ and stop with Ctrl+C", flush=True)
     try:
-        waitress.serve(app, sockets=[listening], threads=4, max_request_body_size=MOST_REQUEST, _quiet=True)
+        waitress.serve(app, sockets=[listening], threads=4, max_request_body_size=MAX_REQUEST_BYTES, _quiet=True)
     finally:
         store.close()
     print("every change is saved in", store.path, file=sys.stderr)
@@ -59,5 +59,5 @@ def _listen(host: str, port: int) -> socket.socket:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((host, port))
     except (OSError, OverflowError) as error:
-        raise InputError(f"{host}:{port} cannot be listened at ({error}); choose another --port or --host") from error
+        raise InputError(f"{host}:{port} cannot be listened on ({error}); choose another --port or --host") from error
     return listening

@@ -10,23 +10,23 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.body.scans.scan import read_scan, storable
+from flowing_puppet_ros.body.scans.scan import read_scan, to_smallest_float
 from flowing_puppet_ros.body.scans.scan_correspondence import correspond
 from flowing_puppet_ros.errors import InputError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the verb's arguments."""
+    """Add the arguments of this verb."""
     parser.add_argument("fit_a", type=Path, metavar="A.npz", help="fit of scan A, as `fit` writes it")
     parser.add_argument("fit_b", type=Path, metavar="B.npz", help="fit of scan B")
     parser.add_argument("--scan-a", type=Path, required=True, metavar="FILE", help="scan A, a mesh or cloud")
     parser.add_argument("--scan-b", type=Path, required=True, metavar="FILE", help="scan B, a mesh or cloud")
-    parser.add_argument("--out", type=Path, required=True, metavar="PAIRS.npz", help="points (N,3), distance (N,)")
+    parser.add_argument("--out", type=Path, required=True, metavar="PAIRS.npz", help="points (N, 3), distance (N,)")
     parser.add_argument("--json", action="store_true", help="print a JSON object on stdout")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write for every vertex of scan A its point on scan B, in scan B's frame and unit."""
+    """Write each scan A vertex's point on scan B, in scan B's frame and unit."""
     vertices_a, faces_a = _read_fit(arguments.fit_a)
     vertices_b, faces_b = _read_fit(arguments.fit_b)
     if not np.array_equal(faces_a, faces_b):
@@ -35,7 +35,7 @@ def run(arguments: argparse.Namespace) -> int:
     points, distance = correspond(vertices_a, vertices_b, faces_a, scan_a, scan_b)
     try:
         with arguments.out.open("wb") as file:
-            np.savez_compressed(file, points=storable(points), distance=distance.astype(np.float32))
+            np.savez_compressed(file, points=to_smallest_float(points), distance=distance.astype(np.float32))
     except OSError as error:
         raise InputError(f"--out {arguments.out} cannot be written: {error.strerror}") from error
     if arguments.json:
@@ -52,4 +52,4 @@ def _read_fit(path: Path) -> tuple[np.ndarray, np.ndarray]:
             raise ValueError("vertices and faces do not make a mesh")
         return vertices, faces
     except (OSError, ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} is no fit; make it with `flowing-puppet fit`") from error
+        raise InputError(f"{path} is not a fit; make one with `flowing-puppet fit`") from error

@@ -11,6 +11,7 @@ import argparse
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,20 @@ import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import FitterSettings
 from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
-from flowing_puppet_ros.body.scans.scan_frame import UNITS, UP_NAMES
+from flowing_puppet_ros.body.scans.scan_frame import UNITS, UP_AXES
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli.batch import runner
-from flowing_puppet_ros.cli.fit_file import FitOptions, files_of, fit_file
+from flowing_puppet_ros.cli.fit_file import FitOptions, fit_file, list_files
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.settings import make_out_folder
+from flowing_puppet_ros.settings import Settings, make_out_folder, nested
+
+
+@dataclass(frozen=True)
+class FitVerbSettings(Settings):
+    """Settings of the fit, and of the segmentation of scenes before it."""
+
+    fitter: FitterSettings = nested(FitterSettings)
+    segmentation: SegmentationSettings = nested(SegmentationSettings)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,10 +44,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--model", choices=("neutral", "female", "male"), default="neutral", help="body model [neutral]"
     )
-    FitterSettings.add_arguments(parser)
+    FitVerbSettings.add_arguments(parser, main="fitter")
     parser.add_argument(
         "--up",
-        choices=(*UP_NAMES, "auto"),
+        choices=(*UP_AXES, "auto"),
         default="auto",
         help="the axis of the input's frame that points up; --up=-y in optical frames [auto]",
     )
@@ -61,7 +70,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="find the people among floor, walls and furniture first (in metres if --unit is auto); results are"
         " <stem>-1 and so on, the likeliest person first",
     )
-    SegmentationSettings.add_arguments(parser)
     parser.add_argument("--rerun", type=Path, metavar="RRD", help="write the fits as a recording for the Rerun viewer")
     runner.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object per input on stdout")
@@ -69,6 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit every input; one that fails is reported and the others go on."""
+    settings = FitVerbSettings.from_arguments(arguments)
     options = FitOptions(
         out=runner.resolve_path(arguments.out, arguments),
         model=arguments.model,
@@ -77,22 +86,22 @@ def run(arguments: argparse.Namespace) -> int:
         unit=arguments.unit,
         view=arguments.view,
         scene=arguments.scene,
-        settings=FitterSettings.from_arguments(arguments),
-        extraction=SegmentationSettings.from_arguments(arguments),
+        settings=settings.fitter,
+        segmentation=settings.segmentation,
     )
     sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in _scans(given)]
     several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
     finished: list[dict[str, Any]] = []
     if arguments.rerun is not None:
-        from flowing_puppet_ros.report.rerun_file import rerun_sdk
+        from flowing_puppet_ros.report.rerun_file import import_rerun
 
-        rerun_sdk()
+        import_rerun()
 
     def tell(summary: dict[str, Any]) -> None:
         _tell(summary, arguments.json)
         finished.extend([] if "error" in summary else [summary])
 
-    verb = runner.Verb("fit", fit_file, files_of, tell)
+    verb = runner.Verb("fit", fit_file, list_files, tell)
     if several:
         status = runner.run_batch(verb, sources, options, arguments.out, arguments)
     else:
@@ -107,9 +116,9 @@ def run(arguments: argparse.Namespace) -> int:
 def _one(verb: runner.Verb, source: Path, options: FitOptions) -> int:
     make_out_folder(options.out)
     try:
-        verb.tell(fit_file(source, options, shown=True))
+        verb.report(fit_file(source, options, shown=True))
     except PuppetError as error:
-        verb.tell({"input": str(source), "error": str(error)})
+        verb.report({"input": str(source), "error": str(error)})
         raise
     return 0
 

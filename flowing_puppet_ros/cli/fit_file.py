@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of one file of `flowing-puppet fit`: unit, axes and view found, the body fitted, and the result written."""
+"""Fit one file for `flowing-puppet fit`: determine unit, axes and view, fit the body, write the result."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from tqdm import tqdm
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.up_axis_search import fit_in_best_frame
-from flowing_puppet_ros.body.scans.scan import Scan, read_scan, storable, write_ply
+from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
 from flowing_puppet_ros.body.scans.scan_frame import (
     UNITS,
     ScanFrame,
-    all_candidates,
-    axis_of,
     guess_scale,
-    seen_from_origin,
-    up_candidates,
+    is_seen_from_origin,
+    parse_axis,
+    propose_all_up_axes,
+    propose_up_axes,
 )
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.body.segmentation.up_axis import segment_people_unknown_up
@@ -33,21 +33,21 @@ from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
-WRITTEN_SHAPES = 4
-SCENE_POINTS = 300_000
+WRITTEN_SHAPE_COEFFICIENTS = 4  # of each part, as in the thesis; all are in `all_shape_coefficients`
+MAX_SCENE_POINTS = 300_000  # sampled from a scene
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Person:
+class ScanPerson:
     """One person's cloud in a scan's frame and unit.
 
     Attributes:
         suffix: appended to the input's stem for the result.
         points: (N, 3).
         normals: (N, 3) or None.
-        scale: metres a unit.
-        ups: directions (3,) that may be up, the likelier first.
-        sensor: (3,) where the sensor stood if the cloud shows one side.
+        scale: metres per unit.
+        ups: directions (3,) that may be up, the most likely first.
+        sensor: (3,) position of the sensor if the cloud shows one side, else None.
     """
 
     suffix: str
@@ -60,7 +60,7 @@ class Person:
 
 @dataclass(frozen=True, slots=True)
 class FitOptions:
-    """All that a fit is told; see the flags of `fit`. `settings.threads` alone does not change the result."""
+    """All options of a fit; see the flags of `fit`. Only `settings.threads` does not change the result."""
 
     out: Path = field(repr=False)
     model: str
@@ -70,37 +70,37 @@ class FitOptions:
     view: str
     scene: bool
     settings: FitterSettings
-    extraction: SegmentationSettings
+    segmentation: SegmentationSettings
 
 
 def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str, Any]:
     """Fit the person, or the people of a scene, in one file; write the results and return a summary for JSON.
 
-    `shown` draws a bar of the progress on stderr. Raises PuppetError when the file cannot be used or nobody is in it.
+    `shown` draws a progress bar on stderr. PuppetError if the file cannot be used or shows no person.
     """
     started = time.perf_counter()
-    fitter = _fitter(options.model, options.settings)
+    fitter = _make_fitter(options.model, options.settings)
     _refuse_overwriting(source, options)
     scan = read_scan(source)
     if not options.scene:
-        person = _whole_scan(scan, fitter, options)
+        person = _take_whole_scan(scan, fitter, options)
         return {"input": str(source)} | _fit_person(source, person, fitter, options, started, shown)
     fits = []
-    for person in _people(scan, source, fitter, options):
+    for person in _segment_scene(scan, source, fitter, options):
         fits.append(_fit_person(source, person, fitter, options, started, shown))
         started = time.perf_counter()
     return {"input": str(source), "people": fits}
 
 
-def files_of(summary: dict[str, Any]) -> list[Path]:
-    """The files that a summary of `fit_file` names."""
+def list_files(summary: dict[str, Any]) -> list[Path]:
+    """List the files that a summary of `fit_file` names."""
     outputs = [Path(fit["output"]) for fit in summary.get("people", [summary])]
     return [output.with_suffix(suffix) for output in outputs for suffix in (".npz", ".ply")]
 
 
 @lru_cache(maxsize=1)
-def _fitter(model: str, settings: FitterSettings) -> BodyFitter:
-    """The fitter that all inputs of a process share."""
+def _make_fitter(model: str, settings: FitterSettings) -> BodyFitter:
+    """Make the fitter that all inputs of a process share."""
     return BodyFitter(StitchedPuppet.load(model), settings)
 
 
@@ -109,41 +109,41 @@ def _refuse_overwriting(source: Path, options: FitOptions) -> None:
         raise InputError(f"the fit of {source} would overwrite it; choose another folder for --out")
 
 
-def _whole_scan(scan: Scan, fitter: BodyFitter, options: FitOptions) -> Person:
-    """The only person of a scan."""
+def _take_whole_scan(scan: Scan, fitter: BodyFitter, options: FitOptions) -> ScanPerson:
+    """Return the only person of a scan."""
     scale = guess_scale(scan) if options.unit == "auto" else UNITS[options.unit]
-    points, normals = scan.surface(fitter.settings.cloud_points, np.random.default_rng(fitter.settings.seed))
-    sensor = _sensor(points, normals, scale, options.view)
-    ups = up_candidates(points, sensor is not None) if options.up == "auto" else [axis_of(options.up)]
-    return Person("", points, normals, scale, _any_way(points, ups, options), sensor)
+    points, normals = scan.sample_surface(fitter.settings.max_points, np.random.default_rng(fitter.settings.seed))
+    sensor = _locate_sensor(points, normals, scale, options.view)
+    ups = propose_up_axes(points, sensor is not None) if options.up == "auto" else [parse_axis(options.up)]
+    return ScanPerson("", points, normals, scale, _candidate_ups(points, ups, options), sensor)
 
 
-def _people(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> list[Person]:
-    """The people in the cloud of a scene."""
+def _segment_scene(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> list[ScanPerson]:
+    """Segment the people in the cloud of a scene; PuppetError if there is none."""
     scale = UNITS["m" if options.unit == "auto" else options.unit]
-    points, normals = scan.surface(SCENE_POINTS, np.random.default_rng(fitter.settings.seed))
-    ups = [axis_of(name) for name in (("z", "y", "-y") if options.up == "auto" else (options.up,))]
+    points, normals = scan.sample_surface(MAX_SCENE_POINTS, np.random.default_rng(fitter.settings.seed))
+    ups = [parse_axis(name) for name in (("z", "y", "-y") if options.up == "auto" else (options.up,))]
     sensor = None if options.view == "full" else np.zeros(3)
-    up, found = segment_people_unknown_up(points, normals, scale, ups, sensor, options.extraction)
+    up, found = segment_people_unknown_up(points, normals, scale, ups, sensor, options.segmentation)
     if not found:
         raise PuppetError(
-            f"{path} shows nobody among its {len(points)} points; check --up and --unit, lower --likeness, or cut the"
-            " person out and leave --scene"
+            f"{path} shows no person among its {len(points)} points; check --up and --unit, lower "
+            "--segmentation-min-score, or cut the person out and leave --scene"
         )
     people = []
     for number, cloud in enumerate(found, start=1):
-        seen = _sensor(cloud.points, cloud.normals, scale, options.view)
-        ways = _any_way(cloud.points, [up], options)
-        people.append(Person(f"-{number}", cloud.points, cloud.normals, scale, ways, seen))
+        seen = _locate_sensor(cloud.points, cloud.normals, scale, options.view)
+        ways = _candidate_ups(cloud.points, [up], options)
+        people.append(ScanPerson(f"-{number}", cloud.points, cloud.normals, scale, ways, seen))
     return people
 
 
-def _any_way(points: np.ndarray, ups: list[np.ndarray], options: FitOptions) -> list[np.ndarray]:
-    return all_candidates(points) if options.upright == "any" else ups
+def _candidate_ups(points: np.ndarray, ups: list[np.ndarray], options: FitOptions) -> list[np.ndarray]:
+    return propose_all_up_axes(points) if options.upright == "any" else ups
 
 
 def _fit_person(
-    path: Path, person: Person, fitter: BodyFitter, options: FitOptions, started: float, shown: bool
+    path: Path, person: ScanPerson, fitter: BodyFitter, options: FitOptions, started: float, shown: bool
 ) -> dict[str, Any]:
     output = options.out / f"{path.stem}{person.suffix}.npz"
     with tqdm(total=100, desc=output.stem, unit="%", file=sys.stderr, disable=not shown) as bar:
@@ -154,11 +154,11 @@ def _fit_person(
             scale=person.scale,
             ups=person.ups,
             sensor=person.sensor,
-            progress=_shown(bar),
+            progress=_progress_on(bar),
         )
     seconds = time.perf_counter() - started
     try:
-        _write(output, fitter.model, frame, fit, seconds)
+        _write_fit(output, fitter.model, frame, fit, seconds)
     except OSError as error:
         raise PuppetError(f"{output} cannot be written: {error.strerror}") from error
     return {
@@ -175,16 +175,16 @@ def _fit_person(
     }
 
 
-def _shown(bar: tqdm) -> Callable[[float], None]:
+def _progress_on(bar: tqdm) -> Callable[[float], None]:
     return lambda done: bar.update(int(100 * done) - bar.n) and None
 
 
-def _sensor(points: np.ndarray, normals: np.ndarray | None, scale: float, view: str) -> np.ndarray | None:
-    """Where the sensor of a cloud from one side stood, None for one from all sides.
+def _locate_sensor(points: np.ndarray, normals: np.ndarray | None, scale: float, view: str) -> np.ndarray | None:
+    """Return the position (3,) of the sensor of a cloud from one side, None for a cloud from all sides.
 
-    It stood at the origin when that lies outside the cloud, otherwise where the normals look.
+    It is the origin if that lies outside the cloud, otherwise in the mean direction of the normals.
     """
-    if view == "full" or (view == "auto" and not seen_from_origin(scale * points)):
+    if view == "full" or (view == "auto" and not is_seen_from_origin(scale * points)):
         return None
     low, high = points.min(axis=0), points.max(axis=0)
     if np.any((low > 0) | (high < 0)):
@@ -195,9 +195,9 @@ def _sensor(points: np.ndarray, normals: np.ndarray | None, scale: float, view: 
     return points.mean(axis=0) + 3 * float(np.ptp(points, axis=0).max()) * mean / max(float(np.linalg.norm(mean)), 1e-9)
 
 
-def _write(output: Path, model: StitchedPuppet, frame: ScanFrame, fit: BodyFit, seconds: float) -> None:
-    """Write the fit in the scan's frame and unit as `output` and as a mesh beside it."""
-    vertices = storable(frame.to_scan(fit.vertices))
+def _write_fit(output: Path, model: StitchedPuppet, frame: ScanFrame, fit: BodyFit, seconds: float) -> None:
+    """Write the fit, in the scan's frame and unit, as `output` and as a mesh beside it."""
+    vertices = to_smallest_float(frame.to_scan(fit.vertices))
     arrays: dict[str, Any] = {
         "vertices": vertices,
         "faces": model.faces,
@@ -208,7 +208,7 @@ def _write(output: Path, model: StitchedPuppet, frame: ScanFrame, fit: BodyFit, 
         "part_confidence": fit.part_confidence.astype(np.float32),
         "joint_names": np.array(model.joint_names),
         "joints": frame.to_scan(fit.joints).astype(vertices.dtype),
-        "shape_coefficients": fit.state.shape[:, :WRITTEN_SHAPES].astype(np.float32),
+        "shape_coefficients": fit.state.shape[:, :WRITTEN_SHAPE_COEFFICIENTS].astype(np.float32),
         "all_shape_coefficients": fit.state.shape.astype(np.float32),
         "pose_coefficients": fit.state.pose.astype(np.float32),
         "energy": fit.energy,
@@ -218,7 +218,7 @@ def _write(output: Path, model: StitchedPuppet, frame: ScanFrame, fit: BodyFit, 
         "seconds": seconds,
         "model": model.name,
     }
-    # A result is there whole or not at all, even if two machines make it at once or one is stopped.
+    # Write atomically, in case two machines make the same result or one is stopped.
     unfinished = output.with_name(f".{output.stem}.{os.getpid()}")
     try:
         with unfinished.open("wb") as stream:

@@ -20,21 +20,21 @@ MODULES = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add one sub-command for each thing that is learned; InputError where what only `learn` needs is absent."""
+    """Add one sub-command per model; InputError if a package that only `learn` needs is missing."""
     kinds = parser.add_subparsers(dest="kind", required=True, metavar="|".join(MODULES))
     for name in MODULES:
-        module = _module(name)
+        module = _import_kind(name)
         summary = (module.__doc__ or "").partition("\n")[0].rstrip(".").replace("%", "%%")
         module.add_arguments(kinds.add_parser(name, help=summary, description=module.__doc__))
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Learn what was chosen and return the exit status."""
-    status: int = _module(arguments.kind).run(arguments)
+    """Learn the chosen model and return the exit status."""
+    status: int = _import_kind(arguments.kind).run(arguments)
     return status
 
 
-def _module(name: str) -> ModuleType:
+def _import_kind(name: str) -> ModuleType:
     try:
         return import_module(f"flowing_puppet_ros.learn.{MODULES[name]}")
     except ModuleNotFoundError as error:

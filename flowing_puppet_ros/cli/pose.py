@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the pose of the people in single images: joints, part outlines, depth order, and other hypotheses of the arms.
 
-The package's own detector says where people are, or the keypoints of --init do. Frames of --init are counted from 0 in
-the order of the images.
+The package's own detector, or the keypoints of --init, say where people are. Frames of --init are counted from 0 in the
+order of the images.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.image.detector.detection import PersonDetection
 from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
-from flowing_puppet_ros.image.formats.tracks_json import DECIMALS, puppet_entry, read_keypoints, write_tracks
+from flowing_puppet_ros.image.formats.tracks_json import DECIMALS, puppet_to_json, read_keypoints, write_tracks
 from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, IMAGE_SUFFIXES, open_frames
 from flowing_puppet_ros.image.pose.estimator import PoseEstimator
 from flowing_puppet_ros.image.pose.result import PosedPuppet
@@ -31,8 +31,18 @@ from flowing_puppet_ros.image.pose.settings import PoseSettings
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.tree import PartTree
+from flowing_puppet_ros.settings import Settings, nested
+from flowing_puppet_ros.threads import one_opencv_thread
 
 GENDERS = ("neutral", "female", "male")
+
+
+@dataclass(frozen=True)
+class PoseVerbSettings(Settings):
+    """Settings of the search for a pose, and of the detector before it."""
+
+    pose: PoseSettings = nested(PoseSettings)
+    detector: DetectorSettings = nested(DetectorSettings)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,14 +56,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--model", default="neutral", choices=(*GENDERS, "auto"), help="body; auto: the likeliest [neutral]"
     )
     parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
-    parser.add_argument("--json", action="store_true", help="print one JSON object an image")
-    PoseSettings.add_arguments(parser)
-    DetectorSettings.add_arguments(parser)
+    parser.add_argument("--json", action="store_true", help="print one JSON object per image")
+    PoseVerbSettings.add_arguments(parser, main="pose")
 
 
+@one_opencv_thread()
 def run(arguments: argparse.Namespace) -> int:
-    """Pose the people of every image; 1 when an image could not be read, after all others are done."""
-    files = list(_files(arguments.images))
+    """Pose the people of every image; return 1 if an image could not be read, after all others are done."""
+    files = list(_find_images(arguments.images))
     init = None if arguments.init is None else read_keypoints(arguments.init)
     if arguments.out.resolve() in {file.resolve() for file in files} | {Path(arguments.init or "").resolve()}:
         raise InputError(f"{arguments.out} is an input itself: name another output")
@@ -62,11 +72,11 @@ def run(arguments: argparse.Namespace) -> int:
     genders = GENDERS if arguments.model == "auto" else (arguments.model,)
     models = [DeformableStructures.load(gender) for gender in genders]
     sides = [MultiViewStructures.load(gender) for gender in genders]
-    # The search knows upper bodies without hands of their own; those are drawn where the lower arms end.
+    # The search models upper bodies without separate hands; hands are drawn at the ends of the lower arms.
     drawn = [MultiViewStructures.load(gender, arguments.parts) for gender in genders] if arguments.parts > 10 else []
-    detector = _Configured(PartDetector.load(), DetectorSettings.from_arguments(arguments)) if init is None else None
-    settings = PoseSettings.from_arguments(arguments)
-    estimator = PoseEstimator(models, detector, PartLikelihood.load(), settings, sides, drawn)
+    settings = PoseVerbSettings.from_arguments(arguments)
+    detector = _ConfiguredDetector(PartDetector.load(), settings.detector) if init is None else None
+    estimator = PoseEstimator(models, detector, PartLikelihood.load(), settings.pose, sides, drawn)
     shown = drawn[0].views[0] if drawn else models[0]
     frames = []
     for index, file in enumerate(tqdm(files, unit="image", disable=None)):
@@ -80,10 +90,10 @@ def run(arguments: argparse.Namespace) -> int:
                 raise
             print(f"flowing-puppet pose: {error}", file=sys.stderr)
             continue
-        puppets = [pose_entry(one, shown.tree) for one in posed]
+        puppets = [make_pose_entry(one, shown.tree) for one in posed]
         stamp = round(index * 1e9 / FOLDER_FPS)
         frames.append({"index": index, "path": str(file), "stamp_ns": stamp, "puppets": puppets})
-        _tell(arguments, file, posed, time.monotonic() - began)
+        _print_result(arguments, file, posed, time.monotonic() - began)
     if not frames:
         raise InputError("none of the images can be used")
     write_tracks(arguments.out, shown.joint_names, FOLDER_FPS, frames)
@@ -91,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Configured:
+class _ConfiguredDetector:
     """The detector with the settings of the command line."""
 
     detector: PartDetector
@@ -101,18 +111,18 @@ class _Configured:
         return self.detector.detect(image, self.settings)
 
 
-def _files(paths: list[Path]) -> Iterator[Path]:
-    """The image files that the arguments name, folders in natural order."""
+def _find_images(paths: list[Path]) -> Iterator[Path]:
+    """Yield the image files that the arguments name, folders in natural order."""
     for path in paths:
         source = open_frames(path) if path.is_dir() or path.suffix.lower() in IMAGE_SUFFIXES else None
         if source is None:
-            told = "is no image" if path.is_file() else "does not exist"
-            raise InputError(f"{path} {told}; give image files or folders of images, and videos to `track`")
+            reason = "is not an image" if path.is_file() else "does not exist"
+            raise InputError(f"{path} {reason}; give image files or folders of images, and videos to `track`")
         yield from source.files
 
 
-def pose_entry(posed: PosedPuppet, tree: PartTree) -> dict[str, Any]:
-    """The JSON object of one person: a puppet as in tracks.json, its model, and the solutions with their energies."""
+def make_pose_entry(posed: PosedPuppet, tree: PartTree) -> dict[str, Any]:
+    """Make the JSON object of one person: a puppet as in tracks.json, its model, all solutions and their energies."""
     solutions = [
         {
             "energy": round(one.energy, 4),
@@ -123,10 +133,10 @@ def pose_entry(posed: PosedPuppet, tree: PartTree) -> dict[str, Any]:
     ]
     genders = {name: round(value, 4) for name, value in posed.gender_probability.items()}
     extra = {"model": posed.model, "gender_probability": genders, "solutions": solutions}
-    return puppet_entry(posed, tree) | extra
+    return puppet_to_json(posed, tree) | extra
 
 
-def _tell(arguments: argparse.Namespace, file: Path, posed: list[PosedPuppet], seconds: float) -> None:
+def _print_result(arguments: argparse.Namespace, file: Path, posed: list[PosedPuppet], seconds: float) -> None:
     if not arguments.json:
         print(f"{file}: {len(posed)} {'person' if len(posed) == 1 else 'people'}, {seconds:.2f} s")
         return

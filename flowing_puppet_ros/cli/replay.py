@@ -91,9 +91,9 @@ def run(arguments: argparse.Namespace) -> int:
         salvage=arguments.salvage,
     )
     if arguments.rerun is not None:
-        from flowing_puppet_ros.report.rerun_file import rerun_sdk
+        from flowing_puppet_ros.report.rerun_file import import_rerun
 
-        rerun_sdk()
+        import_rerun()
     sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in bags_of(given)]
     if sources == arguments.inputs and len(sources) == 1 and arguments.scheduler is None:
         return _one(sources[0], arguments, options)
@@ -124,7 +124,7 @@ def _one(source: Path, arguments: argparse.Namespace, options: ReplayOptions) ->
 
 def replay_one(source: Path, told: ReplayJob) -> dict[str, Any]:
     """Replay one bag of several into a file of its own, with its report if that is wanted, and return the summary."""
-    name = runner.stem_of(source)
+    name = runner.result_stem(source)
     target = told.out / f"{name}.mcap"
     summary = replay(source, target, told.options)
     if told.reports is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the HTML report of a replay from its output bag and, for images and flow, its input bag: one file alone."""
+"""Make the HTML report of a replay, one self-contained file, from its output bag and, for images, its input bag."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flowing_puppet_ros.report.report import write_report
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flowing-puppet report`."""
-    parser.add_argument("output", type=Path, metavar="OUT.mcap", help="the bag that the replay wrote")
+    parser.add_argument("output", type=Path, metavar="OUT.mcap", help="the bag written by the replay")
     parser.add_argument(
         "--input", type=Path, metavar="IN.mcap", help="the bag that was replayed [none: overlays instead of images]"
     )
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Write the report and name it on stdout."""
+    """Write the report and print its path."""
     write_report(arguments.input or arguments.output, arguments.output, arguments.out, picture=arguments.picture)
     print(arguments.out)
     return 0

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Track people in a video, a folder of frames or a bag: joints, part outlines and depth order in every frame.
 
-The keypoints of --init or of a bag say where people are, otherwise the detector of this package; optical flow carries
-them on. At the end the hypotheses of the arms are joined and the joints smoothed along the flow, over the whole input,
-unless --live is given.
+People come from the keypoints of --init or of a bag, else from the package's detector; optical flow propagates them.
+At the end the best hypotheses of the arms are chosen and all joints smoothed along the flow, over the whole input. With
+--live no frame is used before its turn; with --method thesis the loop of the thesis places the joints instead.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,26 +20,20 @@ from typing import Any
 from tqdm import tqdm
 
 from flowing_puppet_ros.bag.paths import is_bag
-from flowing_puppet_ros.draw.overlay_video import check_overlay, drawn_tracks, write_overlay
+from flowing_puppet_ros.draw.overlay_video import check_overlay, read_drawn_tracks, write_overlay
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.flow.estimate import FlowSettings
-from flowing_puppet_ros.image.arms.evidence import ArmEvidence, ArmEvidenceModel
-from flowing_puppet_ros.image.arms.viterbi import PathSettings
-from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.formats.tracks_json import puppet_entry, read_keypoints, write_tracks
+from flowing_puppet_ros.image.formats.tracks_json import puppet_to_json, read_keypoints, write_tracks
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame, open_frames
-from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings
-from flowing_puppet_ros.image.tracking.track import TrackerSettings
-from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
-from flowing_puppet_ros.image.video.offline_smoother import OfflineSmoother
-from flowing_puppet_ros.image.video.tracking_by_detection import DetectingTracker, DetectionSettings
+from flowing_puppet_ros.image.video.clip import (
+    Clip,
+    ClipSettings,
+    DetectedFrame,
+    TrackedFrame,
+    track_clip,
+    track_live,
+)
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-
-type Detected = tuple[VideoFrame, list[Keypoints] | None]
-type Stepped = tuple[TrackResult, dict[str, ArmEvidence] | None]
-type Stepper = Callable[[VideoFrame, list[Keypoints] | None], Stepped]
-type Tracked = tuple[int, int, str, list[TrackedPuppet]]  # index, stamp, path of a frame, and its people
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -53,28 +47,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
     parser.add_argument("--json", action="store_true", help="print a summary as one JSON object")
     parser.add_argument("--overlay", help="video to write: the puppets on the frames and on the flow (.mp4 or .avi)")
-    parser.add_argument("--live", action="store_true", help="use no frame after the one on show, as the nodes do")
-    TrackerSettings.add_arguments(parser)
-    FlowSettings.add_arguments(parser)
-    DetectionSettings.add_arguments(parser)
-    PathSettings.add_arguments(parser)
-    SmoothingSettings.add_arguments(parser)
+    parser.add_argument("--live", action="store_true", help="use no frame after the current one, as the nodes do")
+    parser.add_argument(
+        "--method",
+        default="smoothed",
+        choices=("smoothed", "thesis"),
+        help="smoothed: joints smoothed along the flow; thesis: the loop of the thesis, a slow reference [smoothed]",
+    )
+    ClipSettings.add_arguments(parser, main="tracker")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Track through the whole input and write the tracks."""
+    if arguments.live and arguments.method != "smoothed":
+        raise InputError("--live and --method thesis exclude each other: the thesis's loop sees the whole input")
     model = DeformableStructures.load(arguments.model, arguments.parts)
-    settings = TrackerSettings.from_arguments(arguments), FlowSettings.from_arguments(arguments)
-    clip = OfflineSmoother(model, SmoothingSettings.from_arguments(arguments), PathSettings.from_arguments(arguments))
-    tracker = FlowingPuppetTracker(model, *settings)
+    settings = ClipSettings.from_arguments(arguments)
     if arguments.overlay:
         check_overlay(Path(arguments.overlay))
-    source = _open(arguments, _warn)
-    tally = _Tally()
-    shown = tqdm(source.frames, total=source.count or None, unit="frame", disable=None)
-    steps = _tracked(_stepper(arguments, tracker, source.given), shown)
-    people = _live(steps) if arguments.live else _whole(steps, clip)
+    source = _open(arguments, _Warnings())
     began = time.monotonic()
+    people = _track(arguments, source, model, settings)
+    tally = _Tally()
     write_tracks(arguments.out, model.joint_names, source.fps, tally.counted(_entries(people, model)))
     if not tally.frames:
         Path(arguments.out).unlink(missing_ok=True)
@@ -85,29 +79,21 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _track(
+    arguments: argparse.Namespace, source: _Source, model: DeformableStructures, settings: ClipSettings
+) -> Iterator[TrackedFrame]:
+    def progress(frames: Iterable[DetectedFrame], title: str) -> Iterable[DetectedFrame]:
+        return tqdm(frames, title, total=source.count or None, unit="frame", disable=None)
+
+    if arguments.live:
+        return track_live(source.clip, model, settings, warn=source.warnings, progress=progress)
+    return track_clip(source.clip, model, settings, method=arguments.method, warn=source.warnings, progress=progress)
+
+
 def _draw(arguments: argparse.Namespace, fps: float) -> None:
     """Write --overlay: the input again, with what was written to --out."""
-    images = ((frame.index, frame.image) for frame, _ in _open(arguments, lambda _: None).frames)
-    write_overlay(Path(arguments.overlay), images, drawn_tracks(Path(arguments.out)), fps)
-
-
-def _stepper(arguments: argparse.Namespace, tracker: FlowingPuppetTracker, given: bool) -> Stepper:
-    """What steps the tracker: with the keypoints that are `given`, or with the detector."""
-    if given:
-        return lambda frame, detections: (tracker.step(frame.image, frame.stamp_ns, detections), None)
-    settings = DetectionSettings.from_arguments(arguments)
-    video = DetectingTracker(tracker, PartDetector.load(), ArmEvidenceModel.load(arguments.model), settings)
-    if arguments.live:
-        return lambda frame, _: (video.step(frame.image, frame.stamp_ns)[0], None)
-    again = _open(arguments, lambda _: None)
-    searched = tqdm(again.frames, "search", total=again.count or None, unit="frame", disable=None)
-    paths = video.search(frame.image for frame, _ in searched)
-
-    def step(frame: VideoFrame, detections: list[Keypoints] | None) -> Stepped:
-        result, found = video.step(frame.image, frame.stamp_ns, paths=paths)
-        return result, video.arm_evidence(frame.image, result, found)
-
-    return step
+    images = ((frame.index, frame.image) for frame, _ in _open(arguments, _Warnings(quiet=True)).clip.frames)
+    write_overlay(Path(arguments.overlay), images, read_drawn_tracks(Path(arguments.out)), fps)
 
 
 @dataclass
@@ -126,59 +112,38 @@ class _Tally:
             yield entry
 
 
-def _tracked(step: Stepper, detected: Iterable[Detected]) -> Iterator[tuple[VideoFrame, Stepped]]:
-    """Step through the frames; one that cannot be used is warned of and left out."""
-    last = ""
-    for frame, detections in detected:
-        try:
-            result, sights = step(frame, detections)
-        except InputError as error:
-            _warn(f"frame {frame.index}: {error}")
-            continue
-        for warning in result.warnings:
-            if warning != last:
-                _warn(f"frame {frame.index}: {warning}")
-            last = warning
-        yield frame, (result, sights)
+def _entries(frames: Iterable[TrackedFrame], model: DeformableStructures) -> Iterator[dict[str, Any]]:
+    for frame in frames:
+        people = [puppet_to_json(puppet, model.tree) for puppet in frame.puppets]
+        entry: dict[str, Any] = {"index": frame.index, "stamp_ns": frame.stamp_ns, "puppets": people}
+        yield entry | ({"path": frame.path} if frame.path else {})
 
 
-def _live(steps: Iterable[tuple[VideoFrame, Stepped]]) -> Iterator[Tracked]:
-    for frame, (result, _) in steps:
-        yield frame.index, frame.stamp_ns, frame.path, result.puppets
+class _Warnings:
+    """Prints each sentence once: the input may be read several times."""
 
+    def __init__(self, quiet: bool = False) -> None:
+        self._told: set[str] = set()
+        self._quiet = quiet
 
-def _whole(steps: Iterable[tuple[VideoFrame, Stepped]], clip: OfflineSmoother) -> Iterator[Tracked]:
-    seen = []
-    for frame, (result, sights) in steps:
-        clip.add(result, sights)
-        seen.append((frame.index, frame.stamp_ns, frame.path))
-    for (index, stamp_ns, path), puppets in zip(seen, clip.people(), strict=True):
-        yield index, stamp_ns, path, puppets
-
-
-def _entries(tracked: Iterable[Tracked], model: DeformableStructures) -> Iterator[dict[str, Any]]:
-    for index, stamp_ns, path, puppets in tracked:
-        people = [puppet_entry(puppet, model.tree) for puppet in puppets]
-        entry: dict[str, Any] = {"index": index, "stamp_ns": stamp_ns, "puppets": people}
-        yield entry | ({"path": path} if path else {})
-
-
-def _warn(sentence: str) -> None:
-    print(f"flowing-puppet track: {sentence}", file=sys.stderr)
+    def __call__(self, sentence: str) -> None:
+        if sentence not in self._told and not self._quiet:
+            print(f"flowing-puppet track: {sentence}", file=sys.stderr)
+        self._told.add(sentence)
 
 
 @dataclass(frozen=True)
 class _Source:
-    """Frames with the keypoints `given` for them (or none at all), their rate and number (0 unknown)."""
+    """A clip, its frame rate and number of frames (0 unknown), and what its warnings are told."""
 
-    frames: Iterable[Detected]
+    clip: Clip
     fps: float
     count: int
-    given: bool
+    warnings: _Warnings
 
 
-def _open(arguments: argparse.Namespace, warn: Callable[[str], None]) -> _Source:
-    """The input's frames with the keypoints that it or --init has; `warn` is told what is left out of it."""
+def _open(arguments: argparse.Namespace, warnings: _Warnings) -> _Source:
+    """Open the input's frames with the keypoints that it or --init has."""
     path, init, out = Path(arguments.input), arguments.init, Path(arguments.out)
     if out.resolve() in {Path(name).resolve() for name in (path, init) if name}:
         raise InputError(f"{out} is an input itself: name another output")
@@ -187,16 +152,25 @@ def _open(arguments: argparse.Namespace, warn: Callable[[str], None]) -> _Source
         # Only bags need the bag stack, which takes a while to import.
         from flowing_puppet_ros.bag.frames import open_bag_frames
 
-        bag = open_bag_frames(path, arguments.topic, arguments.salvage, warn)
+        bag = open_bag_frames(path, arguments.topic, arguments.salvage, warnings)
         if keypoints is None:
-            return _Source(bag, bag.fps, bag.count, bool(bag.detections))
+            return _Source(Clip(bag, bool(bag.detections)), bag.fps, bag.count, warnings)
         _check_reach(keypoints, bag.count, arguments)
-        return _Source(((frame, keypoints.get(frame.index)) for frame, _ in bag), bag.fps, bag.count, True)
-    source = open_frames(path, warn)
-    if keypoints is None:
-        return _Source(((frame, None) for frame in source), source.fps, source.count, False)
-    _check_reach(keypoints, source.count, arguments)
-    return _Source(((frame, keypoints.get(frame.index)) for frame in source), source.fps, source.count, True)
+        return _Source(Clip.of(_Images(bag), keypoints), bag.fps, bag.count, warnings)
+    source = open_frames(path, warnings)
+    if keypoints is not None:
+        _check_reach(keypoints, source.count, arguments)
+    return _Source(Clip.of(source, keypoints), source.fps, source.count, warnings)
+
+
+@dataclass(frozen=True)
+class _Images:
+    """The images of a bag without the detections in it."""
+
+    frames: Iterable[DetectedFrame]
+
+    def __iter__(self) -> Iterator[VideoFrame]:
+        return (frame for frame, _ in self.frames)
 
 
 def _check_reach(keypoints: dict[int, list[Keypoints]], count: int, arguments: argparse.Namespace) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of images, puppets, flow and meshes: what nodes, verbs and the report show.
+"""Pictures of images, puppets, flow and meshes: what nodes, commands and the report show.
 
-Arrays come in; RGB images (H,W,3), videos and plots go out. Read `overlay` first.
+Arrays come in; RGB images (H, W, 3), videos and plots go out. Read `overlay` first.
 """

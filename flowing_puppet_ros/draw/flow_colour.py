@@ -17,14 +17,14 @@ _WHEEL = np.stack([np.interp(np.arange(720) / 720, _ARC_ENDS, channel) for chann
 
 
 def flow_scale(flow: np.ndarray, percentile: float = 99.0) -> float:
-    """Magnitude in pixels that should be fully saturated: a percentile of flow (H,W,2) where known, at least 1."""
+    """Return the magnitude in pixels at full saturation: a percentile of `flow` (H, W, 2) where known, at least 1."""
     magnitude = np.hypot(flow[..., 0], flow[..., 1])
     known = magnitude[np.isfinite(magnitude)]
     return max(1.0, float(np.percentile(known, percentile))) if known.size else 1.0
 
 
 def flow_to_rgb(flow: np.ndarray, scale: float | None = None) -> np.ndarray:
-    """Colour a flow field (H,W,2), pixels, +x right, +y down; returns (H,W,3) uint8 RGB.
+    """Colour `flow` (H, W, 2), pixels, +x right, +y down; return an RGB image (H, W, 3) uint8.
 
     `scale` is the magnitude in pixels of full saturation (default `flow_scale`); faster pixels are darker, unknown
     (NaN) ones black.
@@ -33,8 +33,8 @@ def flow_to_rgb(flow: np.ndarray, scale: float | None = None) -> np.ndarray:
     return _colour(np.ascontiguousarray(flow, np.float32), np.float32(full), _WHEEL)
 
 
-def flow_legend(size: int = 96, background: int = 255) -> np.ndarray:
-    """Draw the wheel, (size,size,3) uint8 RGB: the colour of the motion from the centre to each pixel."""
+def draw_flow_legend(size: int = 96, background: int = 255) -> np.ndarray:
+    """Draw the colour wheel, RGB (size, size, 3) uint8: the colour of the motion from the centre to each pixel."""
     axis = (np.arange(size, dtype=np.float32) - (size - 1) / 2) / (size / 2)
     flow = np.stack(np.meshgrid(axis, axis), axis=-1)
     legend = flow_to_rgb(flow, 1.0)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A software renderer for meshes and points: z-buffer, Gouraud shading, no graphics card and no display.
 
-    camera = orthographic(vertices, looking=(-1, 0, 0), size=(300, 480))      # from the front of a body facing +x
+    camera = fit_orthographic_camera(vertices, direction=(-1, 0, 0), size=(300, 480))  # front of a body facing +x
     picture = render(vertices, faces, camera, (300, 480), colours=face_colours)
     Image.fromarray(picture.rgb)
 
-Anything with `project(points (N,3)) -> (pixels (N,2), depth (N,))` is a camera, if depth is linear in the points
-(pinhole and orthographic cameras are). World axes as in REP-103: z is up. The result depends on the input alone.
+Anything with `project(points (N, 3)) -> (pixels (N, 2), depth (N,))` is a camera, if depth is linear in the points
+(pinhole and orthographic cameras are). World axes as in REP-103: z is up. The result depends only on the input.
 """
 
 from __future__ import annotations
@@ -18,47 +18,48 @@ from typing import Protocol
 import numpy as np
 from numba import njit
 
-NEAR = 1e-3
-AMBIENT, HEADLIGHT, SKYLIGHT = 0.30, 0.58, 0.14
+MIN_DEPTH_M = 1e-3  # nearer faces and points are not drawn
+MAX_COORDINATE_PX = 1e6  # points further outside of the image are not drawn
+AMBIENT, HEADLIGHT, SKYLIGHT = 0.30, 0.58, 0.14  # shares of the light
 
 
 class Projector(Protocol):
-    """What the renderer needs of a camera."""
+    """A camera, as far as the renderer needs it."""
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Map (N,3) points to (N,2) pixels and (N,) depths, larger is farther."""
+        """Map `points` (N, 3) to pixels (N, 2) and depths (N,), larger is farther."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrthographicCamera:
-    """A camera infinitely far away: pixels = scale * (right, down) + offset; depth along the third axis, positive."""
+    """A camera infinitely far away: pixels = scale * (right, down) + offset; positive depth along the third axis."""
 
-    axes: np.ndarray  # (3,3), rows are right, down and forward in the world
+    axes: np.ndarray  # (3, 3), rows are right, down and forward in the world
     centre: np.ndarray  # (3,) world point that is shown at `offset`
     scale: float  # pixels per metre
     offset: np.ndarray  # (2,) pixels
     distance: float  # depth of the centre, metres
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Map (N,3) points in metres to (N,2) pixels and (N,) depths in metres."""
+        """Map `points` (N, 3) in metres to pixels (N, 2) and depths (N,) in metres."""
         local = (np.asarray(points, float) - self.centre) @ self.axes.T
         return local[:, :2] * self.scale + self.offset, local[:, 2] + self.distance
 
 
-def orthographic(
+def fit_orthographic_camera(
     points: np.ndarray,
-    looking: Sequence[float] | np.ndarray,
+    direction: Sequence[float] | np.ndarray,
     size: tuple[int, int],
     up: Sequence[float] | np.ndarray = (0.0, 0.0, 1.0),
     margin: float = 0.05,
     scale: float | None = None,
 ) -> OrthographicCamera:
-    """Make a camera that looks along `looking` (world) and shows all (N,3) `points` in an image of (width, height).
+    """Make a camera that looks along `direction` (world) and shows all `points` (N, 3) in an image of (width, height).
 
-    `margin` is the free part of the image on each side; `scale` in pixels per metre replaces the fitted one, so that
-    several pictures can have the same. `looking` must not be parallel to `up`.
+    `margin` is the free part of the image on each side. `scale` in pixels per metre replaces the fitted one, so that
+    several pictures can share it. `direction` must not be parallel to `up`.
     """
-    forward = np.asarray(looking, float) / np.linalg.norm(looking)
+    forward = np.asarray(direction, float) / np.linalg.norm(direction)
     right = np.cross(forward, np.asarray(up, float))
     right /= np.linalg.norm(right)
     axes = np.stack([right, np.cross(forward, right), forward])
@@ -73,7 +74,7 @@ def orthographic(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rendering:
-    """What a canvas shows: rgb (H,W,3) uint8, depth (H,W) float32 (inf where nothing is), coverage (H,W) 0 to 1."""
+    """A picture: `rgb` (H, W, 3) uint8, `depth` (H, W) float32 (inf where empty), `coverage` (H, W) in [0, 1]."""
 
     rgb: np.ndarray
     depth: np.ndarray
@@ -81,12 +82,12 @@ class Rendering:
 
     @property
     def mask(self) -> np.ndarray:
-        """(H,W) bool, True where anything was drawn."""
+        """(H, W) bool, True where anything was drawn."""
         return self.coverage > 0
 
 
 class Canvas:
-    """A picture that meshes and points are drawn into, in any order: the nearest surface stays."""
+    """A picture into which meshes and points are drawn, in any order: the nearest surface stays."""
 
     def __init__(self, camera: Projector, size: tuple[int, int], samples: int = 2) -> None:
         """Start an empty picture of (width, height) pixels with `samples` x `samples` sub-pixels each."""
@@ -97,16 +98,16 @@ class Canvas:
         depth = camera.project(frame)[1]
         self._forward = (depth[1:] - depth[0]) / np.linalg.norm(depth[1:] - depth[0])
 
-    def mesh(
+    def draw_mesh(
         self,
         vertices: np.ndarray,
         faces: np.ndarray,
         colours: np.ndarray | Sequence[int] = (205, 205, 210),
         smooth: bool = True,
     ) -> None:
-        """Draw a mesh: vertices (V,3), faces (F,3) counter-clockwise outside, colours (3,), (V,3) or (F,3) 0 to 255.
+        """Draw `vertices` (V, 3) and `faces` (F, 3), counter-clockwise; `colours` (3,), (V, 3) or (F, 3), 0 to 255.
 
-        Faces seen from inside are dark; faces that reach behind the camera or hold NaN are left out.
+        Faces seen from inside are dark; faces that reach behind the camera or have NaN are left out.
         """
         vertices, faces = np.asarray(vertices, float), np.asarray(faces, np.int64)
         paint = np.asarray(colours, np.float32)
@@ -117,25 +118,25 @@ class Canvas:
         else:
             corners = np.broadcast_to(paint[:, None], (*faces.shape, 3))
         normals = _vertex_normals(vertices, faces)[faces] if smooth else _face_normals(vertices, faces)[:, None]
-        lit = np.ascontiguousarray(corners * self._light(normals)[..., None], np.float32)
+        lit = np.ascontiguousarray(corners * self._shade(normals)[..., None], np.float32)
         pixels, depth = self._project(vertices)
         _fill_triangles(pixels, depth, faces, lit, self._depth, self._colour)
 
-    def points(
+    def draw_points(
         self,
         points: np.ndarray,
         colours: np.ndarray | Sequence[int] = (40, 90, 160),
         radius: float = 1.5,
         normals: np.ndarray | None = None,
     ) -> None:
-        """Draw (N,3) points as discs of `radius` pixels, lit when they have normals; colours (3,) or (N,3) 0 to 255."""
+        """Draw `points` (N, 3) as discs of `radius` pixels, shaded by `normals`; `colours` (3,) or (N, 3), 0 to 255."""
         pixels, depth = self._project(np.asarray(points, float))
-        light = np.ones(len(pixels)) if normals is None else self._light(np.asarray(normals, float))
+        light = np.ones(len(pixels)) if normals is None else self._shade(np.asarray(normals, float))
         lit = np.ascontiguousarray(np.asarray(colours, np.float32) * light[:, None], np.float32)
         _fill_discs(pixels, depth, lit, radius * self.samples, self._depth, self._colour)
 
-    def picture(self, background: Sequence[int] | np.ndarray = (255, 255, 255), opacity: float = 1.0) -> Rendering:
-        """Return what was drawn, with this opacity, over a colour (3,) or an image (H,W,3); sub-pixels are averaged."""
+    def compose(self, background: Sequence[int] | np.ndarray = (255, 255, 255), opacity: float = 1.0) -> Rendering:
+        """Return the drawing with `opacity` over a colour (3,) or an image (H, W, 3); sub-pixels are averaged."""
         (width, height), samples = self.size, self.samples
         blocks = (height, samples, width, samples)
         covered = np.isfinite(self._depth).reshape(blocks).mean(axis=(1, 3), dtype=np.float32)
@@ -149,7 +150,7 @@ class Canvas:
         pixels = (np.asarray(pixels, float) + 0.5) * self.samples - 0.5
         return np.ascontiguousarray(pixels), np.ascontiguousarray(depth, float)
 
-    def _light(self, normals: np.ndarray) -> np.ndarray:
+    def _shade(self, normals: np.ndarray) -> np.ndarray:
         head = np.maximum(normals @ -self._forward, 0)
         sky = np.maximum(normals[..., 2], 0)
         return AMBIENT + HEADLIGHT * head + SKYLIGHT * sky
@@ -166,8 +167,8 @@ def render(
 ) -> Rendering:
     """Draw one mesh and return the picture; arguments as `Canvas.mesh` and `Canvas.picture` take them."""
     canvas = Canvas(camera, size)
-    canvas.mesh(vertices, faces, colours, smooth)
-    return canvas.picture(background)
+    canvas.draw_mesh(vertices, faces, colours, smooth)
+    return canvas.compose(background)
 
 
 def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -177,7 +178,7 @@ def _face_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    weighted = np.cross(b - a, c - a)  # twice the area long, so that large faces count for more
+    weighted = np.cross(b - a, c - a)  # length is twice the area, so that large faces weigh more
     normals = np.zeros_like(vertices)
     for k in range(3):
         for axis in range(3):
@@ -195,7 +196,7 @@ def _fill_triangles(pixels, depth, faces, corners, buffer, colour):  # type: ign
     for face in range(len(faces)):
         a, b, c = faces[face, 0], faces[face, 1], faces[face, 2]
         # Written so that NaN fails it too.
-        if not (depth[a] > NEAR and depth[b] > NEAR and depth[c] > NEAR):
+        if not (depth[a] > MIN_DEPTH_M and depth[b] > MIN_DEPTH_M and depth[c] > MIN_DEPTH_M):
             continue
         ax, ay, bx, by, cx, cy = pixels[a, 0], pixels[a, 1], pixels[b, 0], pixels[b, 1], pixels[c, 0], pixels[c, 1]
         area = (bx - ax) * (cy - ay) - (cx - ax) * (by - ay)
@@ -223,7 +224,7 @@ def _fill_discs(pixels, depth, colours, radius, buffer, colour):  # type: ignore
     height, width = buffer.shape
     for point in range(len(pixels)):
         px, py, z = pixels[point, 0], pixels[point, 1], depth[point]
-        if not (z > NEAR and abs(px) < 1e6 and abs(py) < 1e6):
+        if not (z > MIN_DEPTH_M and abs(px) < MAX_COORDINATE_PX and abs(py) < MAX_COORDINATE_PX):
             continue
         for y in range(max(0, int(np.ceil(py - radius))), min(height - 1, int(np.floor(py + radius))) + 1):
             for x in range(max(0, int(np.ceil(px - radius))), min(width - 1, int(np.floor(px + radius))) + 1):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixed colours of the body parts: the person's left is warm, the right is cool, the midline is neutral.
 
-Neighbouring parts of one limb also differ in lightness, so that they stay apart for people who do not see hue well.
+Neighbouring parts of one limb also differ in lightness, so that they can be told apart without colour vision.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ PART_COLOURS: dict[str, tuple[int, int, int]] = {
     "right_lower_leg": (100, 205, 185),
     "right_foot": (40, 70, 130),
 }
-NEUTRAL = (170, 170, 170)
+NEUTRAL = (170, 170, 170)  # of unknown parts
 
 
 def part_colours(names: Sequence[str]) -> np.ndarray:
-    """Colour of each part, (N,3) uint8 RGB; parts that are not in the palette are grey."""
+    """Return the RGB colour of each part, (N, 3) uint8; parts that are not in the palette are grey."""
     return np.array([PART_COLOURS.get(name, NEUTRAL) for name in names], np.uint8).reshape(-1, 3)
 
 
 def joint_colour(name: str) -> tuple[int, int, int]:
-    """RGB colour of a joint: orange on the person's left, blue on the right, white on the midline."""
+    """Return the RGB colour of a joint: orange on the person's left, blue on the right, white on the midline."""
     if name.startswith("left_"):
         return (255, 140, 0)
     if name.startswith("right_"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small helpers for finished pictures: shrink, caption, join on a sheet, encode for a file or an HTML page."""
+"""Helpers for finished pictures: scale, caption, join on a sheet, encode for a file or an HTML page."""
 
 from __future__ import annotations
 
@@ -13,28 +13,28 @@ import numpy as np
 from flowing_puppet_ros.errors import InputError
 
 
-def to_height(image: np.ndarray, height: int) -> np.ndarray:
-    """Scale an image (H,W,3) to `height` rows with its aspect ratio."""
+def scale_to_height(image: np.ndarray, height: int) -> np.ndarray:
+    """Scale `image` (H, W, 3) to `height` rows and keep its aspect ratio."""
     factor = height / image.shape[0]
     size = (max(1, round(image.shape[1] * factor)), height)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR))
 
 
 def shrink(image: np.ndarray, height: int) -> np.ndarray:
-    """Scale an image (H,W,3) down to `height` rows; a smaller image is returned as it is."""
-    return image if image.shape[0] <= height else to_height(image, height)
+    """Scale `image` (H, W, 3) down to `height` rows; return a smaller image unchanged."""
+    return image if image.shape[0] <= height else scale_to_height(image, height)
 
 
-def caption(image: np.ndarray, text: str, size: float = 0.5) -> np.ndarray:
-    """Write one line of ASCII text into the top left corner of a copy of the image, dark on a light bar."""
+def add_caption(image: np.ndarray, text: str, size: float = 0.5) -> np.ndarray:
+    """Write one line of ASCII text in the top left corner of a copy of the image, dark on a light bar."""
     image = image.copy()
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
     image[: height + 10, : width + 12] = 245
     return cv2.putText(image, text, (6, height + 4), cv2.FONT_HERSHEY_SIMPLEX, size, (20, 20, 20), 1, cv2.LINE_AA)
 
 
-def contact_sheet(images: Sequence[np.ndarray], columns: int, gap: int = 6, background: int = 255) -> np.ndarray:
-    """Lay images (H_k,W_k,3) uint8 out in rows of `columns`, each centred in a cell as large as the largest."""
+def make_contact_sheet(images: Sequence[np.ndarray], columns: int, gap: int = 6, background: int = 255) -> np.ndarray:
+    """Arrange `images` (H_k, W_k, 3) uint8 in rows of `columns`, each centred in a cell of the largest size."""
     if not images:
         raise ValueError("a contact sheet needs at least one image")
     height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
@@ -50,15 +50,15 @@ def contact_sheet(images: Sequence[np.ndarray], columns: int, gap: int = 6, back
     return sheet
 
 
-def row(images: Sequence[np.ndarray], height: int, gap: int = 6, background: int = 255) -> np.ndarray:
-    """Join images beside each other, all scaled to `height` rows."""
+def join_row(images: Sequence[np.ndarray], height: int, gap: int = 6, background: int = 255) -> np.ndarray:
+    """Join images side by side, all scaled to `height` rows."""
     bar = np.full((height, gap, 3), background, np.uint8)
-    pieces = [piece for image in images for piece in (bar, to_height(image, height))]
+    pieces = [piece for image in images for piece in (bar, scale_to_height(image, height))]
     return np.hstack(pieces[1:])
 
 
 def encode(image: np.ndarray, kind: str = "jpg", quality: int = 82) -> bytes:
-    """Encode an RGB image (H,W,3) uint8 as the bytes of a "jpg" or "png" file."""
+    """Encode an RGB image (H, W, 3) uint8 as the bytes of a "jpg" or "png" file."""
     options = [cv2.IMWRITE_JPEG_QUALITY, quality] if kind == "jpg" else [cv2.IMWRITE_PNG_COMPRESSION, 9]
     done, data = cv2.imencode("." + kind, np.ascontiguousarray(image[..., ::-1]), options)
     if not done:
@@ -66,18 +66,18 @@ def encode(image: np.ndarray, kind: str = "jpg", quality: int = 82) -> bytes:
     return data.tobytes()
 
 
-def data_uri(image: np.ndarray, kind: str = "jpg", quality: int = 82) -> str:
-    """Return an image as a `data:` address that stands in an HTML page without a file beside it."""
+def encode_data_uri(image: np.ndarray, kind: str = "jpg", quality: int = 82) -> str:
+    """Return an image as a `data:` URI, so that an HTML page needs no other file."""
     name = "jpeg" if kind == "jpg" else kind
     return f"data:image/{name};base64," + base64.b64encode(encode(image, kind, quality)).decode("ascii")
 
 
 def save(image: np.ndarray, path: Path) -> None:
-    """Write an RGB image (H,W,3) uint8 as .png or .jpg, by the name of the file."""
+    """Write an RGB image (H, W, 3) uint8 as .png or .jpg, by the suffix of `path`."""
     kind = {".png": "png", ".jpg": "jpg", ".jpeg": "jpg"}.get(path.suffix.lower())
     if kind is None:
-        raise InputError(f"{path} is no picture name; end it in .png or .jpg")
+        raise InputError(f"{path} is not a picture name; end it in .png or .jpg")
     try:
         path.write_bytes(encode(image, kind, 90))
     except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}; choose another place") from error
+        raise InputError(f"cannot write {path}: {error.strerror}; choose another path") from error

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time plots as inline SVG text, drawn by ourselves: no plotting library at run time, and CSS decides the colours.
+"""Time plots as inline SVG text, without a plotting library; CSS decides the colours.
 
-Lines carry the classes `s0` to `s7`, text and axes the current colour, so that one file serves light and dark pages.
+Lines have the classes `s0` to `s7`, and text and axes the current colour, so that one file fits light and dark pages.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from html import escape
 
 import numpy as np
 
-from flowing_puppet_ros.draw.pictures import data_uri
+from flowing_puppet_ros.draw.pictures import encode_data_uri
 
-WIDTH, HEIGHT = 720, 230
-LEFT, RIGHT, TOP, BOTTOM = 62, 12, 12, 40
-MOST_POINTS = 600
-SERIES_CLASSES = 8
+WIDTH, HEIGHT = 720, 230  # of a plot, px
+LEFT, RIGHT, TOP, BOTTOM = 62, 12, 12, 40  # margins around the axes, px
+MAX_POINTS = 600  # points of a line; more are averaged in bins
+SERIES_CLASSES = 8  # CSS classes of lines; more lines repeat them
 
-# Dark blue over grey to yellow: lightness rises evenly, so that it reads without colour vision too.
+# Dark blue to grey to yellow: the lightness rises evenly, so that it can be read without colour vision.
 _RAMP = np.array([(0, 32, 77), (66, 78, 108), (124, 123, 120), (188, 175, 111), (255, 233, 69)], float)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """One line of a plot: y (T,) over the plot's x; NaN leaves a gap."""
+    """One line of a plot: `y` (T,) over `x` (T,); NaN leaves a gap."""
 
     name: str
     x: np.ndarray
@@ -34,7 +34,7 @@ class Series:
 
 
 def ticks(low: float, high: float, count: int = 5) -> list[float]:
-    """Round numbers (1, 2 or 5 times a power of ten apart) within low to high, about `count` of them."""
+    """Return about `count` round numbers from low to high, 1, 2 or 5 times a power of ten apart."""
     span = high - low
     if not (math.isfinite(span) and span > 0):
         return [low] if math.isfinite(low) else []
@@ -45,47 +45,47 @@ def ticks(low: float, high: float, count: int = 5) -> list[float]:
     return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
 
 
-def line_plot(series: Sequence[Series], title: str, x_label: str, y_label: str, from_zero: bool = True) -> str:
-    """Plot lines over a common x; returns an `<svg>`, or an empty string when no value is known.
+def draw_line_plot(series: Sequence[Series], title: str, x_label: str, y_label: str, from_zero: bool = True) -> str:
+    """Plot lines over a common x; return an `<svg>`, or an empty string when no value is known.
 
-    `from_zero` puts zero on the y axis. Lines of more than 600 points are averaged in bins.
+    `from_zero` puts zero on the y axis. Lines of more than MAX_POINTS points are averaged in bins.
     """
-    thinned = [_thin(line) for line in series if np.isfinite(line.y).any()]
-    if not thinned:
+    lines = [_downsample(line) for line in series if np.isfinite(line.y).any()]
+    if not lines:
         return ""
-    x_low, x_high = _range([line.x for line in thinned])
-    y_low, y_high = _range([line.y for line in thinned])
+    x_low, x_high = _finite_range([line.x for line in lines])
+    y_low, y_high = _finite_range([line.y for line in lines])
     if from_zero:
         y_low, y_high = min(y_low, 0.0), max(y_high, 0.0)
     if y_high <= y_low:
         y_low, y_high = y_low - 0.5, y_high + 0.5
     y_low, y_high = y_low - 0.03 * (y_high - y_low) * (y_low != 0), y_high + 0.05 * (y_high - y_low)
-    frame = _Frame(x_low, x_high if x_high > x_low else x_low + 1, y_low, y_high)
+    frame = _Axes(x_low, x_high if x_high > x_low else x_low + 1, y_low, y_high)
     body = [frame.axes(x_label, y_label)]
-    body += [frame.line(line, index % SERIES_CLASSES) for index, line in enumerate(thinned)]
-    names = ", ".join(line.name for line in thinned)
-    svg = _svg(f"{title}: {names}", HEIGHT, "".join(body), (LEFT, WIDTH - RIGHT, frame.x_low, frame.x_high))
-    return svg + _legend([line.name for line in thinned])
+    body += [frame.line(line, index % SERIES_CLASSES) for index, line in enumerate(lines)]
+    names = ", ".join(line.name for line in lines)
+    svg = _wrap_svg(f"{title}: {names}", HEIGHT, "".join(body), (LEFT, WIDTH - RIGHT, frame.x_low, frame.x_high))
+    return svg + _make_legend([line.name for line in lines])
 
 
-def heat_strip(names: Sequence[str], values: np.ndarray, x: np.ndarray, title: str, x_label: str) -> str:
-    """Show (N,T) values in 0 to 1 as one row of colour per name over x (T,); NaN is left empty.
+def draw_heat_strip(names: Sequence[str], values: np.ndarray, x: np.ndarray, title: str, x_label: str) -> str:
+    """Draw `values` (N, T) in [0, 1] as one row of colours per name over `x` (T,); NaN is left empty.
 
-    Returns an `<svg>` with its colour scale, or an empty string when there is nothing to show.
+    Return an `<svg>` with its colour scale, or an empty string when there is nothing to show.
     """
     values = np.asarray(values, float)
     if values.size == 0 or not np.isfinite(values).any():
         return ""
-    step = max(1, -(-values.shape[1] // MOST_POINTS))
+    step = max(1, -(-values.shape[1] // MAX_POINTS))
     values, x = values[:, ::step], np.asarray(x, float)[::step]
     left, cell = 130, 16
     height = TOP + cell * len(names) + BOTTOM
     width = WIDTH - left - RIGHT
     known = np.isfinite(values)
-    image = np.where(known[..., None], ramp(np.where(known, values, 0)), 255).astype(np.uint8)
+    image = np.where(known[..., None], colour_ramp(np.where(known, values, 0)), 255).astype(np.uint8)
     body = [
         f'<image x="{left}" y="{TOP}" width="{width}" height="{cell * len(names)}" preserveAspectRatio="none" '
-        f'style="image-rendering:pixelated" href="{data_uri(image, "png")}"/>'
+        f'style="image-rendering:pixelated" href="{encode_data_uri(image, "png")}"/>'
     ]
     for row, name in enumerate(names):
         y = TOP + cell * (row + 0.5)
@@ -95,18 +95,18 @@ def heat_strip(names: Sequence[str], values: np.ndarray, x: np.ndarray, title: s
         at = left + width * (value - x[0]) / (high - x[0])
         body.append(f'<text x="{at:.1f}" y="{height - BOTTOM + 15}" class="tick centre">{value:g}</text>')
     body.append(f'<text x="{left + width / 2:.1f}" y="{height - 6}" class="tick centre">{escape(x_label)}</text>')
-    return _svg(title, height, "".join(body), (left, WIDTH - RIGHT, x[0], high)) + _scale()
+    return _wrap_svg(title, height, "".join(body), (left, WIDTH - RIGHT, x[0], high)) + _make_colour_scale()
 
 
-def ramp(values: np.ndarray) -> np.ndarray:
-    """Colours (...,3), 0 to 255, of values in 0 to 1: dark blue is low, yellow is high."""
-    place = np.clip(values, 0, 1) * (len(_RAMP) - 1)
-    return np.stack([np.interp(place, np.arange(len(_RAMP)), channel) for channel in _RAMP.T], axis=-1)
+def colour_ramp(values: np.ndarray) -> np.ndarray:
+    """Return the colours (..., 3), 0 to 255, of `values` (...) in [0, 1]: dark blue is low, yellow is high."""
+    position = np.clip(values, 0, 1) * (len(_RAMP) - 1)
+    return np.stack([np.interp(position, np.arange(len(_RAMP)), channel) for channel in _RAMP.T], axis=-1)
 
 
 @dataclass(frozen=True, slots=True)
-class _Frame:
-    """The axes' ranges, and where they put things."""
+class _Axes:
+    """The ranges of the axes, and the conversion of values to pixels."""
 
     x_low: float
     x_high: float
@@ -138,7 +138,7 @@ class _Frame:
         known = np.isfinite(series.y)
         xs, ys = np.asarray(self.x(series.x)), np.asarray(self.y(np.where(known, series.y, 0)))
         pieces, dots = [], []
-        for run in _runs(known):
+        for run in _split_runs(known):
             points = [f"{xs[k]:.1f},{ys[k]:.1f}" for k in run]
             if len(points) > 1:
                 pieces.append("M" + "L".join(points))
@@ -148,18 +148,18 @@ class _Frame:
         return path + "".join(dots)
 
 
-def _runs(known: np.ndarray) -> list[np.ndarray]:
-    """Indices of the known values, one array for each unbroken run."""
+def _split_runs(known: np.ndarray) -> list[np.ndarray]:
+    """Return the indices of the known values, one array for each unbroken run."""
     indices = np.flatnonzero(known)
     runs = np.split(indices, np.flatnonzero(np.diff(indices) > 1) + 1)
     return [run for run in runs if run.size]
 
 
-def _thin(series: Series) -> Series:
+def _downsample(series: Series) -> Series:
     x, y = np.asarray(series.x, float), np.asarray(series.y, float)
-    if len(x) <= MOST_POINTS:
+    if len(x) <= MAX_POINTS:
         return Series(series.name, x, y)
-    bins = np.arange(len(x)) * MOST_POINTS // len(x)
+    bins = np.arange(len(x)) * MAX_POINTS // len(x)
     known = np.isfinite(y)
     count = np.bincount(bins, known)
     total = np.bincount(bins, np.where(known, y, 0))
@@ -167,14 +167,14 @@ def _thin(series: Series) -> Series:
     return Series(series.name, np.bincount(bins, x) / np.bincount(bins), mean)
 
 
-def _range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
+def _finite_range(arrays: Sequence[np.ndarray]) -> tuple[float, float]:
     values = np.concatenate(arrays)
     values = values[np.isfinite(values)]
     return float(values.min()), float(values.max())
 
 
-def _svg(title: str, height: float, body: str, span: tuple[float, float, float, float]) -> str:
-    """A plot; `span` are the columns of its left and right end and what x is there, which the timeline's mark needs."""
+def _wrap_svg(title: str, height: float, body: str, span: tuple[float, float, float, float]) -> str:
+    """Return a plot; `span` has the columns of its left and right end and x there, for the timeline's mark."""
     ends = " ".join(f"{value:.6g}" for value in span)
     mark = f'<line class="now" x1="{span[0]}" x2="{span[0]}" y1="{TOP}" y2="{height - BOTTOM}"/>'
     return (
@@ -183,13 +183,13 @@ def _svg(title: str, height: float, body: str, span: tuple[float, float, float, 
     )
 
 
-def _legend(names: Sequence[str]) -> str:
+def _make_legend(names: Sequence[str]) -> str:
     items = "".join(
         f'<span><i class="key k{index % SERIES_CLASSES}"></i>{escape(name)}</span>' for index, name in enumerate(names)
     )
     return f'<p class="legend">{items}</p>'
 
 
-def _scale() -> str:
-    image = data_uri(np.rint(ramp(np.linspace(0, 1, 64)))[None].astype(np.uint8), "png")
+def _make_colour_scale() -> str:
+    image = encode_data_uri(np.rint(colour_ramp(np.linspace(0, 1, 64)))[None].astype(np.uint8), "png")
     return f'<p class="legend"><span>0 <img class="ramp" alt="dark is low, light is high" src="{image}"> 1</span></p>'

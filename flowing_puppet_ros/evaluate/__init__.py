@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors against a reference, of images, videos, bodies and bags, and the tables that show them.
+"""Errors of poses, tracks, bodies and bags against a reference, and their tables.
 
-Results and truths come in; figures as text, CSV and JSON go out. Read `joints` first.
+Results and ground truth come in; figures as text, CSV and JSON go out. Read `joints` first.
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far joints are from a reference: 2D tracks against keypoints, 3D bodies against triangulated joints.
+"""Errors of joints against a reference: 2D tracks against keypoints, 3D bodies against triangulated joints.
 
-Distances are in the unit of the points (pixels or metres) and NaN where either side does not know the joint.
+Distances are in the unit of the points (pixels or metres), and NaN if a joint is unknown on either side.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ LIMB_JOINTS = tuple(f"{side}_{joint}" for joint in ARM_JOINTS + LEG_JOINTS for s
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointErrors:
-    """Distances (T,J) of J named joints in T frames; NaN where not both are known."""
+    """Distances `distance` (T, J) of J named joints in T frames; NaN unless both sides are known."""
 
     names: tuple[str, ...]
     distance: np.ndarray
 
     @property
     def known(self) -> np.ndarray:
-        """The known distances, (n,)."""
+        """The known distances (n,)."""
         return self.distance[np.isfinite(self.distance)]
 
     @property
@@ -38,35 +38,35 @@ class JointErrors:
         return float(self.known.mean()) if self.known.size else float("nan")
 
     def percentile(self, percent: float) -> float:
-        """The distance that `percent` of the known joints do not exceed; 50 is the median; NaN without any."""
+        """Return the distance that `percent` of the known joints do not exceed (50: the median); NaN without any."""
         return float(np.percentile(self.known, percent)) if self.known.size else float("nan")
 
     def fraction_within(self, threshold: float) -> float:
-        """Share of the known joints that are no farther than `threshold`; NaN without any."""
+        """Return the share of the known joints within `threshold`; NaN without any."""
         return float(np.mean(self.known <= threshold)) if self.known.size else float("nan")
 
     def per_joint(self) -> dict[str, JointErrors]:
-        """The same figures for one joint each."""
+        """Return the errors of each joint by itself."""
         return {name: JointErrors((name,), self.distance[:, [j]]) for j, name in enumerate(self.names)}
 
     def per_frame(self) -> np.ndarray:
-        """Mean over the known joints of each frame, (T,); NaN in frames without any."""
+        """Return the mean (T,) over the known joints of each frame; NaN in frames without any."""
         known = np.isfinite(self.distance)
         total = np.where(known, self.distance, 0).sum(axis=1)
         return np.where(known.any(axis=1), total / np.maximum(known.sum(axis=1), 1), np.nan)
 
-    def summary(self, thresholds: Sequence[float] = ()) -> dict[str, float]:
-        """Counts, mean, median, 90th percentile, maximum and the fractions within `thresholds`, JSON-ready."""
+    def summarise(self, thresholds: Sequence[float] = ()) -> dict[str, float]:
+        """Return counts, mean, median, 90th percentile, maximum and the shares within `thresholds`, JSON-ready."""
         figures = {"joints": float(self.known.size), "frames": float(np.isfinite(self.distance).any(axis=1).sum())}
         figures |= {"mean": self.mean, "median": self.percentile(50), "p90": self.percentile(90)}
         figures["max"] = self.percentile(100)
         return figures | {f"within {value:g}": self.fraction_within(value) for value in thresholds}
 
 
-def named_points(names: Sequence[str], points: np.ndarray) -> dict[str, np.ndarray]:
-    """The known ones of (K,D) points under our joint names; `names` (K) in any detector's spelling.
+def name_points(names: Sequence[str], points: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the known ones of `points` (K, D) by our joint names; `names` (K) are in any detector's spelling.
 
-    Raises InputError when the numbers of names and points differ.
+    InputError if the numbers of names and points differ.
     """
     points = np.asarray(points, float)
     if points.ndim != 2 or len(names) != len(points):
@@ -75,14 +75,14 @@ def named_points(names: Sequence[str], points: np.ndarray) -> dict[str, np.ndarr
     return {name: point for name, point in pairs if name is not None and _finite(point)}
 
 
-def joint_errors(
+def measure_joint_errors(
     frames: Mapping[int, Mapping[str, np.ndarray]],
     reference: Mapping[int, Mapping[str, np.ndarray]],
     names: Sequence[str] = LIMB_JOINTS,
 ) -> JointErrors:
     """Compare joints {stamp: {name: (D,) point}} with a reference of the same form at the stamps of `frames`.
 
-    A stamp that the reference lacks is a row of NaN, so that rows stay in step with `frames`.
+    A stamp missing in the reference gives a row of NaN, so that rows correspond to `frames`.
     """
     rows = np.full((len(frames), len(names)), np.nan)
     for row, (stamp, joints) in enumerate(frames.items()):
@@ -93,11 +93,12 @@ def joint_errors(
     return JointErrors(tuple(names), rows)
 
 
-def swapped(joints: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray], limb: Sequence[str]) -> bool | None:
-    """Tell whether the joints of a pair of limbs lie nearer to the other side's reference than to their own side's.
+def is_swapped(
+    joints: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray], limb: Sequence[str]
+) -> bool | None:
+    """Return whether a pair of limbs is nearer to the reference with left and right swapped.
 
-    `limb` is ARM_JOINTS or LEG_JOINTS, or both joined for the whole body. None when no joint of the limb is known on
-    both sides.
+    `limb` is ARM_JOINTS, LEG_JOINTS, or both for the whole body. None if no joint of the limb is known on both sides.
     """
     own = other = 0.0
     count = 0
@@ -112,21 +113,21 @@ def swapped(joints: Mapping[str, np.ndarray], reference: Mapping[str, np.ndarray
     return other < own if count else None
 
 
-def swapped_share(
+def count_swapped(
     frames: Mapping[int, Mapping[str, np.ndarray]],
     reference: Mapping[int, Mapping[str, np.ndarray]],
     limb: Sequence[str],
 ) -> tuple[int, int]:
-    """Count (swapped, comparable) frames of one pair of limbs, see `swapped`."""
-    answers = [swapped(joints, reference[stamp], limb) for stamp, joints in frames.items() if stamp in reference]
-    told = [answer for answer in answers if answer is not None]
-    return sum(told), len(told)
+    """Count (swapped, comparable) frames of one pair of limbs, see `is_swapped`."""
+    answers = [is_swapped(joints, reference[stamp], limb) for stamp, joints in frames.items() if stamp in reference]
+    comparable = [answer for answer in answers if answer is not None]
+    return sum(comparable), len(comparable)
 
 
 def jitter(frames: Mapping[int, Mapping[str, np.ndarray]], step: int | None = None) -> np.ndarray:
-    """Lengths (n,) of the second differences of joints {stamp: {name: point}} over three successive frames.
+    """Return lengths (n,) of the second differences of joints {stamp: {name: point}} over three successive frames.
 
-    With `step` only frames that are so far apart are successive.
+    With `step`, only frames that far apart are successive.
     """
     stamps = sorted(frames)
     lengths = []
@@ -138,10 +139,10 @@ def jitter(frames: Mapping[int, Mapping[str, np.ndarray]], step: int | None = No
     return np.sort(np.array(lengths))
 
 
-def id_switches(ids: Sequence[Sequence[str]]) -> int:
-    """Count how often a person goes on under another id; `ids` are those of the people of each frame, in order.
+def count_id_switches(ids: Sequence[Sequence[str]]) -> int:
+    """Count how often a person's id changes; `ids` are those of the people in each frame, in order.
 
-    A switch is an id that is gone while another one is new, against the last frame with people in it.
+    A switch is an id that disappears while a new one appears, relative to the last frame with people.
     """
     switches = 0
     last: set[str] = set()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every `evaluate` verb gives: a table with a column a run, and JSON, CSV and plots of it in a folder."""
+"""The output of every `evaluate` verb: a table with a column per run, and JSON, CSV and plots in a folder."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.tables import json_text, text_table, write_csv, write_json
+from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
 from flowing_puppet_ros.settings import make_out_folder
 
 Figures = dict[str, dict[str, float]]
 
-WIDTH, HEIGHT, DPI = 7.2, 4.2, 150
-# Told apart without colour vision (Okabe and Ito), darkest first.
+WIDTH_IN, HEIGHT_IN, DPI = 7.2, 4.2, 150  # of a plot
+# Distinguishable without colour vision (Okabe and Ito), darkest first.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
 STYLES = ("-", "--", ":", "-.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Line:
-    """One line or set of bars: y (n,) over x (n,); lines of one `group` (a run) share a dash, of one name a colour."""
+    """A line or bars, `y` (n,) over `x` (n,); lines of one `group` (a run) share a dash, of one name a colour."""
 
     name: str
     x: np.ndarray
@@ -41,12 +41,12 @@ class Chart:
     """One plot.
 
     Attributes:
-        name: the end of its file's name.
-        title, x_label, y_label: what it says.
-        lines: what it shows.
-        kind: "lines", "steps" of a histogram, or "bars" beside each other.
-        categories: names of the x of bars.
-        y_limits: of the axis, from the values when None.
+        name: suffix of its file name.
+        title, x_label, y_label: its texts.
+        lines: the data.
+        kind: "lines", "steps" of a histogram, or "bars" side by side.
+        categories: names of the bars' x values.
+        y_limits: of the axis; from the values if None.
     """
 
     name: str
@@ -60,36 +60,36 @@ class Chart:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Outcome:
-    """The figures {run: {figure: value}} of one verb, more of them for the JSON, and plots."""
+class EvaluationReport:
+    """The figures {run: {figure: value}} of one verb, further details for the JSON, and plots."""
 
     verb: str
     figures: Figures
     details: Mapping[str, Any] = field(default_factory=dict)
     charts: Sequence[Chart] = ()
 
-    def rows(self) -> list[dict[str, Any]]:
-        """One row a figure, one column a run; NaN where a run lacks it."""
+    def make_rows(self) -> list[dict[str, Any]]:
+        """Return one row per figure with one column per run; NaN if a run lacks the figure."""
         names = dict.fromkeys(name for figures in self.figures.values() for name in figures)
         return [
             {"figure": name} | {run: figures.get(name, float("nan")) for run, figures in self.figures.items()}
             for name in names
         ]
 
-    def give(self, arguments: argparse.Namespace) -> None:
-        """Write the files into `--out`, if there is one, and print the table, or with `--json` the figures."""
+    def emit(self, arguments: argparse.Namespace) -> None:
+        """Write the files into `--out`, if given, and print the table or, with `--json`, the figures."""
         if arguments.out is not None:
             self.write(arguments.out)
-        print(json_text(self.figures) if arguments.json else text_table(self.rows()))
+        print(format_json(self.figures) if arguments.json else format_table(self.make_rows()))
 
     def write(self, folder: Path) -> None:
         """Write `<verb>.json`, `.csv`, and `<verb>-<chart>.png` and `.svg`; the same figures give the same bytes."""
         make_out_folder(folder)
         write_json(folder / f"{self.verb}.json", {"figures": self.figures, **self.details})
-        write_csv(folder / f"{self.verb}.csv", self.rows())
+        write_csv(folder / f"{self.verb}.csv", self.make_rows())
         for chart in self.charts:
             if chart.lines:
-                draw(chart, folder / f"{self.verb}-{chart.name}")
+                draw_chart(chart, folder / f"{self.verb}-{chart.name}")
 
 
 def add_arguments(parser: argparse.ArgumentParser, verb: str) -> None:
@@ -98,10 +98,10 @@ def add_arguments(parser: argparse.ArgumentParser, verb: str) -> None:
     parser.add_argument("--json", action="store_true", help="print {run: {figure: value}} as JSON instead of the table")
 
 
-def run_names(paths: Sequence[Path]) -> list[str]:
-    """A short name a run: the stem of its file; with the folder where stems are alike, else the whole path.
+def name_runs(paths: Sequence[Path]) -> list[str]:
+    """Return a short name per run: the file's stem; with its folder if stems are alike; else the whole path.
 
-    Raises InputError when a run is named twice.
+    InputError if a run is given twice.
     """
     if len({path.absolute() for path in paths}) < len(paths):
         raise InputError("a run is named twice; name every run once")
@@ -112,14 +112,14 @@ def run_names(paths: Sequence[Path]) -> list[str]:
     return names
 
 
-def draw(chart: Chart, base: Path) -> None:
+def draw_chart(chart: Chart, base: Path) -> None:
     """Draw a chart into `base`.png and `base`.svg."""
     settings = {"svg.hashsalt": "flowing_puppet_ros", "svg.fonttype": "none", "font.size": 9, "axes.axisbelow": True}
     with matplotlib.rc_context(settings):
-        figure = Figure((WIDTH, HEIGHT), dpi=DPI, layout="constrained")
+        figure = Figure((WIDTH_IN, HEIGHT_IN), dpi=DPI, layout="constrained")
         FigureCanvasAgg(figure)
         axes = figure.add_subplot()
-        _fill(axes, chart)
+        _draw_lines(axes, chart)
         axes.set(xlabel=chart.x_label, ylabel=chart.y_label, ylim=chart.y_limits)
         axes.set_title(chart.title, loc="left", fontsize=10)
         axes.grid(color="0.88", linewidth=0.6)
@@ -129,7 +129,7 @@ def draw(chart: Chart, base: Path) -> None:
         figure.savefig(f"{base}.svg", metadata={"Date": None, "Creator": None})
 
 
-def _fill(axes: Any, chart: Chart) -> None:
+def _draw_lines(axes: Any, chart: Chart) -> None:
     groups = list(dict.fromkeys(line.group for line in chart.lines))
     names = list(dict.fromkeys(line.name for line in chart.lines))
     for index, line in enumerate(chart.lines):

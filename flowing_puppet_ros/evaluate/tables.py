@@ -14,10 +14,10 @@ Row = dict[str, Any]
 """Figures by name; all rows of a table have the same names."""
 
 
-def text_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Lay out rows of one form as a table with a heading; numbers to the right, rounded to 4 digits."""
+def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Format rows of one form as a table with a heading; numbers right-aligned, rounded to 4 digits."""
     heads = list(rows[0])
-    cells = [heads, *([_cell(row[head]) for head in heads] for row in rows)]
+    cells = [heads, *([_format_cell(row[head]) for head in heads] for row in rows)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(heads))]
     right = [not isinstance(rows[0][head], str) for head in heads]
     lines = []
@@ -31,7 +31,7 @@ def text_table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write rows of one form under a line of names."""
+    """Write rows of one form below a line of names."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
@@ -40,23 +40,23 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 def write_json(path: Path, figures: Mapping[str, Any]) -> None:
     """Write figures as an indented JSON object."""
-    path.write_text(json_text(figures, indent=2) + "\n", encoding="utf-8")
+    path.write_text(format_json(figures, indent=2) + "\n", encoding="utf-8")
 
 
-def json_text(figures: Mapping[str, Any], indent: int | None = None) -> str:
-    """Figures as a JSON object; numbers that are not finite are null."""
-    return json.dumps(_finite(figures), indent=indent)
+def format_json(figures: Mapping[str, Any], indent: int | None = None) -> str:
+    """Format figures as a JSON object; non-finite numbers become null."""
+    return json.dumps(_replace_non_finite(figures), indent=indent)
 
 
-def _finite(value: Any) -> Any:
+def _replace_non_finite(value: Any) -> Any:
     if isinstance(value, Mapping):
-        return {key: _finite(inner) for key, inner in value.items()}
+        return {key: _replace_non_finite(inner) for key, inner in value.items()}
     if isinstance(value, list):
-        return [_finite(inner) for inner in value]
+        return [_replace_non_finite(inner) for inner in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _cell(value: Any) -> str:
+def _format_cell(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
     return f"{value:.4g}" if isinstance(value, float) else str(value)

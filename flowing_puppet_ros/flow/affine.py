@@ -2,10 +2,10 @@
 """Affine motion of each labelled region, fitted robustly to dense flow.
 
 A motion is a (2, 3) array A that takes a point of the first image to the second: p' = A [x, y, 1]^T. The thesis fits
-one to the flow inside every visible part (flowing puppets, section 2); here by iteratively reweighted least squares
-with a Geman-McClure weight, from a median translation on, each flow vector weighted by its round trip through the
-backward flow. A part's outline always takes in some background: vectors that the background's motion explains weigh
-less in the parts, which matters where a limb moves and changes nothing where it rests.
+one to the flow inside every visible part (flowing puppets, section 2). Here it is fitted by iteratively reweighted
+least squares with a Geman-McClure weight, starting from the median translation. Each flow vector is also weighted by
+its round trip through the backward flow. A part's outline always includes some background, so vectors that the
+background's motion explains weigh less in the parts. This matters where a limb moves and changes nothing elsewhere.
 """
 
 from __future__ import annotations
@@ -18,23 +18,26 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.arrays import F64, I64, U16, Bools, Flow
 
-SAMPLES_PER_REGION = 2000
-SAMPLES_FOR_START = 200
-ITERATIONS = 8
-LEAST_FOR_AFFINE = 40
-LEAST_FOR_TRANSLATION = 8
-RESIDUAL_FLOOR = 1.0  # px; flow noise that no fit should try to beat
-DEFORMATION = 0.3  # expected size of A's linear part beside the identity
-CORRELATED_PIXELS = 50.0  # neighbouring flow vectors err together: this many count as one
-BACKGROUND_SHARE = 0.3  # weight of a part's vector that moves just as the background does
+SAMPLES_PER_REGION = 2000  # larger regions are subsampled to about this many flow vectors
+MEDIAN_SAMPLES = 200  # flow vectors from which the initial translation is taken
+ITERATIONS = 8  # of reweighted least squares
+MIN_AFFINE_SAMPLES = 40  # regions of fewer get a translation
+MIN_TRANSLATION_SAMPLES = 8  # regions of fewer get no motion of their own
+MIN_SCALE_PX = 1.0  # of the robust weight: flow noise that no fit should try to beat
+LINEAR_PRIOR_SD = 0.3  # expected size of A's linear part beside the identity
+PIXELS_PER_OBSERVATION = 50.0  # neighbouring flow vectors err together: this many count as one
+BACKGROUND_WEIGHT = 0.3  # of a part's vector that moves exactly as the background does
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegionMotions:
-    """Motions of R regions: `affine` (R, 2, 3), `residual` (R,) px, `support` (R,) in [0, 1], `pixels` (R,).
+    """Motions of R regions.
 
-    `residual` is the root mean square of the inliers' misfit (infinite without any), `support` the share of the
-    region's sampled vectors that agree with the motion, `pixels` the number of visible pixels with known flow.
+    Attributes:
+        affine: (R, 2, 3) motions.
+        residual: (R,) px, root mean square misfit of the inliers; infinite without any.
+        support: (R,) in [0, 1], the share of the region's sampled vectors that agree with the motion.
+        pixels: (R,) number of visible pixels with known flow.
     """
 
     affine: F64
@@ -44,21 +47,23 @@ class RegionMotions:
 
     @property
     def known(self) -> Bools:
-        """(R,) whether the region had enough pixels for a motion of its own."""
-        return self.pixels >= LEAST_FOR_TRANSLATION
+        """Regions (R,) with enough pixels for a motion of their own."""
+        return self.pixels >= MIN_TRANSLATION_SAMPLES
 
 
-def transform(affine: F64, points: F64) -> F64:
-    """Apply motions (..., 2, 3) to points (..., N, 2)."""
-    moved: F64 = points @ np.swapaxes(affine[..., :2], -1, -2) + affine[..., None, :, 2]
-    return moved
+def apply_affine(affine: F64, points: F64) -> F64:
+    """Apply motions `affine` (..., 2, 3) to `points` (..., N, 2) px."""
+    transformed: F64 = points @ np.swapaxes(affine[..., :2], -1, -2) + affine[..., None, :, 2]
+    return transformed
 
 
 def fit_regions(labels: NDArray[np.unsignedinteger], count: int, forward: Flow, backward: Flow | None) -> RegionMotions:
     """Fit one motion to each of the labels 0 .. count - 1 of `labels` (H, W), over the pixels with known flow.
 
-    Label 0 is the background, the others are in front of it. Regions of few pixels get a translation, those of fewer
-    still the identity and `known` False.
+    Label 0 is the background, the others are in front of it. By the pixels of a region:
+        MIN_AFFINE_SAMPLES or more           an affine motion
+        MIN_TRANSLATION_SAMPLES or more      a translation
+        fewer                                the identity, and `known` is False
     """
     back = backward if backward is not None else np.empty((0, 0, 2), np.float32)
     regions = np.ascontiguousarray(labels, dtype=np.uint16)
@@ -71,7 +76,7 @@ def fit_regions(labels: NDArray[np.unsignedinteger], count: int, forward: Flow, 
 
 @njit(cache=True, nogil=True)
 def round_trip_weight(x: int, y: int, u: float, v: float, backward: Flow) -> float:
-    """Weight in (0, 1] of a flow vector: 1 when the backward flow returns to where it came from."""
+    """Return the weight in (0, 1] of a flow vector: 1 when the backward flow returns to where it came from."""
     height, width = backward.shape[:2]
     if height == 0:
         return 1.0
@@ -95,9 +100,9 @@ def round_trip_weight(x: int, y: int, u: float, v: float, backward: Flow) -> flo
 
 @njit(cache=True, nogil=True)
 def _gather(labels: U16, count: int, forward: Flow, backward: Flow) -> tuple[F64, I64, I64]:
-    """Samples (M, 6) sorted by label, the first of each label (count + 1,), pixels of each label (count,).
+    """Return samples (M, 6) sorted by label, the first of each label (count + 1,) and the labels' pixels (count,).
 
-    A sample is x, y, u, v, how well the round trip closes in (0, 1], and its weight in a fit, for now the same.
+    A sample is x, y, u, v, how well its round trip closes in (0, 1], and its weight in a fit, initially the same.
     """
     height, width = labels.shape
     pixels = np.zeros(count, np.int64)
@@ -127,47 +132,47 @@ def _gather(labels: U16, count: int, forward: Flow, backward: Flow) -> tuple[F64
 
 @njit(cache=True, nogil=True)
 def _fit_all(samples: F64, starts: I64, affine: F64, residual: F64, support: F64) -> None:
-    """Fit the background, label 0, then discount in the other regions what moves with it and fit those."""
+    """Fit the background, label 0; then discount the vectors of the other regions that move with it, and fit those."""
     residual[0], support[0] = _fit(samples[: starts[1]], affine[0])
     a = affine[0]
     for k in range(starts[1], len(samples)):
         x, y = samples[k, 0], samples[k, 1]
         misfit_x = a[0, 0] * x + a[0, 1] * y + a[0, 2] - x - samples[k, 2]
         misfit_y = a[1, 0] * x + a[1, 1] * y + a[1, 2] - y - samples[k, 3]
-        square = (misfit_x * misfit_x + misfit_y * misfit_y) / RESIDUAL_FLOOR**2
-        samples[k, 5] *= (BACKGROUND_SHARE + square) / (1.0 + square)
+        square = (misfit_x * misfit_x + misfit_y * misfit_y) / MIN_SCALE_PX**2
+        samples[k, 5] *= (BACKGROUND_WEIGHT + square) / (1.0 + square)
     for region in range(1, len(starts) - 1):
         residual[region], support[region] = _fit(samples[starts[region] : starts[region + 1]], affine[region])
 
 
 @njit(cache=True, nogil=True)
 def _fit(samples: F64, affine: F64) -> tuple[float, float]:
-    """Write the robust motion of `samples` (M, 6) into `affine`; return residual and support."""
+    """Write the robust motion of `samples` (M, 6) into `affine` (2, 3); return residual and support."""
     affine[:] = 0.0
     affine[0, 0] = affine[1, 1] = 1.0
-    if len(samples) < LEAST_FOR_TRANSLATION:
+    if len(samples) < MIN_TRANSLATION_SAMPLES:
         return np.inf, 0.0
     centre_x, centre_y = np.mean(samples[:, 0]), np.mean(samples[:, 1])
     radius = max(1.0, np.sqrt(np.var(samples[:, 0]) + np.var(samples[:, 1])))
     # Columns: translation, then the linear part in units of the region's radius.
     motion = np.zeros((2, 3))
-    few = samples[:: max(1, len(samples) // SAMPLES_FOR_START)]
+    start = samples[:: max(1, len(samples) // MEDIAN_SAMPLES)]
     for axis in range(2):
-        motion[axis, 0] = _weighted_median(few[:, 2 + axis], few[:, 5])
-    apart = np.abs(few[:, 2] - motion[0, 0]) + np.abs(few[:, 3] - motion[1, 0])
-    scale = max(RESIDUAL_FLOOR, 1.5 * _weighted_median(apart, few[:, 5]))
-    linear = len(samples) >= LEAST_FOR_AFFINE
+        motion[axis, 0] = _weighted_median(start[:, 2 + axis], start[:, 5])
+    distance = np.abs(start[:, 2] - motion[0, 0]) + np.abs(start[:, 3] - motion[1, 0])
+    scale = max(MIN_SCALE_PX, 1.5 * _weighted_median(distance, start[:, 5]))
+    linear = len(samples) >= MIN_AFFINE_SAMPLES
     for _ in range(ITERATIONS):
-        _reweighted_step(samples, centre_x, centre_y, radius, scale, linear, motion)
-        scale = max(RESIDUAL_FLOOR, 0.7 * scale)
+        _reweight_and_solve(samples, centre_x, centre_y, radius, scale, linear, motion)
+        scale = max(MIN_SCALE_PX, 0.7 * scale)
     affine[:, :2] += motion[:, 1:] / radius
     affine[:, 2] = motion[:, 0] - (motion[:, 1] * centre_x + motion[:, 2] * centre_y) / radius
-    return _agreement(samples, centre_x, centre_y, radius, scale, motion)
+    return _measure_agreement(samples, centre_x, centre_y, radius, scale, motion)
 
 
 @njit(cache=True, nogil=True)
 def _weighted_median(values: F64, weights: F64) -> float:
-    """The smallest value below which, itself included, lies half of the weight."""
+    """Return the smallest value up to which (inclusive) half of the weight lies."""
     order = np.argsort(values)
     half, below = 0.5 * np.sum(weights), 0.0
     for k in order:
@@ -178,10 +183,10 @@ def _weighted_median(values: F64, weights: F64) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _reweighted_step(
+def _reweight_and_solve(
     samples: F64, centre_x: float, centre_y: float, radius: float, scale: float, linear: bool, motion: F64
 ) -> None:
-    """One iteration: weigh every sample by its misfit to `motion` (2, 3), then solve for a new `motion`."""
+    """Weight every sample by its misfit to `motion` (2, 3), then solve for a new `motion`: one iteration."""
     normal, right = np.zeros((3, 3)), np.zeros((3, 2))
     for k in range(len(samples)):
         x, y = (samples[k, 0] - centre_x) / radius, (samples[k, 1] - centre_y) / radius
@@ -207,17 +212,17 @@ def _reweighted_step(
         motion[:, 0] = right[0] / normal[0, 0]
         return
     normal[1, 0], normal[2, 0], normal[2, 1] = normal[0, 1], normal[0, 2], normal[1, 2]
-    prior = CORRELATED_PIXELS * (RESIDUAL_FLOOR / (DEFORMATION * radius)) ** 2
+    prior = PIXELS_PER_OBSERVATION * (MIN_SCALE_PX / (LINEAR_PRIOR_SD * radius)) ** 2
     normal[1, 1] += prior
     normal[2, 2] += prior
     motion[:] = np.linalg.solve(normal, right).T
 
 
 @njit(cache=True, nogil=True)
-def _agreement(
+def _measure_agreement(
     samples: F64, centre_x: float, centre_y: float, radius: float, scale: float, motion: F64
 ) -> tuple[float, float]:
-    """Residual (px, root mean square over the inliers) and support (their share, by round trip) of a motion."""
+    """Return a motion's residual (px, root mean square over the inliers) and support (their share, by round trip)."""
     total, inlier, squares = 0.0, 0.0, 0.0
     for k in range(len(samples)):
         x, y = (samples[k, 0] - centre_x) / radius, (samples[k, 1] - centre_y) / radius

@@ -2,7 +2,7 @@
 """Puppet flow: the motion field of a layered puppet, one affine motion a visible part and one for the background.
 
 Thesis, flowing puppets, section 2 and its Figures 2 to 4: the parts are painted in depth order, an affine motion is
-fitted to the dense flow inside each visible part, and these motions carry the joints to the neighbouring frame.
+fitted to the dense flow inside each visible part, and these motions take the joints to the neighbouring frame.
 """
 
 from __future__ import annotations
@@ -19,10 +19,14 @@ from flowing_puppet_ros.flow.affine import RegionMotions, fit_regions
 
 
 class PuppetFlow(NamedTuple):
-    """`affine` (P, 2, 3) of the parts, `background` (2, 3), `field` (H, W, 2) float32, `explained` fraction in [0, 1].
+    """The motions of a layered puppet and the field that they make.
 
-    `explained` is the share of the parts' pixels where the field agrees with the dense flow within 1 px or a tenth
-    of the flow; 0 when no part is visible.
+    Attributes:
+        affine: (P, 2, 3) motions of the parts.
+        background: (2, 3) motion of the background.
+        field: (H, W, 2) float32 displacements in pixels.
+        explained: share in [0, 1] of the parts' pixels where the field agrees with the dense flow, within 1 px or a
+            tenth of the flow; 0 when no part is visible.
     """
 
     affine: F64
@@ -31,12 +35,12 @@ class PuppetFlow(NamedTuple):
     explained: float
 
 
-def part_motions(
+def fit_part_motions(
     labels: NDArray[np.unsignedinteger], parents: tuple[int, ...], forward: Flow, backward: Flow | None = None
 ) -> tuple[RegionMotions, F64]:
-    """Motions of the parts, label = part + 1 in `labels` (H, W), and the background's motion (2, 3).
+    """Fit the motions of the parts, label = part + 1 in `labels` (H, W), and the background's motion (2, 3).
 
-    `parents` (P) is the part tree (a forest for several people), -1 at roots: a hidden part moves like the mean of
+    `parents` (P,) is the part tree (a forest for several people), -1 at roots. A hidden part moves like the mean of
     its tree neighbours, a wholly hidden person like the background.
     """
     regions = fit_regions(labels, len(parents) + 1, forward, backward)
@@ -60,11 +64,11 @@ def part_motions(
 
 
 def motion_field(labels: NDArray[np.unsignedinteger], affine: F64, background: F64) -> Flow:
-    """Displacements (H, W, 2) float32 of the layered motions: label k moves by affine[k - 1], 0 by `background`."""
+    """Return the field (H, W, 2) px of layered motions: label k moves by affine[k - 1], label 0 by `background`."""
     return _paint(np.ascontiguousarray(labels, dtype=np.uint16), np.concatenate([background[None], affine]))
 
 
-def puppet_flow(
+def fit_puppet_flow(
     labels: NDArray[np.unsignedinteger],
     flow: Flow,
     backward: Flow | None = None,
@@ -72,18 +76,18 @@ def puppet_flow(
 ) -> PuppetFlow:
     """Fit the puppet flow to dense `flow` (H, W, 2) under part `labels` (H, W), label = part + 1, 0 background.
 
-    `parents` is the part tree that hidden parts borrow motion through; without it there are as many parts as
-    the largest label says, and hidden ones move with the background.
+    `parents` (P,) is the part tree through which hidden parts borrow motion. Without it the largest label is the number
+    of parts, and hidden ones move with the background.
     """
     if parents is None:
         parents = (-1,) * int(labels.max(initial=0))
-    motions, background = part_motions(labels, parents, flow, backward)
+    motions, background = fit_part_motions(labels, parents, flow, backward)
     field = motion_field(labels, motions.affine, background)
     return PuppetFlow(motions.affine, background, field, explained_fraction(labels, field, flow))
 
 
 def explained_fraction(labels: NDArray[np.unsignedinteger], field: Flow, flow: Flow) -> float:
-    """Share of the pixels under a part where `field` is within 1 px, or a tenth of the flow, of dense `flow`."""
+    """Return the share of the parts' pixels where `field` is within 1 px, or a tenth of the flow, of dense `flow`."""
     inside = labels > 0
     difference, magnitude = (field[inside] - flow[inside]).astype(np.float64), flow[inside].astype(np.float64)
     known = np.isfinite(difference).all(axis=1)

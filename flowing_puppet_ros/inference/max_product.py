@@ -17,7 +17,7 @@ from flowing_puppet_ros.model.tree import PartTree
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaxProduct:
-    """What one run of max-product found; edge e of the tree leads from `tree.edges[e][0]` to node e + 1.
+    """Result of one run of max-product; edge e of the tree leads from `tree.edges[e][0]` to node e + 1.
 
     Attributes:
         to_parent: per edge the message from child to parent, one cost a particle of the parent.
@@ -36,7 +36,7 @@ class MaxProduct:
 
 
 def max_product(tree: PartTree, node_costs: Sequence[np.ndarray], edge_costs: Sequence[np.ndarray]) -> MaxProduct:
-    """Run max-product to its exact end on a tree.
+    """Run max-product to its exact end on a tree (Eqs. 16, 17 and 19).
 
     Args:
         tree: the graph; nodes may have different numbers of particles.
@@ -44,7 +44,7 @@ def max_product(tree: PartTree, node_costs: Sequence[np.ndarray], edge_costs: Se
         edge_costs: per edge (particles of the parent, particles of the child) finite costs.
 
     Raises:
-        ValueError: when shapes do not agree with the tree.
+        ValueError: if shapes do not agree with the tree.
     """
     _check(tree, node_costs, edge_costs)
     beliefs = [np.array(cost, dtype=np.float64) for cost in node_costs]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the shipped models come from: the commands of `flowing-puppet learn`, a folder for each product.
+"""Training of the shipped models: the commands of `flowing-puppet learn`, one folder per model.
 
-Synthetic bodies or annotated images come in; weights with a model card go out. Nothing else imports it but `evaluate`.
+Synthetic bodies or annotated images come in; weights with a model card go out. Only `evaluate` imports it.
 """

@@ -13,17 +13,17 @@ from flowing_puppet_ros.arrays import Array
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gaussian:
-    """N(x; mean (D,), covariance (D,D)), in the units of x."""
+    """N(x; `mean` (D,), `covariance` (D, D)), in the units of x."""
 
     mean: Array
     covariance: Array
 
     def __post_init__(self) -> None:
-        """Store float64 arrays; raise ValueError when their shapes do not belong together."""
+        """Store float64 arrays; ValueError when their shapes do not agree."""
         mean = np.asarray(self.mean, dtype=np.float64)
         covariance = np.asarray(self.covariance, dtype=np.float64)
         if mean.ndim != 1 or covariance.shape != (mean.size, mean.size):
-            raise ValueError(f"a mean of shape {mean.shape} has no covariance of shape {covariance.shape}")
+            raise ValueError(f"a mean of shape {mean.shape} and a covariance of shape {covariance.shape} do not agree")
         object.__setattr__(self, "mean", mean)
         object.__setattr__(self, "covariance", covariance)
 
@@ -32,18 +32,18 @@ class Gaussian:
 
     @classmethod
     def from_samples(cls, samples: Array, ridge: float = 0.0) -> Gaussian:
-        """Fit mean and (n - 1)-normalised covariance to samples (n,D), with `ridge` added to the variances."""
+        """Fit mean and (n - 1)-normalised covariance to `samples` (n, D), with `ridge` added to the variances."""
         centred = samples - samples.mean(axis=0)
         covariance = centred.T @ centred / max(len(samples) - 1, 1)
         return cls(samples.mean(axis=0), covariance + ridge * np.eye(samples.shape[1]))
 
     def marginal(self, indices: Sequence[int] | Array) -> Gaussian:
-        """The distribution of the variables `indices`, in that order."""
+        """Return the distribution of the variables `indices`, in that order."""
         kept = np.asarray(indices, dtype=np.intp)
         return Gaussian(self.mean[kept], self.covariance[np.ix_(kept, kept)])
 
     def condition(self, kept: Sequence[int] | Array, given: Sequence[int] | Array, values: Array) -> Gaussian:
-        """The distribution of the variables `kept` when the variables `given` have `values` (Eqs. 13 and 14).
+        """Return the distribution of the variables `kept` when the variables `given` have `values` (Eqs. 13 and 14).
 
         Variables in neither list are marginalised out.
         """
@@ -54,7 +54,7 @@ class Gaussian:
         return Gaussian(mean, (covariance + covariance.T) / 2)
 
     def sample(self, rng: np.random.Generator, n: int) -> Array:
-        """Draw (n,D) samples; a singular covariance is allowed."""
+        """Draw samples (n, D); a singular covariance is allowed."""
         variances, axes = np.linalg.eigh(self.covariance)
         scaled = axes * np.sqrt(np.maximum(variances, 0.0))
         return np.asarray(self.mean + rng.standard_normal((n, len(self))) @ scaled.T)

@@ -9,7 +9,7 @@ from flowing_puppet_ros.arrays import Array
 
 
 def exp(r: Array) -> Array:
-    """Rotation matrices (...,3,3) of Rodrigues vectors r (...,3) in radians; they act on column vectors."""
+    """Return the rotation matrices (..., 3, 3) of Rodrigues vectors `r` (..., 3) rad; they act on column vectors."""
     r = np.asarray(r, dtype=np.float64)
     angle = np.linalg.norm(r, axis=-1)[..., None, None]
     zero = np.zeros(r.shape[:-1])
@@ -22,7 +22,7 @@ def exp(r: Array) -> Array:
 
 
 def quaternion(matrix: Array) -> Array:
-    """Unit quaternions (...,4) as (w,x,y,z), w >= 0, of rotation matrices (...,3,3)."""
+    """Return the unit quaternions (..., 4) as (w, x, y, z), w >= 0, of rotation matrices `matrix` (..., 3, 3)."""
     matrix = np.asarray(matrix, dtype=np.float64)
     m = matrix.reshape((-1, 3, 3))
     # Rows of 4 q q^T: the row with the largest diagonal entry is the numerically safe multiple of q (Shepperd 1978).
@@ -42,7 +42,10 @@ def quaternion(matrix: Array) -> Array:
 
 
 def log(matrix: Array) -> Array:
-    """Rodrigues vectors (...,3), angle in [0, pi], of rotation matrices (...,3,3); accurate near 0 and near pi."""
+    """Return the Rodrigues vectors (..., 3) rad of rotation matrices `matrix` (..., 3, 3).
+
+    Angles are in [0, pi] and accurate near both ends.
+    """
     q = quaternion(matrix)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, q[..., :1])
@@ -51,7 +54,7 @@ def log(matrix: Array) -> Array:
 
 
 def nearest_rotation(matrix: Array) -> Array:
-    """The rotation (...,3,3) with the largest trace(R^T M) for M (...,3,3)."""
+    """Return the rotation R (..., 3, 3) with the largest trace(R^T M) for M = `matrix` (..., 3, 3)."""
     u, _, vt = np.linalg.svd(matrix)
     sign = np.ones(u.shape[:-1])
     sign[..., 2] = np.sign(np.linalg.det(u @ vt))
@@ -59,9 +62,9 @@ def nearest_rotation(matrix: Array) -> Array:
 
 
 def procrustes(a: Array, b: Array, w: Array | None = None) -> tuple[Array, Array]:
-    """Rotation R (...,3,3) and translation t (...,3) that minimise sum_k w_k |R a_k + t - b_k|^2.
+    """Return the rotation R (..., 3, 3) and translation t (..., 3) that minimise sum_k w_k |R a_k + t - b_k|^2.
 
-    a, b: (...,K,3) points, w: (K,) or (...,K) weights >= 0 (uniform when left out).
+    `a` and `b` (..., K, 3) are points, `w` (K,) or (..., K) weights >= 0 (uniform when left out).
     """
     a, b = np.asarray(a, dtype=np.float64), np.asarray(b, dtype=np.float64)
     weight = np.ones(a.shape[-2]) if w is None else np.asarray(w, dtype=np.float64)

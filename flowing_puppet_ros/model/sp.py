@@ -18,17 +18,17 @@ from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
 
 POSE_WIDTH = 12  # columns of BodyState.pose; parts with fewer coefficients leave the rest 0
-DEVIATIONS = 3.0  # samples stay within this many standard deviations of every coefficient
-MIRROR_POINT = np.array([1.0, -1.0, 1.0])
-MIRROR_AXIS = np.array([-1.0, 1.0, -1.0])  # what a mirror in the plane y = 0 does to a rotation vector
+MAX_DEVIATIONS = 3.0  # samples stay within this many standard deviations of every coefficient
+MIRROR_POINT = np.array([1.0, -1.0, 1.0])  # signs of a point mirrored in the plane y = 0 ...
+MIRROR_AXIS = np.array([-1.0, 1.0, -1.0])  # ... and of a rotation vector
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyState:
     """The node variables of all 16 parts (Eq. 44), with any leading batch dimensions.
 
-    center (...,16,3) metres, rotation (...,16,3,3), pose (...,16,12) zero-padded and shape (...,16,S), both in
-    standard deviations.
+    `center` (..., 16, 3) m, `rotation` (..., 16, 3, 3), `pose` (..., 16, 12) zero-padded and `shape` (..., 16, S), both
+    in standard deviations.
     """
 
     center: Array
@@ -39,7 +39,7 @@ class BodyState:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Interface:
-    """The points that a parent part and a child part share (Eq. 48): local indices (K,) in each and weights (K,)."""
+    """Points that a parent part and a child part share (Eq. 48): local indices (K,) in each and `weight` (K,)."""
 
     parent_index: Array
     child_index: Array
@@ -48,7 +48,7 @@ class Interface:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartTopology:
-    """How the template falls into parts, each with its own copy of the vertices on its border."""
+    """Partition of the template into parts, each with its own copy of the vertices on its border."""
 
     part_vertices: tuple[Array, ...]
     part_faces: tuple[Array, ...]
@@ -56,7 +56,7 @@ class PartTopology:
 
     @classmethod
     def from_faces(cls, faces: Array, part_of_face: Array, tree: PartTree) -> PartTopology:
-        """Split template faces (F,3) by the part (F,) each belongs to; `shared` has local indices for every edge."""
+        """Split template `faces` (F, 3) by `part_of_face` (F,); `shared` has the local indices of every edge."""
         vertices = tuple(np.unique(faces[part_of_face == i]).astype(np.int32) for i in range(len(tree)))
         local = tuple(np.searchsorted(vertices[i], faces[part_of_face == i]).astype(np.int32) for i in range(len(tree)))
         shared = []
@@ -68,13 +68,14 @@ class PartTopology:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StitchedPuppet:
-    """A learned Stitched Puppet. V vertices, part i has N_i vertices and P_i pose coefficients, S shape coefficients.
+    """A learned Stitched Puppet: V vertices, S shape coefficients; part i has N_i vertices and P_i pose coefficients.
 
-    faces (F,3) closed and counter-clockwise outside; part_vertices are template ids, border vertices stand in both
-    parts; mean_shape, shape_basis (N_i,3,S), mean_pose, pose_basis (N_i,3,P_i): Eqs. 45 and 46, in the part's frame
-    (origin in its rest centre, axes of the body); pairwise: Eq. 49 over [r_ij (3), d_i, d_j], r_ij = log(R_i^T R_j);
-    limit_low, limit_high (15,3) of r_ij; joint_index, joint_weight (J,M): joints as convex sums of vertices;
-    mirror_vertex (V,) and pose_mirror (P_i,) signs: the same body seen in a mirror.
+    `faces` (F, 3) are closed, counter-clockwise from outside. `part_vertices` are template ids; border vertices are in
+    both parts. `mean_shape`, `shape_basis` (N_i, 3, S), `mean_pose` and `pose_basis` (N_i, 3, P_i) are those of
+    Eqs. 45 and 46, in the part's frame (origin in its rest centre, axes of the body). `pairwise` is Eq. 49 over
+    [r_ij (3), d_i, d_j] with r_ij = log(R_i^T R_j); `limit_low` and `limit_high` (15, 3) rad bound r_ij.
+    `joint_index` and `joint_weight` (J, M) give joints as convex sums of vertices. `mirror_vertex` (V,) and the signs
+    `pose_mirror` (P_i,) describe the same body seen in a mirror.
     """
 
     name: str
@@ -100,8 +101,8 @@ class StitchedPuppet:
 
     @classmethod
     def load(cls, name: str = "neutral") -> StitchedPuppet:
-        """The shipped model neutral, female or male; InputError for another name."""
-        return _loaded(name)
+        """Return the shipped model "neutral", "female" or "male"; InputError for another name."""
+        return _load_shared(name)
 
     @classmethod
     def from_arrays(cls, name: str, arrays: Mapping[str, Array]) -> StitchedPuppet:
@@ -142,29 +143,35 @@ class StitchedPuppet:
         return int(self.shape_basis[0].shape[2])
 
     def pose_count(self, part: int) -> int:
-        """P_i, the number of pose coefficients of a part."""
+        """Return P_i, the number of pose coefficients of a part."""
         return int(self.pose_basis[part].shape[2])
 
     def rest_state(self) -> BodyState:
-        """The average body in the template pose: pose coefficients that undo the mean pose deformation."""
-        rest = _rest_pose(self)
+        """Return the average body in the template pose: pose coefficients that undo the mean pose deformation."""
+        rest = _fit_rest_pose(self)
         parts = len(self.tree)
-        turned = np.broadcast_to(np.eye(3), (parts, 3, 3)).copy()
-        return BodyState(self.rest_center.copy(), turned, rest.copy(), np.zeros((parts, self.shape_count)))
+        upright = np.broadcast_to(np.eye(3), (parts, 3, 3)).copy()
+        return BodyState(self.rest_center.copy(), upright, rest.copy(), np.zeros((parts, self.shape_count)))
 
     def local_vertices(self, i: int, d: Array, s: Array) -> Array:
-        """Vertices (...,N_i,3) of part i in its own frame (Eqs. 45 and 46); d (...,P_i or zero-padded), s (...,S)."""
+        """Return the vertices (..., N_i, 3) of part `i` in its own frame (Eqs. 45 and 46).
+
+        `d` (..., P_i or zero-padded) are pose coefficients, `s` (..., S) shape coefficients.
+        """
         mean, count = self.mean_shape[i] + self.mean_pose[i], self.pose_count(i)
         shaped = s @ self.shape_basis[i].reshape((-1, self.shape_count)).T
         posed = d[..., :count] @ self.pose_basis[i].reshape((-1, count)).T
         return np.asarray((shaped + posed).reshape((*shaped.shape[:-1], -1, 3)) + mean)
 
     def part_mesh(self, i: int, o: Array, r: Array, d: Array, s: Array) -> Array:
-        """Vertices (...,N_i,3) of part i in the world (Eq. 47) with centre o (...,3) and rotation r (...,3,3)."""
+        """Return the vertices (..., N_i, 3) of part `i` in the world (Eq. 47).
+
+        `o` (..., 3) is its centre, `r` (..., 3, 3) its rotation, `d` and `s` as in `local_vertices`.
+        """
         return np.asarray(self.local_vertices(i, d, s) @ np.swapaxes(r, -1, -2) + np.asarray(o)[..., None, :])
 
     def parts(self, state: BodyState) -> tuple[Array, ...]:
-        """Vertices (...,N_i,3) of every part in the world."""
+        """Return the vertices (..., N_i, 3) of every part in the world."""
         return tuple(
             self.part_mesh(
                 i, state.center[..., i, :], state.rotation[..., i, :, :], state.pose[..., i, :], state.shape[..., i, :]
@@ -173,7 +180,7 @@ class StitchedPuppet:
         )
 
     def vertices(self, state: BodyState) -> Array:
-        """Vertices (...,V,3) of the whole body; where parts share a vertex, the mean of their copies."""
+        """Return the vertices (..., V, 3) of the whole body; where parts share a vertex, the mean of their copies."""
         total = np.zeros((*state.center.shape[:-2], len(self.part_of_vertex), 3))
         copies = np.zeros(len(self.part_of_vertex))
         for ids, mesh in zip(self.part_vertices, self.parts(state), strict=True):
@@ -182,13 +189,13 @@ class StitchedPuppet:
         return np.asarray(total / copies[:, None])
 
     def joints(self, vertices: Array) -> Array:
-        """Joints (...,J,3), in the order of joint_names, of body vertices (...,V,3)."""
+        """Return the joints (..., J, 3), in the order of `joint_names`, of body `vertices` (..., V, 3)."""
         return np.asarray((self.joint_weight[..., None] * vertices[..., self.joint_index, :]).sum(axis=-2))
 
     def stitch(self, child: int, parent: int, parent_points: Array, d: Array, s: Array) -> tuple[Array, Array]:
-        """Rotation (...,3,3) and centre (...,3) that lay the child's interface onto parent_points (...,K,3).
+        """Return the rotation (..., 3, 3) and centre (..., 3) that fit the child's interface to its parent's.
 
-        `parent_points` are the parent's interface points in the world, in the order of the interface of that edge.
+        `parent_points` (..., K, 3) are the parent's interface points in the world, in the order of the interface.
         """
         if self.tree.parents[child] != parent:
             raise ValueError(f"{self.tree.names[parent]} is not the parent of {self.tree.names[child]}")
@@ -197,53 +204,53 @@ class StitchedPuppet:
         return rotation.procrustes(points, parent_points, interface.weight)
 
     def sample(self, rng: np.random.Generator, shape_scale: float = 1.0, pose_scale: float = 1.0) -> BodyState:
-        """Draw a stitched body that faces x forward (thesis section "Generating Model Instances").
+        """Draw a stitched body that faces along x (thesis section "Generating Model Instances").
 
-        One shape for all parts, then from the torso outwards the pose coefficients given the parent's, and the
-        rotation and centre that stitch the part to its parent, within the joint limits. The scales multiply standard
+        All parts share one shape. From the torso outwards, a part's pose coefficients are drawn given its parent's,
+        and its rotation and centre stitch it to its parent within the joint limits. The scales multiply standard
         deviations.
         """
         rest = self.rest_state()
-        rest.shape[:] = np.clip(shape_scale * rng.standard_normal(self.shape_count), -DEVIATIONS, DEVIATIONS)
+        rest.shape[:] = np.clip(shape_scale * rng.standard_normal(self.shape_count), -MAX_DEVIATIONS, MAX_DEVIATIONS)
         torso = self.pose_count(0)
-        rest.pose[0, :torso] = np.clip(pose_scale * rng.standard_normal(torso), -DEVIATIONS, DEVIATIONS)
+        rest.pose[0, :torso] = np.clip(pose_scale * rng.standard_normal(torso), -MAX_DEVIATIONS, MAX_DEVIATIONS)
         for parent, child in self.tree.edges:
             given, own = self.pose_count(parent), self.pose_count(child)
             d_child = self.pairwise[child - 1].condition(
                 np.arange(3 + given, 3 + given + own), np.arange(3, 3 + given), rest.pose[parent, :given]
             )
             drawn = d_child.mean + pose_scale * (d_child.sample(rng, 1)[0] - d_child.mean)
-            rest.pose[child, :own] = np.clip(drawn, -DEVIATIONS, DEVIATIONS)
-            self._place(rest, parent, child)
+            rest.pose[child, :own] = np.clip(drawn, -MAX_DEVIATIONS, MAX_DEVIATIONS)
+            self._attach_to_parent(rest, parent, child)
         return rest
 
-    def _place(self, state: BodyState, parent: int, child: int) -> None:
+    def _attach_to_parent(self, state: BodyState, parent: int, child: int) -> None:
         mesh = self.part_mesh(
             parent, state.center[parent], state.rotation[parent], state.pose[parent], state.shape[parent]
         )
         interface = self.interfaces[child - 1]
         target = mesh[interface.parent_index]
-        turned, _ = self.stitch(child, parent, target, state.pose[child], state.shape[child])
-        relative = rotation.log(state.rotation[parent].T @ turned)
+        stitched, _ = self.stitch(child, parent, target, state.pose[child], state.shape[child])
+        relative = rotation.log(state.rotation[parent].T @ stitched)
         limited = np.clip(relative, self.limit_low[child - 1], self.limit_high[child - 1])
         state.rotation[child] = state.rotation[parent] @ rotation.exp(limited)
         own = self.local_vertices(child, state.pose[child], state.shape[child])[interface.child_index]
         offsets = target - own @ state.rotation[child].T
         state.center[child] = np.average(offsets, axis=0, weights=interface.weight)
 
-    def mirrored(self, state: BodyState) -> BodyState:
-        """The state of the same body seen in the mirror plane y = 0: left and right swapped."""
+    def mirror(self, state: BodyState) -> BodyState:
+        """Mirror a body in the plane y = 0: left and right are swapped."""
         other = list(self.tree.mirror)
         pose = state.pose[..., other, :].copy()
         for i, signs in enumerate(self.pose_mirror):
             pose[..., i, : len(signs)] *= signs
-        turned = MIRROR_POINT[:, None] * state.rotation[..., other, :, :] * MIRROR_POINT
-        return BodyState(state.center[..., other, :] * MIRROR_POINT, turned, pose, state.shape[..., other, :])
+        rotations = MIRROR_POINT[:, None] * state.rotation[..., other, :, :] * MIRROR_POINT
+        return BodyState(state.center[..., other, :] * MIRROR_POINT, rotations, pose, state.shape[..., other, :])
 
 
 @lru_cache(maxsize=4)
-def _rest_pose(model: StitchedPuppet) -> Array:
-    """Pose coefficients (N, POSE_WIDTH) that undo the mean pose deformation."""
+def _fit_rest_pose(model: StitchedPuppet) -> Array:
+    """Fit the pose coefficients (N, POSE_WIDTH) that undo the mean pose deformation."""
     pose = np.zeros((len(model.tree), POSE_WIDTH))
     for i in range(len(pose)):
         basis = model.pose_basis[i].reshape((-1, model.pose_count(i)))
@@ -252,6 +259,6 @@ def _rest_pose(model: StitchedPuppet) -> Array:
 
 
 @lru_cache(maxsize=3)
-def _loaded(name: str) -> StitchedPuppet:
-    """The shipped model; nobody changes it, so all of a process share it."""
+def _load_shared(name: str) -> StitchedPuppet:
+    """Load a shipped model once; it is never changed, so the whole process shares it."""
     return StitchedPuppet.from_arrays(name, weights.load("sp", name))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Trees of body parts, and the names that every module uses for parts and joints (left and right are the person's)."""
+"""Trees of body parts, and the part and joint names that every module uses (left and right are the person's)."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class PartTree:
     def __post_init__(self) -> None:
         """Refuse anything but one root at index 0 with parents before children."""
         if len(self.names) != len(self.parents) or not self.parents or self.parents[0] != -1:
-            raise ValueError(f"a part tree needs a root first and one parent a name, got {self.parents}")
+            raise ValueError(f"a part tree needs the root first and one parent per name, got {self.parents}")
         for child, parent in enumerate(self.parents[1:], start=1):
             if not 0 <= parent < child:
                 raise ValueError(f"parent {parent} of node {child} does not come before it")
@@ -82,19 +82,19 @@ class PartTree:
         return tuple((parent, child) for child, parent in enumerate(self.parents) if parent >= 0)
 
     def children(self, node: int) -> tuple[int, ...]:
-        """The nodes whose parent is `node`."""
+        """Return the nodes whose parent is `node`."""
         return tuple(child for child, parent in enumerate(self.parents) if parent == node)
 
     def neighbours(self, node: int) -> tuple[int, ...]:
-        """The parent, where there is one, then the children."""
+        """Return the parent of `node`, if it has one, then its children."""
         parent = self.parents[node]
         return (() if parent < 0 else (parent,)) + self.children(node)
 
     def index(self, name: str) -> int:
-        """Index of the part called `name`; ValueError when there is none."""
+        """Return the index of the part called `name`; ValueError if there is none."""
         return self.names.index(name)
 
     @property
     def mirror(self) -> tuple[int, ...]:
-        """For every node the node on the other side of the body (itself on the midline)."""
+        """Each node's counterpart on the other side of the body (itself on the midline)."""
         return tuple(self.names.index(mirrored_name(name)) for name in self.names)

@@ -15,7 +15,7 @@ FOLDER = "weights"
 
 
 def available(kind: Kind) -> tuple[str, ...]:
-    """Sorted names of the shipped models of one kind, for example ("female", "male", "neutral")."""
+    """List the names of the shipped models of one kind, sorted, for example ("female", "male", "neutral")."""
     folder = resources.files("flowing_puppet_ros") / FOLDER
     if not folder.is_dir():
         return ()
@@ -25,7 +25,7 @@ def available(kind: Kind) -> tuple[str, ...]:
 
 
 def load(kind: Kind, name: str) -> dict[str, np.ndarray[Any, Any]]:
-    """Arrays of the shipped model `name` of `kind`; InputError, naming what there is, when there is no such model."""
+    """Load the arrays of the shipped model `name` of `kind`; InputError, with the known names, if there is none."""
     known = available(kind)
     if name not in known:
         have = ", ".join(known) or "none (learn one with `flowing-puppet learn`)"

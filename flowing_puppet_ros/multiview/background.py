@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a still camera sees behind its people: a mean and a variance per pixel, learned only where nobody stands."""
+"""The background of a still camera: a mean and a variance per pixel, learned only where there are no people."""
 
 from __future__ import annotations
 
@@ -11,37 +11,40 @@ from numba import njit
 from flowing_puppet_ros.arrays import F32, Bools, Image
 from flowing_puppet_ros.settings import Settings, setting
 
-# A pixel that differs by this many spreads and grey levels counts as changed; more than this share changed: new scene.
-_CHANGED_SPREADS = 6.0
-_CHANGED_LEVELS = 25.0
+# Standard deviations and grey levels by which a changed pixel differs from the background.
+_MIN_CHANGE_DEVIATIONS = 6.0
+_MIN_CHANGE_LEVELS = 25.0
+# Share of changed pixels, and consecutive frames with so many, that make a new scene.
 _NEW_SCENE_SHARE = 0.5
 _NEW_SCENE_FRAMES = 3
-# A value farther than this many grey levels and spreads from the mean is learned as if it were that far.
-_LIKELY_LEVELS = 8.0
-_LIKELY_SPREADS = 3.0
-# A shadow leaves at least this share of the light, and its share differs between channels by no more than this.
-_DARKEST_SHADOW = 0.35
-_SHADOW_TINT = 0.12
+# Grey levels plus standard deviations from the mean at which a value is clamped before it is learned.
+_MAX_LEARNED_LEVELS = 8.0
+_MAX_LEARNED_DEVIATIONS = 3.0
+# Share of the light that a shadow leaves, and the maximum difference of that share between channels.
+_MIN_SHADOW_SHARE = 0.35
+_MAX_SHADOW_TINT = 0.12
 
 
 @dataclass(frozen=True)
 class BackgroundSettings(Settings):
     """How the background of one camera is learned."""
 
-    min_frames: int = setting(3, "frames a pixel must have been seen bare to be known", unit="frames", low=2, high=1000)
-    memory: int = setting(200, "frames after which old appearance fades", unit="frames", low=2, high=100000)
+    min_frames: int = setting(
+        3, "frames without people in which a pixel must be seen to be known", low=2, high=1000, advanced=True
+    )
+    memory: int = setting(200, "frames over which the background is averaged", low=2, high=100000, advanced=True)
 
 
 class Background:
     """Running mean and variance of every pixel over the frames in which it lay outside the people (causal).
 
-    A person who never leaves a pixel keeps it unknown, so somebody who walks on the spot does not become background,
-    as happens with a plain median. A frame in which more than half of the bare pixels differ from what is known is not
-    learned; with the third such frame on end (the camera moved, the light changed) everything older is forgotten.
+    A pixel that a person never leaves stays unknown, so a person who walks on the spot does not become background, as
+    with a plain median. A frame in which more than half of the bare pixels differ from the background is not learned;
+    after the third such frame in a row (the camera moved, the light changed) everything older is forgotten.
     """
 
     def __init__(self, settings: BackgroundSettings | None = None) -> None:
-        """Know nothing yet; the image size is taken from the first update."""
+        """Start empty; the image size is taken from the first update."""
         self.settings = settings or BackgroundSettings()
         self.reset()
 
@@ -50,7 +53,7 @@ class Background:
         self._start((0, 0))
 
     def resize(self, shape: tuple[int, int]) -> None:
-        """Start afresh when the images have had another `shape` (h, w) so far."""
+        """Reset when the images so far had another `shape` (h, w)."""
         if self.count.shape != shape:
             self._start(shape)
 
@@ -61,7 +64,7 @@ class Background:
         self._changed_frames = 0
 
     def update(self, image: Image, bare: Bools) -> None:
-        """Learn from `image` (h,w,3) uint8 where `bare` (h,w) is true; another image size starts afresh."""
+        """Learn from `image` (h, w, 3) uint8 where `bare` (h, w) is true; another image size resets."""
         self.resize((image.shape[0], image.shape[1]))
         if not self._same_scene(image, bare):
             self._changed_frames += 1
@@ -82,31 +85,31 @@ class Background:
 
     @property
     def known(self) -> Bools:
-        """Pixels (h,w) that were seen bare often enough."""
+        """Pixels (h, w) that were seen bare often enough."""
         return self.count >= self.settings.min_frames
 
     def difference(self, image: Image) -> tuple[F32, F32]:
-        """Largest channel difference (h,w) in grey levels, and the spread (h,w) of the background in that channel."""
+        """Return the largest channel difference (h, w) in grey levels, and that channel's standard deviation (h, w)."""
         return _difference(self.mean, self.variance, np.ascontiguousarray(image))
 
-    def shadow(self, image: Image) -> Bools:
-        """Pixels (h,w) that are darker than the background by much the same factor in all channels."""
-        return _shadow(self.mean, np.ascontiguousarray(image))
+    def find_shadows(self, image: Image) -> Bools:
+        """Return the pixels (h, w) that are darker than the background by a similar factor in all channels."""
+        return _find_shadows(self.mean, np.ascontiguousarray(image))
 
     def _same_scene(self, image: Image, bare: Bools) -> bool:
-        judged = bare & self.known
-        if not judged.any():
+        compared = bare & self.known
+        if not compared.any():
             return True
-        levels, spread = self.difference(image)
-        changed = (levels > _CHANGED_LEVELS) & (levels > _CHANGED_SPREADS * (spread + 1))
-        return bool(np.count_nonzero(changed & judged) <= _NEW_SCENE_SHARE * np.count_nonzero(judged))
+        levels, deviation = self.difference(image)
+        changed = (levels > _MIN_CHANGE_LEVELS) & (levels > _MIN_CHANGE_DEVIATIONS * (deviation + 1))
+        return bool(np.count_nonzero(changed & compared) <= _NEW_SCENE_SHARE * np.count_nonzero(compared))
 
 
 @njit(cache=True, nogil=True)
 def _update(count, mean, variance, image, bare, min_frames, memory):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Welford's update with the count held at `memory`, which turns the mean into an exponential one.
+    """Apply Welford's update with the count limited to `memory`, which turns the mean into an exponential one.
 
-    Once a pixel is known, a value pulls at most as far as a likely one: a limb the puppet misses leaves little trace.
+    Once a pixel is known, values are clamped to likely ones, so a limb that the puppet misses leaves little trace.
     """
     height, width, channels = image.shape
     for y in range(height):
@@ -122,8 +125,8 @@ def _update(count, mean, variance, image, bare, min_frames, memory):  # type: ig
                     continue
                 delta = image[y, x, c] - mean[y, x, c]
                 if n > min_frames:
-                    likely = _LIKELY_LEVELS + _LIKELY_SPREADS * np.sqrt(variance[y, x, c])
-                    delta = min(max(delta, -likely), likely)
+                    limit = _MAX_LEARNED_LEVELS + _MAX_LEARNED_DEVIATIONS * np.sqrt(variance[y, x, c])
+                    delta = min(max(delta, -limit), limit)
                 mean[y, x, c] += delta / n
                 variance[y, x, c] += (delta * delta * (n - 1) / n - variance[y, x, c]) / n
 
@@ -132,19 +135,19 @@ def _update(count, mean, variance, image, bare, min_frames, memory):  # type: ig
 def _difference(mean, variance, image):  # type: ignore[no-untyped-def]  # pragma: no cover
     height, width, channels = image.shape
     levels = np.zeros((height, width), np.float32)
-    spread = np.zeros((height, width), np.float32)
+    deviation = np.zeros((height, width), np.float32)
     for y in range(height):
         for x in range(width):
             for c in range(channels):
                 delta = abs(image[y, x, c] - mean[y, x, c])
                 if c == 0 or delta > levels[y, x]:
                     levels[y, x] = delta
-                    spread[y, x] = np.sqrt(variance[y, x, c])
-    return levels, spread
+                    deviation[y, x] = np.sqrt(variance[y, x, c])
+    return levels, deviation
 
 
 @njit(cache=True, nogil=True)
-def _shadow(mean, image):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _find_shadows(mean, image):  # type: ignore[no-untyped-def]  # pragma: no cover
     height, width, channels = image.shape
     shadow = np.zeros((height, width), np.bool_)
     for y in range(height):
@@ -153,5 +156,5 @@ def _shadow(mean, image):  # type: ignore[no-untyped-def]  # pragma: no cover
             for c in range(channels):
                 factor = (image[y, x, c] + 1.0) / (mean[y, x, c] + 1.0)
                 darkest, brightest = min(darkest, factor), max(brightest, factor)
-            shadow[y, x] = brightest < 1 and darkest > _DARKEST_SHADOW and brightest - darkest < _SHADOW_TINT
+            shadow[y, x] = brightest < 1 and darkest > _MIN_SHADOW_SHARE and brightest - darkest < _MAX_SHADOW_TINT
     return shadow

@@ -13,17 +13,21 @@ from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
 
 _LENS_MODELS = ("plumb_bob", "")
-_RADIUS2 = np.linspace(0.0, 5.0, 5001) ** 2
-_NEWTON_STEPS = 20
-_NEWTON_ACCURACY = 1e-10
+_RADIUS2 = np.linspace(0.0, 5.0, 5001) ** 2  # squared radii on the image plane at which the lens model is checked
+_NEWTON_STEPS = 20  # to invert the lens model
+_NEWTON_ACCURACY = 1e-10  # on the image plane at depth 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """One view of the world: X_camera = rotation @ X_world + translation, z forward, x right, y down, metres.
+    """A camera: X_camera = rotation @ X_world + translation, z forward, x right, y down, metres.
 
-    `matrix` (3,3) is K in pixels, (0, 0) being the centre of the top-left pixel; `distortion` (5,) is k1 k2 p1 p2 k3
-    of Brown's lens model; `size` is (width, height) in pixels; `rotation` (3,3), `translation` (3,).
+    Attributes:
+        matrix: (3, 3) K in pixels, (0, 0) being the centre of the top-left pixel.
+        distortion: (5,) k1 k2 p1 p2 k3 of Brown's lens model.
+        size: (width, height) in pixels.
+        rotation: (3, 3).
+        translation: (3,) metres.
     """
 
     matrix: F64
@@ -43,94 +47,105 @@ class Camera:
         translation: ArrayLike,
         lens_model: str = "plumb_bob",
     ) -> Camera:
-        """Make a camera from the fields k (9 or (3,3)), d, width, height of a CameraInfo and its extrinsics.
+        """Make a camera from the fields k (9,) or (3, 3), d, width, height of a CameraInfo and its extrinsics.
 
-        Raises InputError for an uncalibrated camera (all-zero K), for another lens model than plumb_bob and for
-        anything that is not finite or no rotation.
+        Raises InputError for an uncalibrated camera (all-zero K), for a lens model other than plumb_bob, for values
+        that are not finite and for a `rotation` that is not one.
         """
         if lens_model not in _LENS_MODELS:
             raise InputError(f"the camera's distortion_model is {lens_model!r}; rectify the images or use plumb_bob")
-        matrix = _array(k, "camera matrix k", (9,)).reshape(3, 3)
+        matrix = _check_array(k, "camera matrix k", (9,)).reshape(3, 3)
         if not matrix.any():
             raise InputError("the camera_info is uncalibrated (k is all zero); publish a calibrated camera_info")
         if matrix[0, 0] <= 0 or matrix[1, 1] <= 0 or not np.array_equal(matrix[2], (0, 0, 1)):
-            raise InputError(f"the camera matrix k is {matrix.ravel().tolist()}, which is no pinhole camera's")
+            raise InputError(f"the camera matrix k is {matrix.ravel().tolist()}, which is not that of a pinhole camera")
         if width <= 0 or height <= 0:
             raise InputError(f"the camera_info says {width} x {height} pixels; both must be positive")
         coefficients = np.asarray(d, np.float64).ravel()
         if coefficients.size > 5 or not np.isfinite(coefficients).all():
             raise InputError(f"the distortion d is {coefficients.tolist()}; plumb_bob has up to 5 finite coefficients")
-        turn = _array(rotation, "camera rotation", (9,)).reshape(3, 3)
-        if not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5) or np.linalg.det(turn) < 0:
-            raise InputError(f"the camera rotation is {turn.ravel().tolist()}, which is no rotation matrix")
+        world_to_camera = _check_array(rotation, "camera rotation", (9,)).reshape(3, 3)
+        if (
+            not np.allclose(world_to_camera @ world_to_camera.T, np.eye(3), atol=1e-5)
+            or np.linalg.det(world_to_camera) < 0
+        ):
+            raise InputError(
+                f"the camera rotation is {world_to_camera.ravel().tolist()}, which is not a rotation matrix"
+            )
         distortion = np.zeros(5)
         distortion[: coefficients.size] = coefficients
-        return cls(matrix, distortion, (int(width), int(height)), turn, _array(translation, "camera translation", (3,)))
+        return cls(
+            matrix,
+            distortion,
+            (int(width), int(height)),
+            world_to_camera,
+            _check_array(translation, "camera translation", (3,)),
+        )
 
     @property
     def centre(self) -> F64:
-        """The centre of projection in the world, (3,) metres."""
+        """Centre of projection (3,) in the world, metres."""
         return -self.rotation.T @ self.translation
 
     @property
     def focal(self) -> float:
-        """The mean focal length in pixels: pixels per metre at one metre depth."""
+        """Mean focal length in pixels: pixels per metre at one metre depth."""
         return float(np.sqrt(self.matrix[0, 0] * self.matrix[1, 1]))
 
     @property
-    def lens_reach(self) -> float:
-        """Squared distance from the axis, on the image plane at depth 1, up to which the radial lens model is 1 to 1.
+    def max_squared_radius(self) -> float:
+        """Squared distance from the axis on the image plane at depth 1 up to which the radial lens model is one-to-one.
 
-        Beyond it the model would fold places far outside the view back into the image. Infinite when there is no fold
+        Beyond it the model would fold points far outside the view back into the image. Infinite when there is no fold
         within 79 degrees of the axis.
         """
         k1, k2, _, _, k3 = self.distortion
         slope = 1 + _RADIUS2 * (3 * k1 + _RADIUS2 * (5 * k2 + _RADIUS2 * 7 * k3))
-        turned = np.flatnonzero(slope <= 0)
-        return float(_RADIUS2[turned[0] - 1]) if len(turned) else np.inf
+        folded = np.flatnonzero(slope <= 0)
+        return float(_RADIUS2[folded[0] - 1]) if len(folded) else np.inf
 
-    def same_as(self, other: Camera) -> bool:
-        """Whether both cameras project every point to the same pixel."""
+    def equals(self, other: Camera) -> bool:
+        """Return whether both cameras project every point to the same pixel."""
         names = ("matrix", "distortion", "size", "rotation", "translation")
         return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
 
     def to_camera(self, points: ArrayLike) -> F64:
-        """World points (..., 3) in this camera's frame, metres."""
+        """Return world points (..., 3) in this camera's frame, metres."""
         return np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
     def project(self, points: ArrayLike) -> tuple[F64, F64]:
-        """Pixels (..., 2) and depths (...) in metres of world points (..., 3); NaN pixels for what no lens shows.
+        """Return pixels (..., 2) and depths (...) in metres of world points (..., 3).
 
-        That is what lies behind, or beyond `lens_reach`.
+        Pixels are NaN for points behind the camera or beyond `max_squared_radius`.
         """
         local = self.to_camera(points)
         depth = local[..., 2]
         plane = local[..., :2] / np.where(depth > 0, depth, np.nan)[..., None]
-        plane = np.where((plane**2).sum(axis=-1, keepdims=True) <= self.lens_reach, plane, np.nan)
+        plane = np.where((plane**2).sum(axis=-1, keepdims=True) <= self.max_squared_radius, plane, np.nan)
         return self.to_pixels(distort(plane, self.distortion)), depth
 
     def to_pixels(self, image_plane: F64) -> F64:
-        """Pixels (..., 2) of (distorted) points (..., 2) of the image plane at depth 1."""
+        """Return the pixels (..., 2) of (distorted) points (..., 2) on the image plane at depth 1."""
         return image_plane @ self.matrix[:2, :2].T + self.matrix[:2, 2]
 
     def undistort(self, pixels: ArrayLike) -> F64:
-        """Points (..., 2) of the undistorted image plane at depth 1; NaN where the lens model has no inverse."""
+        """Return points (..., 2) on the undistorted image plane at depth 1; NaN where the lens model has no inverse."""
         offset = np.asarray(pixels, np.float64) - self.matrix[:2, 2]
         return _remove_distortion(offset @ np.linalg.inv(self.matrix[:2, :2]).T, self.distortion)
 
-    def rays(self, pixels: ArrayLike) -> F64:
-        """Unit directions (..., 3) in the world of the rays through pixels (..., 2)."""
+    def cast_rays(self, pixels: ArrayLike) -> F64:
+        """Return the unit directions (..., 3) in the world of the rays through pixels (..., 2)."""
         plane = self.undistort(pixels)
         direction = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ self.rotation
         return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
-    def scaled(self, factor: float) -> Camera:
-        """The camera of its image resized by `factor`: the size is rounded to whole pixels, and K follows exactly."""
+    def scale(self, factor: float) -> Camera:
+        """Return the camera for the image resized by `factor`: the size in whole pixels, and K to match it exactly."""
         width, height = (max(1, round(side * factor)) for side in self.size)
-        return self.resized((width, height))
+        return self.resize((width, height))
 
-    def resized(self, size: Sequence[int]) -> Camera:
-        """The camera of its image resized to `size` (width, height), as cv2.resize does it."""
+    def resize(self, size: Sequence[int]) -> Camera:
+        """Return the camera for the image resized to `size` (width, height), as by cv2.resize."""
         factor = np.array([size[0] / self.size[0], size[1] / self.size[1]])
         matrix = self.matrix.copy()
         matrix[:2] *= factor[:, None]
@@ -139,7 +154,7 @@ class Camera:
 
 
 def distort(plane: F64, coefficients: F64) -> F64:
-    """Where the lens moves points (..., 2) of the image plane at depth 1 (Brown 1966; k1 k2 p1 p2 k3)."""
+    """Return where the lens moves points (..., 2) on the image plane at depth 1 (Brown 1966; k1 k2 p1 p2 k3)."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = plane[..., 0], plane[..., 1]
     r2 = x * x + y * y
@@ -154,7 +169,7 @@ def distort(plane: F64, coefficients: F64) -> F64:
 
 
 def _distortion_jacobian(plane: F64, coefficients: F64) -> F64:
-    """Derivatives (..., 2, 2) of `distort` by the undistorted point."""
+    """Return the derivatives (..., 2, 2) of `distort` by the undistorted point."""
     k1, k2, p1, p2, k3 = coefficients
     x, y = plane[..., 0], plane[..., 1]
     r2 = x * x + y * y
@@ -180,13 +195,13 @@ def _remove_distortion(distorted: F64, coefficients: F64) -> F64:
             u, v = residual[..., 0], residual[..., 1]
             plane = plane - np.stack([d * u - b * v, a * v - b * u], axis=-1) / (a * d - b * b)[..., None]
         residual = distort(plane, coefficients) - distorted
-        # Past the fold of the lens model a root is a mirrored one: there the Jacobian's determinant is not positive.
+        # Beyond the fold of the lens model roots are mirrored: there the Jacobian's determinant is not positive.
         jacobian = _distortion_jacobian(plane, coefficients)
         valid = (np.abs(residual).max(axis=-1) < _NEWTON_ACCURACY) & (np.linalg.det(jacobian) > 0)
     return np.where(valid[..., None], plane, np.nan)
 
 
-def _array(values: ArrayLike, name: str, shape: tuple[int]) -> F64:
+def _check_array(values: ArrayLike, name: str, shape: tuple[int]) -> F64:
     array = np.asarray(values, np.float64).ravel()
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(f"the {name} is {array.tolist()}; it needs {shape[0]} finite numbers")

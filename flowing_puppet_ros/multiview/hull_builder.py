@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the tracked puppets of several calibrated cameras to silhouettes, triangulated joints and a visual hull."""
+"""Builds silhouettes, triangulated joints and a visual hull from the tracked puppets of several calibrated cameras."""
 
 from __future__ import annotations
 
@@ -20,19 +20,26 @@ from flowing_puppet_ros.multiview.visual_hull import (
     bounds_of_masks,
     visual_hull,
 )
+from flowing_puppet_ros.settings import Settings, nested
 
 
-# The parts of a composed settings class must not be slotted: Python cannot merge the layouts of several slotted bases.
 @dataclass(frozen=True)
-class HullBuilderSettings(HullSettings, SilhouetteSettings, TriangulationSettings):
-    """Everything that leads from puppets to a hull."""
+class HullBuilderSettings(Settings):
+    """Settings from puppets to a hull."""
+
+    silhouette: SilhouetteSettings = nested(SilhouetteSettings)
+    triangulation: TriangulationSettings = nested(TriangulationSettings)
+    hull: HullSettings = nested(HullSettings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraObservation:
-    """What one camera contributes to a set: its observed frame, and the joints of the puppet in it.
+    """One camera's observation of a person.
 
-    `joints` (J,2) are pixels of the camera's full image, NaN where unknown; `confidence` (J,) is in [0,1].
+    Attributes:
+        observation: the frame at working scale.
+        joints: (J, 2) pixels of the camera's full image, NaN where unknown.
+        confidence: (J,) in [0, 1].
     """
 
     observation: Observation
@@ -42,10 +49,13 @@ class CameraObservation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MultiViewPerson:
-    """One person in the cameras at one instant, in the world frame of the cameras' extrinsics, metres.
+    """One person in the cameras at one instant, in the world frame of the cameras' extrinsics.
 
-    `joints` (J,3) and `confidence` (J,), NaN and 0 where fewer than two views agree; the `silhouettes` of all cameras;
-    `masks` (h,w) of those that can be used, fewer than two when `problem` says why in one sentence.
+    Attributes:
+        joints: (J, 3) metres, NaN where fewer than two views agree.
+        confidence: (J,) in [0, 1], 0 where fewer than two views agree.
+        silhouettes: of all cameras.
+        problem: one sentence that says why fewer than two masks can be used; empty when there are enough.
     """
 
     joints: F64
@@ -55,13 +65,13 @@ class MultiViewPerson:
 
     @property
     def masks(self) -> dict[str, U8]:
-        """The masks by camera that can be used."""
+        """Usable masks (h, w) by camera."""
         return {name: each.mask for name, each in self.silhouettes.items() if not each.problem}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hull:
-    """Surface `points` (N,3) and outward `normals` (N,3); none when `problem` says why in one sentence."""
+    """Surface `points` (N, 3) m and outward `normals` (N, 3); none when `problem` says why in one sentence."""
 
     points: F64
     normals: F64
@@ -69,31 +79,31 @@ class Hull:
 
 
 class HullBuilder:
-    """Keeps the cameras and their backgrounds, cuts one person out of each set that is asked for and carves its hull.
+    """The cameras with their backgrounds; segments a person in a set of images and carves the hull.
 
-    Every frame of every camera goes through `observe`, which is cheap; `cut` takes the observations of one instant, and
-    `carve` what it found.
+    Every frame of every camera goes through `update_background`, which is cheap; `segment` takes the observations of
+    one instant, and `carve` its result.
     """
 
     def __init__(self, settings: HullBuilderSettings | None = None) -> None:
-        """Know no camera yet."""
+        """Start without cameras."""
         self.settings = settings or HullBuilderSettings()
         self.cameras: dict[str, Camera] = {}
         self._estimators: dict[str, SilhouetteEstimator] = {}
 
     def set_camera(self, name: str, camera: Camera) -> None:
-        """Take a camera's calibration; when a known camera's changes, its background is forgotten."""
+        """Set a camera's calibration; a known camera whose calibration changes loses its background."""
         known = self.cameras.get(name)
-        if known is not None and not known.same_as(camera):
+        if known is not None and not known.equals(camera):
             self._estimators.pop(name, None)
         self.cameras[name] = camera
 
     def reset(self) -> None:
-        """Forget all backgrounds, as after a jump back in time; the calibrations stay."""
+        """Forget all backgrounds, as after a jump back in time, but keep the calibrations."""
         self._estimators.clear()
 
     def background_share(self, name: str) -> float:
-        """The share of camera `name`'s image whose background is known, 0 to 1."""
+        """Return the share of camera `name`'s image with a known background, 0 to 1."""
         estimator = self._estimators.get(name)
         return float(estimator.background.known.mean()) if estimator and estimator.background.count.size else 0.0
 
@@ -105,9 +115,9 @@ class HullBuilder:
         scale: float,
         person: U8 | None = None,
     ) -> Observation:
-        """Learn camera `name`'s background from a frame; see `SilhouetteEstimator.observe` for the arguments.
+        """Learn camera `name`'s background from a frame, with the arguments of `SilhouetteEstimator.update_background`.
 
-        Raises InputError when the image has another size than the camera's calibration.
+        Raises InputError when the image does not have the size of the camera's calibration.
         """
         camera = self.cameras.get(name)
         if camera is not None and image.shape[1::-1] != camera.size:
@@ -115,24 +125,24 @@ class HullBuilder:
                 f"the image of camera {name} is {image.shape[1]} x {image.shape[0]}, "
                 f"its camera_info says {camera.size[0]} x {camera.size[1]}"
             )
-        return self._estimator(name).update_background(image, labels, scale, person)
+        return self._get_estimator(name).update_background(image, labels, scale, person)
 
     def segment(self, views: Mapping[str, CameraObservation]) -> MultiViewPerson:
-        """Cut the silhouettes of one set and triangulate its joints.
+        """Segment the silhouettes of one set and triangulate its joints.
 
-        `views` maps camera names to what they saw at one instant. Raises InputError for a camera without
+        `views` maps camera names to their observations at one instant. Raises InputError for a camera without
         calibration.
         """
         missing = sorted(set(views) - set(self.cameras))
         if missing:
-            raise InputError(f"camera {missing[0]} has no calibration; is its camera_info published?")
-        silhouettes = {name: self._estimator(name).segment(view.observation) for name, view in views.items()}
+            raise InputError(f"camera {missing[0]} has no calibration; check that its camera_info is published")
+        silhouettes = {name: self._get_estimator(name).segment(view.observation) for name, view in views.items()}
         usable = sum(not silhouette.problem for silhouette in silhouettes.values())
         problem = ""
         if usable < MIN_VIEWS:
             reasons = "; ".join(f"{name}: {each.problem}" for name, each in silhouettes.items() if each.problem)
             problem = f"a person needs {MIN_VIEWS} usable silhouettes, got {usable} ({reasons})"
-        return MultiViewPerson(*self._joints(views), silhouettes, problem)
+        return MultiViewPerson(*self._triangulate(views), silhouettes, problem)
 
     def carve(self, person: MultiViewPerson) -> Hull:
         """Carve the hull of a person; cameras with an unusable mask are left out."""
@@ -141,20 +151,20 @@ class HullBuilder:
             return Hull(empty, empty, person.problem)
         cameras, masks = [self.cameras[name] for name in person.masks], list(person.masks.values())
         try:
-            bounds = bounds_of_joints(person.joints, self.settings.margin)
+            bounds = bounds_of_joints(person.joints, self.settings.hull.margin)
             if bounds is None:
-                bounds = bounds_of_masks(cameras, masks, self.settings.margin)
-            return Hull(*visual_hull(cameras, masks, bounds, self.settings))
+                bounds = bounds_of_masks(cameras, masks, self.settings.hull.margin)
+            return Hull(*visual_hull(cameras, masks, bounds, self.settings.hull))
         except PuppetError as error:
             return Hull(empty, empty, str(error))
 
-    def _estimator(self, name: str) -> SilhouetteEstimator:
-        return self._estimators.setdefault(name, SilhouetteEstimator(self.settings))
+    def _get_estimator(self, name: str) -> SilhouetteEstimator:
+        return self._estimators.setdefault(name, SilhouetteEstimator(self.settings.silhouette))
 
-    def _joints(self, views: Mapping[str, CameraObservation]) -> tuple[F64, F64]:
+    def _triangulate(self, views: Mapping[str, CameraObservation]) -> tuple[F64, F64]:
         if len(views) < MIN_VIEWS:
             count = max((len(view.joints) for view in views.values()), default=0)
             return np.full((count, 3), np.nan), np.zeros(count)
         pixels = np.stack([view.joints for view in views.values()])
         weights = np.stack([view.confidence for view in views.values()])
-        return triangulate([self.cameras[name] for name in views], pixels, weights, self.settings)
+        return triangulate([self.cameras[name] for name in views], pixels, weights, self.settings.triangulation)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a body's rendered silhouette agrees with the seen one."""
+"""Measures how well a body's rendered silhouettes agree with the observed ones."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import numpy as np
 from numba import njit
 
 from flowing_puppet_ros.arrays import F64, I32, Bools
+from flowing_puppet_ros.body.cloud.correspondence import geman_mcclure
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.distance_transform import signed_distance
-from flowing_puppet_ros.multiview.rim_term import Outline, distances_outside
+from flowing_puppet_ros.multiview.rim_term import Outline, measure_outside
 
 
 def render_mask(camera: Camera, vertices: F64, faces: I32) -> Bools:
-    """The pixels (h,w) of `camera` whose centres the mesh, vertices (V,3) in metres and faces (F,3), covers.
+    """Return the pixels (h, w) of `camera` that a mesh of `vertices` (V, 3) in metres and `faces` (F, 3) covers.
 
-    Faces with a corner that no lens shows are left out.
+    Pixels count by their centres; faces with a corner that the lens cannot show are left out.
     """
     width, height = camera.size
     mask = np.zeros((height, width), np.bool_)
@@ -49,40 +50,40 @@ def _fill(mask, pixels, faces):  # type: ignore[no-untyped-def]  # pragma: no co
 
 
 def silhouette_iou(first: Bools, second: Bools) -> float:
-    """Intersection over union of two masks (h,w), 0 to 1; 0 when both are empty."""
+    """Return the intersection over union of two masks (h, w), 0 to 1; 0 when both are empty."""
     union = np.count_nonzero(first | second)
     return np.count_nonzero(first & second) / union if union else 0.0
 
 
-def outline_gap(drawn: Bools, outline: Outline, depth: float) -> tuple[float, float]:
-    """Mean distance and mean squared distance between the outlines of a rendered mask (h,w) and a seen one, both ways.
+def measure_outline_gap(rendered: Bools, outline: Outline, depth: float) -> tuple[float, float]:
+    """Return the mean distance and the mean squared distance between the outlines of a rendered mask (h, w) and a mask.
 
-    In metres at `depth` metres from the camera. NaN when either outline is nowhere in the image.
+    Over both directions, in metres at `depth` metres from the camera; NaN when either outline is not in the image.
     """
-    signed = signed_distance(drawn.astype(np.uint8))
-    edge = drawn & (signed > -0.7)
+    signed = signed_distance(rendered.astype(np.uint8))
+    edge = rendered & (signed > -0.7)
     edge[0] = edge[-1] = edge[:, 0] = edge[:, -1] = False
     if not edge.any() or not len(outline.points):
         return np.nan, np.nan
     # A pixel on the edge lies half a pixel inside the outline.
-    there = np.abs(outline.distance[edge] + 0.5)
-    column, row = np.clip(np.rint(outline.points).astype(int), 0, np.array(drawn.shape[::-1]) - 1).T
-    back = np.abs(signed[row, column])
+    to_outline = np.abs(outline.distance[edge] + 0.5)
+    column, row = np.clip(np.rint(outline.points).astype(int), 0, np.array(rendered.shape[::-1]) - 1).T
+    to_edge = np.abs(signed[row, column])
     metres = depth / outline.camera.focal
     return (
-        float(there.mean() + back.mean()) / 2 * metres,
-        float((there**2).mean() + (back**2).mean()) / 2 * metres**2,
+        float(to_outline.mean() + to_edge.mean()) / 2 * metres,
+        float((to_outline**2).mean() + (to_edge**2).mean()) / 2 * metres**2,
     )
 
 
-def shares_inside(vertices: F64, outlines: Sequence[Outline], sigma: float) -> F64:
-    """How much of each vertex (V,) lies inside the silhouettes, 0 to 1: the mean over the views that show it.
+def measure_shares_inside(vertices: F64, outlines: Sequence[Outline], sigma: float) -> F64:
+    """Return how far each vertex (V,) lies inside the silhouettes, 0 to 1: the mean over the views that show it.
 
-    Outside it is the Geman-McClure weight of the distance at `sigma` metres; 0 where no view shows the vertex.
+    Outside it is the `geman_mcclure` weight of the distance, of width `sigma` metres; 0 where no view shows the vertex.
     """
     total, views = np.zeros(len(vertices)), np.zeros(len(vertices))
     for outline in outlines:
-        seen, distance, _ = distances_outside(vertices, outline)
-        total[seen] += (sigma**2 / (sigma**2 + np.maximum(distance, 0) ** 2)) ** 2
+        seen, distance, _ = measure_outside(vertices, outline)
+        total[seen] += geman_mcclure(np.maximum(distance, 0) ** 2, sigma**2)
         views[seen] += 1
     return total / np.maximum(views, 1)

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """rclpy nodes: the only package that imports rclpy.
 
-Messages on topics come in and go out; what is between is a component of `stream`. Read `component_node` first, then
+Messages on topics come in and go out; between them works a component of `stream`. Read `component_node` first, then
 `session` and `worker`; `main` has the programs.
 """

@@ -17,7 +17,7 @@ from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
 
 
 class _Cancelled(Exception):
-    """Nobody wants the result any more."""
+    """Raised in a fit whose result is not wanted any more."""
 
 
 class BodyFitterNode(ComponentNode[BodyFitterComponent]):
@@ -32,25 +32,25 @@ class BodyFitterNode(ComponentNode[BodyFitterComponent]):
             FitBody,
             "fit_body",
             _abort,
-            goal_callback=lambda _: GoalResponse.ACCEPT if self._serving() else GoalResponse.REJECT,
-            # The worker executes a goal when its fit is done: a goal that waits or is fitted holds up no callback.
+            goal_callback=lambda _: GoalResponse.ACCEPT if self._active_session() else GoalResponse.REJECT,
+            # The worker executes a goal when its fit is done, so that a waiting goal blocks no callback.
             handle_accepted_callback=self._accept,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
         )
 
     def _close(self) -> None:
-        """Close the action when no goal is fitted any more."""
+        """Close the session first, so that no goal is being fitted when the action is destroyed."""
         super()._close()
         action, self._action = self._action, None
         if action is not None:
             action.destroy()
 
-    def _serving(self) -> Session[BodyFitterComponent] | None:
-        """The session, when it is active."""
+    def _active_session(self) -> Session[BodyFitterComponent] | None:
+        """Return the session if it is active."""
         return self.session if self.session is not None and self.session.active else None
 
     def _accept(self, goal: ServerGoalHandle) -> None:
-        session = self._serving()
+        session = self._active_session()
         if session is None:
             goal.execute(partial(_abort, message=f"the node is {self.state}"))
         else:
@@ -72,7 +72,7 @@ class BodyFitterNode(ComponentNode[BodyFitterComponent]):
             goal.execute(partial(_succeed, bodies=bodies))
 
     def _fit(self, session: Session[BodyFitterComponent], goal: ServerGoalHandle) -> Any:
-        """Return the BodyArray of the goal's cloud and publish feedback; _Cancelled when the fit is to end."""
+        """Return the BodyArray of the goal's cloud and publish feedback; _Cancelled if the fit must end."""
 
         def progress(fraction: float) -> None:
             if goal.is_cancel_requested or not session.active or not self.context.ok():

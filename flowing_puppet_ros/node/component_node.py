@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The managed node around a stream component: lifecycle, parameters, diagnostics, reset, jumps of time."""
+"""The managed node around a stream component: lifecycle, parameters, diagnostics, reset, time jumps."""
 
 from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.srv import ChangeState
@@ -20,28 +20,27 @@ from std_srvs.srv import Trigger
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.node.diagnostics import Diagnostics, NodeStatus
 from flowing_puppet_ros.node.factory import RosMessageFactory
-from flowing_puppet_ros.node.parameters import changed, declare, with_floats
+from flowing_puppet_ros.node.parameters import apply_changes, convert_to_floats, declare
 from flowing_puppet_ros.node.session import Session
 from flowing_puppet_ros.stream.component import Component
-from flowing_puppet_ros.stream.components.registry import COMPONENTS, FIXED, node_settings
+from flowing_puppet_ros.stream.components.registry import COMPONENTS, FIXED_SETTINGS, node_settings
 
-C = TypeVar("C", bound=Component)
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 _UNUSABLE = (PuppetError, ParameterException, NameValidationException, RuntimeError, ValueError)
-"""What components and rclpy raise for parameters, names and policies that cannot be used."""
+"""Errors of components and rclpy for unusable parameters, names and policies."""
 
 
-class ComponentNode[C: Component](LifecycleNode):
+class ComponentNode[C: Component[Any]](LifecycleNode):
     """A managed node: configuring loads the models and compiles what they need, activating opens the inputs.
 
-    With the parameter `autostart` it activates itself when it is made; without, a lifecycle manager does. Parameters
-    may be changed in every state: a running component takes them over, or is made anew where it cannot.
+    With the parameter `autostart` it activates itself at once; otherwise a lifecycle manager does. Parameters may be
+    changed in every state: a running component adopts them or, if it cannot, is replaced by a new one.
     """
 
     session: Session[C] | None = None
 
     def __init__(self, component: str, node_name: str | None = None, **options: Any) -> None:
-        """Declare the parameters and start; InputError in one sentence when that cannot work.
+        """Declare the parameters and start; InputError if that cannot work.
 
         `component` is a name in COMPONENTS, and the node's unless `node_name` is given; `options` are those of
         rclpy.node.Node (namespace, parameter_overrides, ...).
@@ -50,21 +49,21 @@ class ComponentNode[C: Component](LifecycleNode):
         self.problem = ""
         self._component = component
         self._settings = declare(self, COMPONENTS[component].settings_type, COMPONENTS[component].fixed)
-        self._own = declare(self, node_settings(component), FIXED)
+        self._node_settings = declare(self, node_settings(component), FIXED_SETTINGS)
         self._diagnostics = Diagnostics(self.get_fully_qualified_name(), component)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._reported = self._steady.now()
+        self._steady_clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self._last_report = self._steady_clock.now()
         self._publisher = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_timer(1.0, self._report, clock=self._steady)
-        self.create_service(Trigger, "~/reset", self._reset_requested)
+        self.create_timer(1.0, self._report, clock=self._steady_clock)
+        self.create_service(Trigger, "~/reset", self._on_reset_request)
         backward = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         # The handle keeps the callback registered.
-        self._jump_handle = self.get_clock().create_jump_callback(backward, post_callback=self._time_jumped)
-        self.add_pre_set_parameters_callback(self._converted)
+        self._jump_handle = self.get_clock().create_jump_callback(backward, post_callback=self._on_time_jump)
+        self.add_pre_set_parameters_callback(self._convert_parameters)
         self.add_on_set_parameters_callback(self._check)
         self.add_post_set_parameters_callback(self._apply)
         self._answer_every_transition()
-        if self._own.autostart:
+        if self._node_settings.autostart:
             for transition in (self.trigger_configure, self.trigger_activate):
                 if transition() != SUCCESS:
                     raise InputError(self.problem)
@@ -83,7 +82,7 @@ class ComponentNode[C: Component](LifecycleNode):
         return self._attempt(self._activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Close the inputs; the models stay, the people are forgotten."""
+        """Close the inputs; keep the models, forget the people."""
         if self.session is not None:
             self.session.deactivate()
         return SUCCESS
@@ -104,12 +103,12 @@ class ComponentNode[C: Component](LifecycleNode):
         return SUCCESS
 
     def destroy_node(self) -> None:
-        """Let the running task end, then take the node down."""
+        """Let the running task end, then destroy the node."""
         self._close()
         super().destroy_node()
 
     def _attempt(self, step: Callable[[], None]) -> TransitionCallbackReturn:
-        """Take a step of the lifecycle; what is unusable is said in one sentence and undone."""
+        """Run a step of the lifecycle; if it fails, report the problem in one sentence and undo the step."""
         self.problem = ""
         try:
             step()
@@ -117,7 +116,7 @@ class ComponentNode[C: Component](LifecycleNode):
             self._give_up(" ".join(str(error).split()))
             return FAILURE
         except Exception as error:
-            # rclpy would say nothing about it.
+            # rclpy would not report it.
             where = traceback.extract_tb(error.__traceback__)[-1]
             self._give_up(f"{type(error).__name__}: {error} ({where.filename}:{where.lineno})")
             return TransitionCallbackReturn.ERROR
@@ -125,18 +124,18 @@ class ComponentNode[C: Component](LifecycleNode):
 
     def _give_up(self, problem: str) -> None:
         self.problem = problem
-        self._diagnostics.warned(problem)
-        if not self._own.autostart:
+        self._diagnostics.record_problem(problem)
+        if not self._node_settings.autostart:
             self.get_logger().error(f"the node cannot work: {problem}")
         if self.session is not None:
             self.session.deactivate()
 
     def _open(self) -> None:
-        """Make the component out of the settings as they are, and put it to work on the topics."""
+        """Make the component with the current settings and connect it to the topics."""
         kind: Any = COMPONENTS[self._component]
         component: C = kind(self._settings, RosMessageFactory())
         component.warm_up()
-        self.session = Session(self, component, self._own.queue, self._diagnostics)
+        self.session = Session(self, component, self._node_settings.queue, self._diagnostics)
 
     def _activate(self) -> None:
         if self.session is None:
@@ -148,66 +147,66 @@ class ComponentNode[C: Component](LifecycleNode):
         if session is not None:
             session.close()
 
-    def _converted(self, parameters: list[Parameter]) -> list[Parameter]:
-        return with_floats((type(self._settings), type(self._own)), parameters)
+    def _convert_parameters(self, parameters: list[Parameter]) -> list[Parameter]:
+        return convert_to_floats((type(self._settings), type(self._node_settings)), parameters)
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Say whether a change can be made, and make none."""
+        """Return whether a change is possible, without making it."""
         try:
-            changed(self._settings, parameters)
-            changed(self._own, parameters)
+            apply_changes(self._settings, parameters)
+            apply_changes(self._node_settings, parameters)
         except InputError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _apply(self, parameters: list[Parameter]) -> None:
-        """Make a change that was checked."""
-        before, self._settings = self._settings, changed(self._settings, parameters)
-        self._own = changed(self._own, parameters)
+        """Apply a checked change."""
+        before, self._settings = self._settings, apply_changes(self._settings, parameters)
+        self._node_settings = apply_changes(self._node_settings, parameters)
         if self.session is None:
             return
-        self.session.worker.limit = self._own.queue
-        names = {info.name for info in type(before).describe()}
-        different = {name for name in names if getattr(before, name) != getattr(self._settings, name)}
+        self.session.worker.limit = self._node_settings.queue
+        after = self._settings.values()
+        different = {name for name, value in before.values().items() if value != after[name]}
         if not different:
             return
         component, settings = self.session.component, self._settings
         if different <= component.hot_settings:
             self.session.worker.call(lambda: component.reconfigure(settings))
         else:
-            self._renew(", ".join(sorted(different)))
+            self._restart(", ".join(sorted(different)))
 
-    def _renew(self, names: str) -> None:
-        """Put a component with the changed settings in the place of the running one."""
+    def _restart(self, names: str) -> None:
+        """Replace the running component by one with the changed settings."""
         active = self.state == "active"
-        self.get_logger().info(f"{names} changed: the models are loaded and everything starts anew")
+        self.get_logger().info(f"{names} changed: loading the models and restarting")
         self._close()
         if self._attempt(self._open) == SUCCESS and active:
             self._attempt(self._activate)
 
     def _report(self) -> None:
-        now = self._steady.now()
-        seconds, self._reported = (now - self._reported).nanoseconds * 1e-9, now
-        condition = NodeStatus(self.state, self.problem)
+        now = self._steady_clock.now()
+        seconds, self._last_report = (now - self._last_report).nanoseconds * 1e-9, now
+        status = NodeStatus(self.state, self.problem)
         if (session := self.session) is not None:
             publishers = {topic: self.count_publishers(topic) for topic in session.topics}
             counters, dropped = dict(session.component.counters), dict(session.worker.dropped)
-            condition = NodeStatus(self.state, self.problem, counters, dropped, publishers)
-        report = self._diagnostics.report(self.get_clock().now().to_msg(), max(seconds, 1e-3), condition)
+            status = NodeStatus(self.state, self.problem, counters, dropped, publishers)
+        report = self._diagnostics.report(self.get_clock().now().to_msg(), max(seconds, 1e-3), status)
         self._publisher.publish(report)
 
-    def _reset_requested(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_reset_request(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = self.session is not None
-        response.message = "the next message starts anew" if self.session else f"the node is {self.state}"
+        response.message = "the next message starts a new recording" if self.session else f"the node is {self.state}"
         self._reset()
         return response
 
-    def _time_jumped(self, jump: TimeJump) -> None:
-        """Start anew, unless the messages have jumped back before the clock and the component has done so already."""
+    def _on_time_jump(self, jump: TimeJump) -> None:
+        """Restart, unless the messages jumped back before the clock and the component has restarted already."""
         session = self.session
-        if session is None or (session.stamped and not session.behind(self.get_clock().now().nanoseconds)):
+        if session is None or (session.stamped and not session.is_ahead_of(self.get_clock().now().nanoseconds)):
             return
-        self.get_logger().warning("the time jumped back: starting anew")
+        self.get_logger().warning("the time jumped back: restarting")
         self._reset()
 
     def _reset(self) -> None:
@@ -216,7 +215,7 @@ class ComponentNode[C: Component](LifecycleNode):
             self.session.reset()
 
     def _answer_every_transition(self) -> None:
-        """Let a transition that the state does not allow fail: rclpy raises and leaves the caller without an answer."""
+        """Answer transitions that the state does not allow with a failure; rclpy would raise and never answer."""
         service = self._service_change_state
         change = service.callback
 

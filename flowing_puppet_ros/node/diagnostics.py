@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a node says about itself on /diagnostics (REP-107): state, rates, latency, drops, counters, the last error."""
+"""The status of a node on /diagnostics (REP-107): state, rates, latency, drops, counters, the last error."""
 
 from __future__ import annotations
 
@@ -13,16 +13,20 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-SILENCE = 5.0
-"""Seconds without an input after which an active node is stale."""
+MAX_SILENCE_S = 5.0
+"""Seconds without input after which an active node is stale."""
 
 
 @dataclass(frozen=True, slots=True)
 class NodeStatus:
-    """How a node is when it reports.
+    """Status of a node when it reports.
 
-    `state` is that of the lifecycle, `problem` why the node could not be configured, `counters` are the component's,
-    `dropped` the messages dropped so far of each input, `publishers` how many publish on each input topic.
+    Attributes:
+        state: of the lifecycle.
+        problem: why the node could not be configured.
+        counters: of the component.
+        dropped: messages of each input dropped so far.
+        publishers: number of publishers on each input topic.
     """
 
     state: str = "active"
@@ -33,11 +37,14 @@ class NodeStatus:
 
 
 class Diagnostics:
-    """Counts what passes and reports it, the rates and latencies over the time since the last report.
+    """Counts messages and reports them; rates and latencies are those since the last report.
 
-    The level is one that a supervisor can act on. OK: works, or is not active by somebody's will. WARN: it works, but
-    messages are dropped or cannot be used. ERROR: it could not be configured, or the processing of messages failed.
-    STALE: active, but nothing comes in.
+    A supervisor can act on the level:
+
+    - OK: the node works, or is inactive on purpose.
+    - WARN: it works, but messages are dropped or cannot be used.
+    - ERROR: it could not be configured, or the processing of messages failed.
+    - STALE: it is active, but receives nothing.
     """
 
     def __init__(self, node: str, component: str) -> None:
@@ -47,49 +54,49 @@ class Diagnostics:
         self._name = f"{node.lstrip('/').replace('/', '.')}: {component}"
         self._hardware_id = node
         self._lock = threading.Lock()
-        self._passed: Counter[str] = Counter()
+        self._counts: Counter[str] = Counter()
         self._latencies: list[float] = []
         self._dropped = 0
         self._unusable = 0
         self._failures = 0
         self._last_error: tuple[float, str] | None = None
         self._last_input = time.monotonic()
-        self._ever = False
+        self._has_input = False
 
     def reset_silence(self) -> None:
-        """Note that inputs may come from now on."""
-        self._last_input, self._ever, self.people = time.monotonic(), False, None
+        """Restart the time without input: inputs may come from now on."""
+        self._last_input, self._has_input, self.people = time.monotonic(), False, None
 
-    def received(self, topic: str) -> None:
-        """Count a message that came in."""
-        self._last_input, self._ever = time.monotonic(), True
-        self.passed(topic)
+    def count_received(self, topic: str) -> None:
+        """Count a received message."""
+        self._last_input, self._has_input = time.monotonic(), True
+        self.count_message(topic)
 
-    def passed(self, topic: str) -> None:
-        """Count a message that went out."""
+    def count_message(self, topic: str) -> None:
+        """Count a message on `topic`, received or published."""
         with self._lock:
-            self._passed[topic] += 1
+            self._counts[topic] += 1
 
     def record_latency(self, seconds: float) -> None:
-        """Note the age of an input, by its stamp, when its results went out."""
+        """Record the age of an input, by its stamp, when its results were published."""
         with self._lock:
             self._latencies.append(seconds)
 
-    def failed(self, sentence: str) -> None:
+    def record_failure(self, sentence: str) -> None:
         """Count a message whose processing raised an unexpected error."""
         with self._lock:
             self._failures += 1
             self._last_error = time.monotonic(), sentence
 
-    def warned(self, sentence: str) -> None:
-        """Note what was wrong with an input, a parameter or the set-up."""
+    def record_problem(self, sentence: str) -> None:
+        """Record what was wrong with an input, a parameter or the set-up."""
         with self._lock:
             self._last_error = time.monotonic(), sentence
 
     def report(self, stamp: Any, seconds: float, now: NodeStatus) -> Any:
         """Return the DiagnosticArray of the `seconds` since the last report."""
         with self._lock:
-            passed, self._passed = self._passed, Counter(dict.fromkeys(self._passed, 0))
+            passed, self._counts = self._counts, Counter(dict.fromkeys(self._counts, 0))
             latencies, self._latencies = self._latencies, []
             failures, self._failures = self._failures, 0
             error = self._last_error
@@ -102,9 +109,9 @@ class Diagnostics:
         elif now.state != "active":
             level, message = DiagnosticStatus.OK, f"{now.state}: nothing is processed until it is activated"
         elif failures or newly_unusable or newly_dropped:
-            level, message = _trouble(failures, newly_unusable, newly_dropped)
+            level, message = _describe_trouble(failures, newly_unusable, newly_dropped)
         else:
-            level, message = self._quiet(now.publishers)
+            level, message = self._assess_input(now.publishers)
         values = {"state": now.state}
         values |= {f"{topic} (Hz)": f"{count / seconds:.1f}" for topic, count in sorted(passed.items())}
         if latencies:
@@ -123,15 +130,15 @@ class Diagnostics:
         array.header.stamp = stamp
         return array
 
-    def _quiet(self, publishers: Mapping[str, int]) -> tuple[bytes, str]:
+    def _assess_input(self, publishers: Mapping[str, int]) -> tuple[bytes, str]:
         silent = time.monotonic() - self._last_input
-        if silent > SILENCE:
+        if silent > MAX_SILENCE_S:
             who = ", ".join(f"{topic} ({count})" for topic, count in publishers.items())
             return DiagnosticStatus.STALE, f"no message for {silent:.0f} s; topics and their publishers: {who}"
-        return DiagnosticStatus.OK, "running" if self._ever else "waiting for messages"
+        return DiagnosticStatus.OK, "running" if self._has_input else "waiting for messages"
 
 
-def _trouble(failures: int, unusable: int, dropped: int) -> tuple[bytes, str]:
+def _describe_trouble(failures: int, unusable: int, dropped: int) -> tuple[bytes, str]:
     if failures:
         return DiagnosticStatus.ERROR, f"{failures} messages failed; the last error says why"
     if unusable:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Makes rclpy messages; the counterpart of the factory of bag messages in `bag.typestore`."""
+"""Makes rclpy messages; `bag.typestore` makes those of bags."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def message_type(type_name: str) -> Any:
 
 
 class RosMessageFactory:
-    """Makes rclpy messages out of plain values and arrays."""
+    """Makes rclpy messages from plain values and arrays."""
 
     def make(self, type_name: str, **values: Any) -> Any:
         """Make a message of type `package/msg/Name`; fields without a value keep the message's defaults."""
@@ -46,7 +46,7 @@ class RosMessageFactory:
         for name, value in values.items():
             if name not in fields:
                 raise TypeError(f"{type_name} has no field {name!r}")
-            setattr(message, name, _converted(fields[name], value))
+            setattr(message, name, _convert(fields[name], value))
         return message
 
 
@@ -55,10 +55,10 @@ def _field_types(kind: Any) -> dict[str, str]:
     return dict(kind.get_fields_and_field_types())
 
 
-def _converted(field: str, value: Any) -> Any:
-    """Return `value` as the Python type that rclpy wants in a field of type `field`."""
+def _convert(field: str, value: Any) -> Any:
+    """Return `value` as the Python type that rclpy expects in a field of type `field`."""
     if field == "float":
-        # A message that travels loses these digits; without a journey it must not keep them.
+        # Serialisation drops these digits; a message that is not serialised must not keep them.
         return float(np.float32(value))
     if field == "double":
         return float(value)
@@ -68,14 +68,14 @@ def _converted(field: str, value: Any) -> Any:
         return int(value)
     if field.startswith("sequence<"):
         element = field.removeprefix("sequence<").split(",")[0].rstrip(">").strip()
-        return _sequence(_TYPE_CODES[element], value) if element in _TYPE_CODES else list(value)
+        return _to_array(_TYPE_CODES[element], value) if element in _TYPE_CODES else list(value)
     if field.endswith("]") and field.split("[")[0] in _TYPE_CODES:
         code = _TYPE_CODES[field.split("[")[0]]
         return np.ascontiguousarray(value, np.dtype(code)).reshape(-1)
     return value
 
 
-def _sequence(code: str, value: Any) -> array.array[Any]:
+def _to_array(code: str, value: Any) -> array.array[Any]:
     if isinstance(value, array.array) and value.typecode == code:
         return value
     numbers: Array = np.ascontiguousarray(value, np.dtype(code)).reshape(-1)

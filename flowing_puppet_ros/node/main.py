@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The programs that start the nodes: one function each, which runs its node until it is interrupted.
 
-`python -m flowing_puppet_ros.node.main NAME` starts the node NAME where its program is not installed.
+`python -m flowing_puppet_ros.node.main NAME` starts the node NAME if its program is not installed.
 """
 
 from __future__ import annotations
@@ -14,22 +14,22 @@ _COMPONENT_NODE = "flowing_puppet_ros.node.component_node"
 
 
 def optical_flow(arguments: list[str] | None = None) -> int:
-    """Images in, dense forward and backward optical flow out."""
+    """Estimate dense forward and backward optical flow between images."""
     return run("optical_flow", optical_flow.__doc__, _COMPONENT_NODE, arguments)
 
 
 def puppet_tracker(arguments: list[str] | None = None) -> int:
-    """Images and detections in, flowing puppets out."""
+    """Track people in images, with or without detections, as flowing puppets."""
     return run("puppet_tracker", puppet_tracker.__doc__, _COMPONENT_NODE, arguments)
 
 
 def visual_hull(arguments: list[str] | None = None) -> int:
-    """Images, part labels and puppets of calibrated cameras in; silhouettes, joints and visual hull out."""
+    """Carve the visual hull of a person from images, part labels and puppets of calibrated cameras."""
     return run("visual_hull", visual_hull.__doc__, _COMPONENT_NODE, arguments)
 
 
 def body_fitter(arguments: list[str] | None = None) -> int:
-    """Point clouds or silhouettes in, fitted bodies out; the action fit_body fits one cloud on request."""
+    """Fit bodies to point clouds, depth images or silhouettes; the action fit_body fits one cloud on request."""
     return run("body_fitter", body_fitter.__doc__, "flowing_puppet_ros.node.body_fitter_node", arguments)
 
 

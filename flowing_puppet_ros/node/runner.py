@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Starts a node as a program: arguments, one sentence for what cannot work, clean end on an interrupt."""
+"""Runs a node as a program: arguments, one sentence for every error, clean exit on an interrupt."""
 
 from __future__ import annotations
 
@@ -8,17 +8,16 @@ import sys
 from importlib import import_module
 from typing import Any
 
-from threadpoolctl import threadpool_limits
-
 from flowing_puppet_ros.errors import PuppetError
+from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
 
 def run(name: str, description: str | None, module: str, arguments: list[str] | None = None) -> int:
     """Spin the node `name` until it is interrupted; return the exit status.
 
-    `module` is the module of this package whose `make_node(name)` returns the node; it is imported here, so that the
-    absence of ROS is told in a sentence. 0 after an interrupt, 2 when arguments or parameters are unusable or ROS is
-    absent (one sentence on stderr).
+    The status is 0 after an interrupt, and 2 if arguments or parameters are unusable or ROS is missing (one sentence
+    on stderr). `module` is the module of this package whose `make_node(name)` returns the node; it is imported here,
+    so that a missing ROS gives that sentence.
     """
     try:
         import rclpy
@@ -31,7 +30,7 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
         return 2
     given = [name, *(sys.argv[1:] if arguments is None else arguments)]
     try:
-        _parser(name, description).parse_args(remove_ros_args(given)[1:])
+        _make_parser(name, description).parse_args(remove_ros_args(given)[1:])
         rclpy.init(args=given)
         node = make_node(name)
     except (PuppetError, ParameterException, NameValidationException, RuntimeError) as error:
@@ -39,17 +38,17 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         rclpy.try_shutdown()
         return 2
-    # Workers of their own use the cores; threads of BLAS beside them would only stand in each other's way.
-    threadpool_limits(1)
-    _spin(node)
+    # The node's own workers use the cores; threads of BLAS and OpenCV beside them would only slow them down.
+    with one_blas_thread(), one_opencv_thread():
+        _spin(node)
     rclpy.try_shutdown()
     return 0
 
 
-def _parser(name: str, description: str | None) -> argparse.ArgumentParser:
-    from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_settings
+def _make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
+    from flowing_puppet_ros.stream.components.registry import published
 
-    infos = [*COMPONENTS[name].settings_type.describe(), *node_settings(name).describe()]
+    infos = published(name)
     parameters = "\n".join(f"  {info.name} [{info.default}]: {info.description}" for info in infos)
     return argparse.ArgumentParser(
         prog=name,

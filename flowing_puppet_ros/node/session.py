@@ -26,15 +26,15 @@ from flowing_puppet_ros.node.factory import message_type
 from flowing_puppet_ros.node.worker import Worker
 from flowing_puppet_ros.stream.component import Component, Output, Port
 from flowing_puppet_ros.stream.messages.geometry import header_ns
-from flowing_puppet_ros.stream.messages.images import compress
+from flowing_puppet_ros.stream.messages.images import compress_image
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 from flowing_puppet_ros.units import NANOSECONDS
 
-QUIET_SECONDS = 5.0
-"""Shortest time between two log lines about the same trouble."""
-FUTURE_NS = NANOSECONDS
-"""A stamp this much ahead of the node's clock comes from another clock."""
+LOG_INTERVAL_S = 5.0
+"""Minimum seconds between two log lines about failed messages."""
+MAX_STAMP_LEAD_NS = NANOSECONDS
+"""Maximum nanoseconds that a stamp may be ahead of the node's clock; a later one is from another clock."""
 _SUBSCRIPTION_QOS = {
     "sensor": qos_profile_sensor_data,
     "reliable": QoSProfile(depth=10),
@@ -44,16 +44,16 @@ _PUBLISHER_QOS = {
     "reliable": QoSProfile(depth=10),
     "latched": QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
 }
-_PEOPLE = {"puppets": "puppets", "bodies": "bodies"}
-"""Output ports whose messages list the people, and the field that does."""
+_PEOPLE_FIELDS = {"puppets": "puppets", "bodies": "bodies"}
+"""Output ports whose messages list people, and the field that does."""
 
 
-class Session[C: Component]:
+class Session[C: Component[Any]]:
     """Runs one component on live topics.
 
-    Callbacks only put messages in line; the worker thread hands them to the component in order of arrival and
-    publishes what comes out. Whatever a message does, the session goes on. What the worker still computes when the
-    session is deactivated or closed is not published.
+    Callbacks only queue messages; the worker thread passes them to the component in order of arrival and publishes
+    the results. The session survives any message. What the worker still computes when the session is deactivated or
+    closed is not published.
     """
 
     def __init__(self, node: Node, component: C, queue: int, diagnostics: Diagnostics) -> None:
@@ -64,9 +64,9 @@ class Session[C: Component]:
         self._diagnostics = diagnostics
         self._publishing = threading.Lock()
         self._last_stamp: int | None = None
-        self._said: set[str] = set()
+        self._warned: set[str] = set()
         self._subscriptions: list[Subscription] = []
-        topics = {port.name: _resolved(node, port.name) for port in component.inputs}
+        topics = {port.name: _resolve_topic(node, port.name) for port in component.inputs}
         self._optional = {port.name: topics[port.name] for port in component.inputs if port.optional}
         self.topics = [topic for name, topic in topics.items() if name not in self._optional]
         self._lazy = [port for port in component.outputs if port.lazy]
@@ -78,8 +78,8 @@ class Session[C: Component]:
         except Exception:
             self._close_outputs()
             raise
-        component.background = _background()
-        self.worker = Worker(queue, self._failed)
+        component.background = _background_executor()
+        self.worker = Worker(queue, self._on_task_error)
 
     def activate(self) -> None:
         """Open the inputs."""
@@ -88,10 +88,10 @@ class Session[C: Component]:
         for port in self.component.inputs:
             self._subscribe(port, message_type(port.type), port.name)
             if port.transport:
-                self._subscribe(port, message_type(COMPRESSED_IMAGE), self._compressed(port))
+                self._subscribe(port, message_type(COMPRESSED_IMAGE), self._compressed_topic(port))
 
     def deactivate(self) -> None:
-        """Close the inputs and forget what waits; the outputs stay open and silent."""
+        """Close the inputs and drop what waits; the outputs stay open but silent."""
         with self._publishing:
             self.active = False
         for subscription in self._subscriptions:
@@ -103,7 +103,7 @@ class Session[C: Component]:
         """Let the running task end, then close the outputs."""
         self.deactivate()
         self.worker.stop()
-        # The worker takes no more tasks, and what runs in the background must end too.
+        # The worker accepts no more tasks; what runs in the background must end too.
         self.component.reset()
         self._close_outputs()
 
@@ -116,7 +116,7 @@ class Session[C: Component]:
             self._close_output(name)
 
     def reset(self) -> None:
-        """Drop the messages that wait and let the next one start anew."""
+        """Drop the messages that wait; the next one starts a new recording."""
         self.worker.clear()
         self.worker.call(self._reset)
 
@@ -128,11 +128,11 @@ class Session[C: Component]:
 
     @property
     def stamped(self) -> bool:
-        """Whether a message with a stamp has come since the last reset."""
+        """Whether a message with a stamp arrived since the last reset."""
         return self._last_stamp is not None
 
-    def behind(self, now_ns: int) -> bool:
-        """Whether the newest input is stamped later than `now_ns`, so that the time must have jumped back since."""
+    def is_ahead_of(self, now_ns: int) -> bool:
+        """Return whether the newest stamp is clearly later than `now_ns`, so that the time must have jumped back."""
         last = self._last_stamp
         return last is not None and last > now_ns + BACKWARD_JUMP_NS
 
@@ -141,100 +141,104 @@ class Session[C: Component]:
         made = self._node.create_subscription(
             kind,
             topic,
-            partial(self._received, port.name, name),
+            partial(self._on_message, port.name, name),
             copy(_SUBSCRIPTION_QOS[port.qos]),  # an override changes the profile itself
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             event_callbacks=SubscriptionEventCallbacks(
-                incompatible_qos=partial(self._incompatible, name, "subscription"),
-                incompatible_type=partial(self._other_type, name),
-                message_lost=partial(self._lost, port.name, name),
+                incompatible_qos=partial(self._on_incompatible_qos, name, "subscription"),
+                incompatible_type=partial(self._on_incompatible_type, name),
+                message_lost=partial(self._on_message_lost, port.name, name),
             ),
         )
         self._subscriptions.append(made)
 
     def _open_output(self, port: Port, person: bool = False) -> list[tuple[Publisher, Callable[[Any], Any]]]:
-        """Return the publishers of a port, each with what makes its message out of the component's."""
+        """Return the publishers of a port, each with the conversion from the component's message to its own."""
         made: list[tuple[Publisher, Callable[[Any], Any]]]
-        made = [(self._publisher(message_type(port.type), port.name, port.qos, person), _same)]
+        made = [(self._create_publisher(message_type(port.type), port.name, port.qos, person), _identity)]
         if port.transport:
-            compressed = self._publisher(message_type(COMPRESSED_IMAGE), self._compressed(port), port.qos, person)
-            made.append((compressed, partial(compress, self.component.factory)))
+            compressed = self._create_publisher(
+                message_type(COMPRESSED_IMAGE), self._compressed_topic(port), port.qos, person
+            )
+            made.append((compressed, partial(compress_image, self.component.factory)))
         return made
 
-    def _compressed(self, port: Port) -> str:
-        """Return the topic of a port's compressed images: it follows the port when that is remapped."""
+    def _compressed_topic(self, port: Port) -> str:
+        """Return the topic of a port's compressed images, which follows the port when that is remapped."""
         return f"{self._node.resolve_topic_name(port.name)}/{port.transport}"
 
-    def _publisher(self, kind: Any, topic: str, qos: str, person: bool) -> Publisher:
+    def _create_publisher(self, kind: Any, topic: str, qos: str, person: bool) -> Publisher:
         name = self._node.resolve_topic_name(topic)
-        # Overriding options are parameters; for every person who ever came they would be without end.
+        # Overriding options are parameters; one set per person would accumulate without end.
         options = None if person else QoSOverridingOptions.with_default_policies()
-        events = PublisherEventCallbacks(incompatible_qos=partial(self._incompatible, name, "publisher"))
+        events = PublisherEventCallbacks(incompatible_qos=partial(self._on_incompatible_qos, name, "publisher"))
         return self._node.create_publisher(
             kind, topic, copy(_PUBLISHER_QOS[qos]), qos_overriding_options=options, event_callbacks=events
         )
 
-    def _incompatible(self, topic: str, side: str, event: Any) -> None:
+    def _on_incompatible_qos(self, topic: str, side: str, event: Any) -> None:
         policy = qos_policy_name_from_kind(event.last_policy_kind).lower()
         other = "publisher offers" if side == "subscription" else "subscriber wants"
         cure = f"set qos_overrides.{topic}.{side}.{policy} of this node, or the {policy} of the other, to fit"
-        self._complain(f"{topic}: a {other} another {policy}, so nothing passes between the two; {cure}")
+        self._warn(f"{topic}: a {other} another {policy}, so they do not connect; {cure}")
 
-    def _other_type(self, topic: str, _: Any) -> None:
-        self._complain(f"{topic}: somebody uses another message type; remap that topic or this node's")
+    def _on_incompatible_type(self, topic: str, _: Any) -> None:
+        self._warn(f"{topic}: another node uses another message type; remap its topic or this node's")
 
-    def _lost(self, port: str, topic: str, event: Any) -> None:
-        """Count what the middleware lost on the way; the first time say what helps."""
+    def _on_message_lost(self, port: str, topic: str, event: Any) -> None:
+        """Count the messages that the middleware lost; warn once, with the remedy."""
         self.component.counters[f"lost {port}"] = event.total_count
-        self._complain_once(
-            f"{topic}: messages are lost on the way; large ones need qos_overrides.{topic}.subscription.reliability "
+        self._warn_once(
+            f"{topic}: messages are lost in transport; large ones need qos_overrides.{topic}.subscription.reliability "
             "reliable (and a reliable publisher), or compressed images"
         )
 
-    def _complain(self, sentence: str) -> None:
-        self._diagnostics.warned(sentence)
+    def _warn(self, sentence: str) -> None:
+        self._diagnostics.record_problem(sentence)
         self._node.get_logger().warning(sentence)
 
-    def _complain_once(self, sentence: str) -> None:
-        if sentence not in self._said:
-            self._said.add(sentence)
-            self._complain(sentence)
+    def _warn_once(self, sentence: str) -> None:
+        if sentence not in self._warned:
+            self._warned.add(sentence)
+            self._warn(sentence)
 
-    def _received(self, port: str, topic: str, message: Any) -> None:
-        self._diagnostics.received(port)
+    def _on_message(self, port: str, topic: str, message: Any) -> None:
+        self._diagnostics.count_received(port)
         self.worker.put(port, partial(self._handle, port, topic, message))
 
     def _handle(self, port: str, topic: str, message: Any) -> None:
-        """Hand one message to the component and publish what comes out (on the worker thread)."""
+        """Pass one message to the component and publish the results (on the worker thread)."""
         if not self.active:
             return
         for name, optional in self._optional.items():
             self.component.set_expected(name, self._node.count_publishers(optional) > 0)
         for lazy in self._lazy:
-            listened = any(publisher.get_subscription_count() for publisher, _ in self._outputs.get(lazy.name, []))
-            self.component.set_subscribed(lazy.name, listened)
+            subscribed = any(publisher.get_subscription_count() for publisher, _ in self._outputs.get(lazy.name, []))
+            self.component.set_subscribed(lazy.name, subscribed)
         if hasattr(message, "header"):
-            self._look_at_stamp(topic, header_ns(message.header))
+            self._check_stamp(topic, header_ns(message.header))
         self.publish(self.component.handle(port, message))
-        for warning in self.component.drain_warnings():
-            self._complain(f"{topic}: {warning}")
+        for warning in self.component.report.drain_warnings():
+            self._warn(f"{topic}: {warning}")
 
-    def _look_at_stamp(self, topic: str, stamp: int) -> None:
+    def _check_stamp(self, topic: str, stamp: int) -> None:
         self._last_stamp = stamp
         now = self._node.get_clock().now().nanoseconds
         if stamp == 0:
             self.component.counters["stamps of zero"] += 1
-            self._complain_once(f"{topic} has stamps of zero: results carry them, latency means nothing; set the stamp")
-        elif stamp > now + FUTURE_NS:
+            self._warn_once(
+                f"{topic} has stamps of zero: results have them too, and latency means nothing; set the stamp"
+            )
+        elif stamp > now + MAX_STAMP_LEAD_NS:
             self.component.counters["stamps from the future"] += 1
-            self._complain_once(
-                f"{topic} has stamps from the future; set use_sim_time when a bag is played, or synchronise the clocks"
+            self._warn_once(
+                f"{topic} has stamps from the future; set use_sim_time if a bag is played, or synchronise the clocks"
             )
 
     def publish(self, outputs: Output) -> None:
-        """Publish what the component made, unless the session has ended meanwhile."""
+        """Publish the component's results unless the session has ended meanwhile."""
         for name, message in outputs:
-            port = self.component.output(name)
+            port = self.component.find_output(name)
             with self._publishing:
                 if not self.active:
                     return
@@ -244,42 +248,42 @@ class Session[C: Component]:
                 if name not in self._outputs:
                     self._outputs[name] = self._open_output(replace(port, name=name), person=True)
                 publishers = self._outputs[name]
-                for publisher, converted in publishers:
+                for publisher, convert in publishers:
                     if len(publishers) == 1 or publisher.get_subscription_count():
-                        publisher.publish(converted(message))
-            self._count(port, message)
+                        publisher.publish(convert(message))
+            self._record_published(port, message)
 
-    def _count(self, port: Port, message: Any) -> None:
-        self._diagnostics.passed(port.name)
-        if port.name in _PEOPLE:
-            self._diagnostics.people = len(getattr(message, _PEOPLE[port.name]))
+    def _record_published(self, port: Port, message: Any) -> None:
+        self._diagnostics.count_message(port.name)
+        if port.name in _PEOPLE_FIELDS:
+            self._diagnostics.people = len(getattr(message, _PEOPLE_FIELDS[port.name]))
         if hasattr(message, "header"):
             age = self._node.get_clock().now().nanoseconds - header_ns(message.header)
             self._diagnostics.record_latency(age * 1e-9)
 
-    def _failed(self, error: Exception) -> None:
+    def _on_task_error(self, error: Exception) -> None:
         if not self.active or not self._node.context.ok():
             return
         where = traceback.extract_tb(error.__traceback__)[-1]
         reason = " ".join(str(error).split())
         text = f"a message failed: {type(error).__name__}: {reason} ({where.filename}:{where.lineno})"
-        self._diagnostics.failed(text)
-        self._node.get_logger().error(text, throttle_duration_sec=QUIET_SECONDS)
+        self._diagnostics.record_failure(text)
+        self._node.get_logger().error(text, throttle_duration_sec=LOG_INTERVAL_S)
 
 
-def _resolved(node: Node, topic: str) -> str:
-    """Return the topic's full name after remapping; InputError that names it when it is none."""
+def _resolve_topic(node: Node, topic: str) -> str:
+    """Return the topic's full name after remapping; InputError if the name is not valid."""
     try:
         return str(node.resolve_topic_name(topic))
     except (RuntimeError, ValueError, NameValidationException) as error:
-        raise InputError(f"{topic!r} is no name for a topic: {' '.join(str(error).split())}") from error
+        raise InputError(f"{topic!r} is not a topic name: {' '.join(str(error).split())}") from error
 
 
 @cache
-def _background() -> ThreadPoolExecutor:
-    """Two threads for the slow work of all components of this process, a long one and a short one."""
+def _background_executor() -> ThreadPoolExecutor:
+    """Return the two threads for the slow work of all components of this process, one long and one short task."""
     return ThreadPoolExecutor(2, thread_name_prefix="background")
 
 
-def _same(message: Any) -> Any:
+def _identity(message: Any) -> Any:
     return message

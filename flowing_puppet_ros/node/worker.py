@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One thread that does the work of a node in order of arrival, while the node goes on receiving.
+"""One thread that does the work of a node in order of arrival, while the node continues to receive.
 
-Messages wait in bounded lines, one an input: when a line is full its oldest message is dropped for the newest, so a
-node that cannot keep up stays near the present instead of falling behind, and a flood on one input drops nothing of
-another.
+Messages wait in bounded queues, one per input. A full queue drops its oldest message for the newest, so a node that
+cannot keep up stays near the present instead of falling behind, and a flood on one input drops nothing of another.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ Task = Callable[[], None]
 
 
 class Worker:
-    """Runs tasks one after the other on its own thread; `limit` is the length of each line and may be changed."""
+    """Runs tasks one after the other on its own thread; `limit` is the maximum length of each queue and may change."""
 
     def __init__(self, limit: int, on_error: Callable[[Exception], None]) -> None:
-        """Start the thread; `on_error` takes what a task raised."""
+        """Start the thread; `on_error` is called with what a task raises."""
         self.dropped: Counter[str] = Counter()
         self.limit = limit
         self._on_error = on_error
@@ -29,14 +28,14 @@ class Worker:
         self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
         self._thread.start()
 
-    def put(self, line: str, task: Task) -> None:
-        """Append a task to a bounded line, dropping the line's oldest waiting tasks when it is full."""
+    def put(self, queue: str, task: Task) -> None:
+        """Append a task to a bounded queue; drop the queue's oldest tasks if it is full."""
         with self._changed:
-            waiting = [index for index, (name, _) in enumerate(self._tasks) if name == line]
+            waiting = [index for index, (name, _) in enumerate(self._tasks) if name == queue]
             for index in reversed(waiting[: max(0, len(waiting) + 1 - self.limit)]):
                 del self._tasks[index]
-                self.dropped[line] += 1
-            self._tasks.append((line, task))
+                self.dropped[queue] += 1
+            self._tasks.append((queue, task))
             self._changed.notify()
 
     def call(self, task: Task) -> None:
@@ -46,12 +45,12 @@ class Worker:
             self._changed.notify()
 
     def clear(self) -> None:
-        """Forget the messages that wait; tasks given to `call` stay."""
+        """Drop the messages that wait; keep the tasks given to `call`."""
         with self._changed:
             self._tasks = deque(item for item in self._tasks if item[0] is None)
 
     def stop(self, timeout: float = 1.0) -> None:
-        """Drop the tasks that wait and end the thread; a task that runs has `timeout` seconds to finish."""
+        """Drop the waiting tasks and end the thread; a running task has `timeout` seconds to finish."""
         with self._changed:
             self._stopping = True
             self._changed.notify()

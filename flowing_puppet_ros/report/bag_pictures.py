@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report's pictures: tracked puppets, optical and puppet flow, fitted meshes, all small enough for one page."""
+"""The report's pictures: tracked puppets, optical and puppet flow, fitted meshes, small enough for one page."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 
 from flowing_puppet_ros.bag.reader import Bag
-from flowing_puppet_ros.draw.flow_colour import flow_legend, flow_scale, flow_to_rgb
-from flowing_puppet_ros.draw.mesh_render import Canvas, orthographic
+from flowing_puppet_ros.draw.flow_colour import draw_flow_legend, flow_scale, flow_to_rgb
+from flowing_puppet_ros.draw.mesh_render import Canvas, fit_orthographic_camera
 from flowing_puppet_ros.draw.overlay import DrawnPuppet, draw_puppets
 from flowing_puppet_ros.draw.palette import part_colours
-from flowing_puppet_ros.draw.pictures import shrink, to_height
+from flowing_puppet_ros.draw.pictures import scale_to_height, shrink
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.evaluate.bag.recording import CameraRecord, body_joints, puppet_joints
 from flowing_puppet_ros.flow.estimate import OpticalFlow
-from flowing_puppet_ros.flow.puppet_flow import explained_fraction, motion_field, part_motions
+from flowing_puppet_ros.flow.puppet_flow import explained_fraction, fit_part_motions, motion_field
 from flowing_puppet_ros.model.ds.render import render_labels
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.model.tree import DS14_PARENTS
@@ -30,15 +30,15 @@ from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image
 
-STRIP_HEIGHT, FLOW_HEIGHT, VIEW_HEIGHT = 560, 400, 400
-BODY_SIZE = (360, 520)
-VIEW_ASPECT = 0.75
+STRIP_HEIGHT, FLOW_HEIGHT, VIEW_HEIGHT = 560, 400, 400  # px of track, flow and body pictures
+BODY_SIZE = (360, 520)  # px, width and height of a body alone
+VIEW_ASPECT = 0.75  # width by height of a body over an image
 POINT_COLOUR = (20, 90, 200)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlowShot:
-    """One frame's motion to the next frame: three pictures of one size, and figures."""
+    """One frame's motion to the next frame: three pictures of the same size, and figures."""
 
     stamp: int
     image: np.ndarray
@@ -50,7 +50,7 @@ class FlowShot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyShot:
-    """One stamp's body from the front and from its left, and over the cameras' images [(camera name, picture)]."""
+    """One body from the front and from its left, and over the cameras' images [(camera name, picture)]."""
 
     stamp: int
     front: np.ndarray
@@ -58,13 +58,13 @@ class BodyShot:
     views: list[tuple[str, np.ndarray]]
 
 
-def fetch(bag: Bag, wanted: Mapping[str, Iterable[int]]) -> dict[tuple[str, int], Any]:
-    """Messages {(topic, stamp)} of the wanted stamps (ns) of each topic; missing and damaged ones are left out."""
-    return dict(each(bag, wanted))
+def fetch_messages(bag: Bag, wanted: Mapping[str, Iterable[int]]) -> dict[tuple[str, int], Any]:
+    """Return {(topic, stamp): message} for the wanted stamps (ns) of each topic, without missing and damaged ones."""
+    return dict(read_messages(bag, wanted))
 
 
-def each(bag: Bag, wanted: Mapping[str, Iterable[int]]) -> Iterator[tuple[tuple[str, int], Any]]:
-    """Yield ((topic, stamp), message) as `fetch` does, one after the other, so that many images need little memory."""
+def read_messages(bag: Bag, wanted: Mapping[str, Iterable[int]]) -> Iterator[tuple[tuple[str, int], Any]]:
+    """Yield ((topic, stamp), message) of `fetch_messages` one by one, so that many images need little memory."""
     stamps = {topic: set(values) for topic, values in wanted.items() if topic}
     for record in bag.messages([topic for topic in stamps if topic in bag.topics]):
         with suppress(InputError):
@@ -73,23 +73,23 @@ def each(bag: Bag, wanted: Mapping[str, Iterable[int]]) -> Iterator[tuple[tuple[
                 yield (record.topic, stamp_ns(message)), message
 
 
-def spread_over(stamps: Sequence[int], count: int) -> list[int]:
-    """At most `count` of the sorted stamps, spread evenly, the first and the last among them."""
+def pick_evenly(stamps: Sequence[int], count: int) -> list[int]:
+    """Return at most `count` of the stamps, sorted and evenly spread, with the first and the last."""
     ordered = sorted(stamps)
     if len(ordered) <= count:
         return ordered
     return [ordered[round(k * (len(ordered) - 1) / max(count - 1, 1))] for k in range(count)]
 
 
-def moving_stamps(camera: CameraRecord, count: int) -> list[int]:
-    """The stamp with the fastest puppet in each of `count` equal spans of the recording; each has a successor."""
+def find_moving_stamps(camera: CameraRecord, count: int) -> list[int]:
+    """Return the stamp with the fastest puppet in each of `count` equal spans of the recording, never the last one."""
     stamps = sorted(camera.puppets)
     speed: dict[int, float] = {}
     for stamp, following in pairwise(stamps):
         if camera.puppets[stamp] and camera.puppets[following]:
-            now, then = (puppet_joints(camera.puppets[s][0]) for s in (stamp, following))
-            common = [name for name in now if name in then]
-            speed[stamp] = sum(float(np.linalg.norm(then[name] - now[name])) for name in common)
+            now, later = (puppet_joints(camera.puppets[s][0]) for s in (stamp, following))
+            common = [name for name in now if name in later]
+            speed[stamp] = sum(float(np.linalg.norm(later[name] - now[name])) for name in common)
     chosen = []
     for span in np.array_split(np.array(sorted(speed), np.int64), count):
         if span.size:
@@ -98,8 +98,8 @@ def moving_stamps(camera: CameraRecord, count: int) -> list[int]:
 
 
 @dataclass(frozen=True, slots=True)
-class Box:
-    """A part of an image: columns left to right and rows top to bottom, the last ones excluded."""
+class ImageBox:
+    """A part of an image: columns left to right and rows top to bottom, the last ones exclusive."""
 
     left: int
     top: int
@@ -107,10 +107,11 @@ class Box:
     bottom: int
 
     @classmethod
-    def around(cls, points: np.ndarray, shape: tuple[int, ...], margin: float, aspect: float = 0.0) -> Box:
-        """The box of the finite points (N,2), wider by `margin` times its longer side, inside an image (H,W,...).
+    def around(cls, points: np.ndarray, shape: tuple[int, ...], margin: float, aspect: float = 0.0) -> ImageBox:
+        """Return the box of the finite `points` (N, 2) within an image (H, W, ...).
 
-        A positive `aspect` is the width by the height that the box is grown to, as far as the image has room.
+        It is enlarged by `margin` times its longer side on each side and, with a positive `aspect`, to that ratio of
+        width to height, as far as the image has room.
         """
         points = points[np.isfinite(points).all(axis=1)]
         room = np.array(shape[1::-1], float)
@@ -124,56 +125,58 @@ class Box:
         left, top = (int(value) for value in np.clip(np.floor((low + high - size) / 2), 0, room - size))
         return cls(left, top, left + int(size[0]), top + int(size[1]))
 
-    def scaled(self, factor: float) -> Box:
-        """The same part of the image resized by `factor`."""
+    def scale(self, factor: float) -> ImageBox:
+        """Return the box in the image resized by `factor`."""
         left, top = int(self.left * factor), int(self.top * factor)
         right, bottom = (max(low + 1, round(high * factor)) for low, high in ((left, self.right), (top, self.bottom)))
-        return Box(left, top, right, bottom)
+        return ImageBox(left, top, right, bottom)
 
-    def cut(self, image: np.ndarray) -> np.ndarray:
-        """That part of an image, a view."""
+    def crop(self, image: np.ndarray) -> np.ndarray:
+        """Return this part of an image, a view."""
         return image[self.top : self.bottom, self.left : self.right]
 
 
-def people_box(people: Iterable[Sequence[Any]], shape: tuple[int, ...], margin: float = 0.14) -> Box:
-    """The part of an image (H,W,...) in which the nearest person of the given frames is."""
+def find_people_box(people: Iterable[Sequence[Any]], shape: tuple[int, ...], margin: float = 0.14) -> ImageBox:
+    """Return the part of an image (H, W, ...) that has the nearest person of the given frames."""
     joints = [point for persons in people if persons for point in puppet_joints(persons[0]).values()]
-    return Box.around(np.array(joints, float).reshape(-1, 2), shape, margin)
+    return ImageBox.around(np.array(joints, float).reshape(-1, 2), shape, margin)
 
 
-def track_shot(image: np.ndarray, people: Sequence[Any], box: Box) -> np.ndarray:
-    """The part `box` of an image with its puppets drawn over it, the first with labels; 560 rows."""
-    part = box.cut(image)
-    small = to_height(part, STRIP_HEIGHT)
+def draw_track(image: np.ndarray, people: Sequence[Any], box: ImageBox) -> np.ndarray:
+    """Draw the puppets over the part `box` of an image, the first one with labels; STRIP_HEIGHT rows."""
+    part = box.crop(image)
+    small = scale_to_height(part, STRIP_HEIGHT)
     factor = small.shape[0] / part.shape[0]
-    drawn = [DrawnPuppet.from_message(person).placed(factor, (box.left, box.top)) for person in people]
+    drawn = [DrawnPuppet.from_message(person).transform(factor, (box.left, box.top)) for person in people]
     return draw_puppets(draw_puppets(small, drawn[:0:-1], labels=False), drawn[:1])
 
 
-def flow_shot(stamp: int, image: np.ndarray, following: np.ndarray, people: Sequence[Any], box: Box) -> FlowShot:
-    """Dense flow to the following image, and the puppet flow fitted to it under the puppets of `image`.
+def draw_flow_shot(
+    stamp: int, image: np.ndarray, following: np.ndarray, people: Sequence[Any], box: ImageBox
+) -> FlowShot:
+    """Draw the dense flow to the following image, and the puppet flow fitted to it under the puppets of `image`.
 
     The flow is that of the whole image; the pictures show the part `box`.
     """
-    forward, backward = OpticalFlow().at_working_scale(image, following)
+    forward, backward = OpticalFlow().estimate_at_working_scale(image, following)
     height, width = forward.shape[:2]
     factor = height / image.shape[0]
-    drawn = [DrawnPuppet.from_message(person).placed(factor) for person in reversed(people)]
-    labels, parents = paint_forest([person for person in drawn if person.contours], (height, width))
-    motions, background = part_motions(labels, parents, forward, backward)
+    drawn = [DrawnPuppet.from_message(person).transform(factor) for person in reversed(people)]
+    labels, parents = render_people_labels([person for person in drawn if person.contours], (height, width))
+    motions, background = fit_part_motions(labels, parents, forward, backward)
     field = motion_field(labels, motions.affine, background)
     scale = flow_scale(forward[labels > 0][None] if (labels > 0).any() else forward)
     small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     outlined = draw_puppets(small, drawn, opacity=0.25, labels=False)
-    whole = (outlined, flow_to_rgb(forward, scale), flow_to_rgb(field, scale))
-    seen, dense, puppet = (to_height(box.scaled(factor).cut(p), FLOW_HEIGHT) for p in whole)
+    pictures = (outlined, flow_to_rgb(forward, scale), flow_to_rgb(field, scale))
+    overlay, dense, puppet = (scale_to_height(box.scale(factor).crop(p), FLOW_HEIGHT) for p in pictures)
     size = min(dense.shape[:2]) // 5
-    dense[-size:, -size:] = flow_legend(size)
-    return FlowShot(stamp, seen, dense, puppet, explained_fraction(labels, field, forward), scale)
+    dense[-size:, -size:] = draw_flow_legend(size)
+    return FlowShot(stamp, overlay, dense, puppet, explained_fraction(labels, field, forward), scale)
 
 
-def paint_forest(people: Sequence[DrawnPuppet], shape: tuple[int, int]) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Labels (H,W) uint16 of all people's parts, running part index + 1, and the parents of the running indices."""
+def render_people_labels(people: Sequence[DrawnPuppet], shape: tuple[int, int]) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Return labels (H, W) uint16 of all people's parts, running index + 1, and the parent of each running index."""
     labels = np.zeros(shape, np.uint16)
     parents: list[int] = []
     for person in people:
@@ -188,34 +191,34 @@ def paint_forest(people: Sequence[DrawnPuppet], shape: tuple[int, int]) -> tuple
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyMesh:
-    """A fitted mesh with a colour per vertex, and what it was fitted to."""
+    """A fitted mesh with a colour per vertex, and the points it was fitted to."""
 
-    vertices: np.ndarray  # (V,3) metres, z up
-    faces: np.ndarray  # (F,3)
-    colours: np.ndarray  # (V,3)
-    points: np.ndarray  # (N,3), may be empty
+    vertices: np.ndarray  # (V, 3) metres, z up
+    faces: np.ndarray  # (F, 3)
+    colours: np.ndarray  # (V, 3)
+    points: np.ndarray  # (N, 3), may be empty
 
 
-def body_meshes(bodies: Sequence[Any], vertices: Any, triangles: np.ndarray, cloud: Any | None) -> list[BodyMesh]:
-    """The meshes of a stamp's bodies from its messages: the cloud of all their vertices, and what they were fitted to.
+def read_body_meshes(bodies: Sequence[Any], vertices: Any, triangles: np.ndarray, cloud: Any | None) -> list[BodyMesh]:
+    """Return the meshes of `bodies` from the clouds of all their `vertices` and of the points they were fitted to.
 
-    Empty when the cloud of the vertices is missing or is not one body after the other.
+    Empty if the cloud of vertices is missing or too small for all bodies, one after the other.
     """
     if vertices is None or not len(triangles) or not bodies:
         return []
     count = int(triangles.max()) + 1
-    places = decode_cloud(vertices)[0]
-    if len(places) < count * len(bodies):
+    positions = decode_cloud(vertices)[0]
+    if len(positions) < count * len(bodies):
         return []
     points = decode_cloud(cloud)[0] if cloud is not None else np.zeros((0, 3))
     return [
-        BodyMesh(places[count * k : count * (k + 1)], triangles, _colours(body, count), points)
+        BodyMesh(positions[count * k : count * (k + 1)], triangles, _vertex_colours(body, count), points)
         for k, body in enumerate(bodies)
     ]
 
 
-def _colours(body: Any, count: int) -> np.ndarray:
-    """Colours (V, 3) of the parts; a body of a model that is not installed here is grey."""
+def _vertex_colours(body: Any, count: int) -> np.ndarray:
+    """Return colours (V, 3) by part; grey for a model that is not installed here."""
     with suppress(PuppetError):
         model = StitchedPuppet.load(body.model)
         if len(model.part_of_vertex) == count:
@@ -223,32 +226,32 @@ def _colours(body: Any, count: int) -> np.ndarray:
     return np.full((count, 3), 205.0)
 
 
-def body_shot(stamp: int, body: Any, mesh: BodyMesh, images: Sequence[tuple[str, Camera, np.ndarray]]) -> BodyShot:
+def draw_body_shot(stamp: int, body: Any, mesh: BodyMesh, images: Sequence[tuple[str, Camera, np.ndarray]]) -> BodyShot:
     """Draw a body from two sides and over (camera name, camera, image)."""
-    forward, left, up = facing(body_joints(body))
-    front, side = (_from_side(mesh, -direction, up) for direction in (forward, left))
+    forward, left, up = body_axes(body_joints(body))
+    front, side = (_render_side(mesh, -direction, up) for direction in (forward, left))
     views = []
     for name, camera, image in images:
-        box = Box.around(camera.project(mesh.vertices)[0], image.shape, 0.08, VIEW_ASPECT)
-        small = shrink(box.cut(image), VIEW_HEIGHT)
+        box = ImageBox.around(camera.project(mesh.vertices)[0], image.shape, 0.08, VIEW_ASPECT)
+        small = shrink(box.crop(image), VIEW_HEIGHT)
         size = (small.shape[1], small.shape[0])
-        canvas = Canvas(_cropped(camera, box).resized(size), size)
-        canvas.mesh(mesh.vertices, mesh.faces, mesh.colours)
-        views.append((name, canvas.picture(small, opacity=0.7).rgb))
+        canvas = Canvas(_crop_camera(camera, box).resize(size), size)
+        canvas.draw_mesh(mesh.vertices, mesh.faces, mesh.colours)
+        views.append((name, canvas.compose(small, opacity=0.7).rgb))
     return BodyShot(stamp, front, side, views)
 
 
-def _cropped(camera: Camera, box: Box) -> Camera:
+def _crop_camera(camera: Camera, box: ImageBox) -> Camera:
     matrix = camera.matrix.copy()
     matrix[:2, 2] -= (box.left, box.top)
     return replace(camera, matrix=matrix, size=(box.right - box.left, box.bottom - box.top))
 
 
-def facing(joints: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unit vectors to the person's front and left and upwards, from shoulders and hips; x, y and z when unknown.
+def body_axes(joints: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return unit vectors to the person's front, left and up from shoulders and hips; x, y and z when unknown.
 
-    Up is z, unless the trunk is nearer to lying in a z-up frame: then the axis nearest to the trunk, as in clouds in
-    the frame of an optical sensor (y down).
+    Up is z if the trunk is clearly upright in a z-up frame, otherwise the axis nearest to the trunk, as for clouds in
+    an optical frame (y down).
     """
     x, y, z = np.eye(3)
     sides = {f"{side}_{joint}" for side in ("left", "right") for joint in ("shoulder", "hip")}
@@ -266,19 +269,19 @@ def facing(joints: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np
     return np.cross(left / length, up), left / length, up
 
 
-def _from_side(mesh: BodyMesh, looking: np.ndarray, up: np.ndarray) -> np.ndarray:
-    across = np.cross(looking, up)
+def _render_side(mesh: BodyMesh, direction: np.ndarray, up: np.ndarray) -> np.ndarray:
+    across = np.cross(direction, up)
     height = float(np.ptp(mesh.vertices @ up))
-    reach = max(float(np.ptp(mesh.vertices @ direction)) for direction in (across, looking))
-    scale = 0.88 * min(BODY_SIZE[1] / max(height, 1e-3), BODY_SIZE[0] / max(reach, 1e-3))
-    canvas = Canvas(orthographic(mesh.vertices, looking, BODY_SIZE, up, scale=scale), BODY_SIZE)
-    canvas.mesh(mesh.vertices, mesh.faces, mesh.colours)
+    extent = max(float(np.ptp(mesh.vertices @ axis)) for axis in (across, direction))
+    scale = 0.88 * min(BODY_SIZE[1] / max(height, 1e-3), BODY_SIZE[0] / max(extent, 1e-3))
+    canvas = Canvas(fit_orthographic_camera(mesh.vertices, direction, BODY_SIZE, up, scale=scale), BODY_SIZE)
+    canvas.draw_mesh(mesh.vertices, mesh.faces, mesh.colours)
     if len(mesh.points):
-        canvas.points(mesh.points, POINT_COLOUR, radius=0.9)
-    return canvas.picture((250, 250, 250)).rgb
+        canvas.draw_points(mesh.points, POINT_COLOUR, radius=0.9)
+    return canvas.compose((250, 250, 250)).rgb
 
 
-def picture_of(messages: Mapping[tuple[str, int], Any], topic: str, stamp: int) -> np.ndarray | None:
-    """The RGB image of a fetched message, None when it is not there."""
+def decode_picture(messages: Mapping[tuple[str, int], Any], topic: str, stamp: int) -> np.ndarray | None:
+    """Return the RGB image of a fetched message, None if it is missing."""
     message = messages.get((topic, stamp))
     return None if message is None else decode_image(message)

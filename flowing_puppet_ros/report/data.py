@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a report shows, gathered from the two bags of a replay: figures, series over time, and pictures."""
+"""The data of a report, gathered from the two bags of a replay: figures, series over time, and pictures."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.bag.reader import Bag, open_bag
-from flowing_puppet_ros.bag.replay import NOTE
+from flowing_puppet_ros.bag.replay import METADATA_NAME
 from flowing_puppet_ros.draw.pictures import shrink
 from flowing_puppet_ros.draw.plots import Series
 from flowing_puppet_ros.errors import InputError
@@ -21,43 +21,44 @@ from flowing_puppet_ros.evaluate.bag.recording import (
     CameraRecord,
     Joints,
     Recording,
-    as_cloud,
     body_joints,
-    first_bodies,
     frontality,
+    match_track_to_detections,
     read_recording,
-    sensed_clouds,
-    track_and_detections,
-    triangulated,
+    select_first_bodies,
+    sensor_cloud_topics,
+    to_cloud,
+    triangulate_detections,
 )
 from flowing_puppet_ros.evaluate.joints import (
     ARM_JOINTS,
     LEG_JOINTS,
     JointErrors,
-    id_switches,
-    joint_errors,
-    swapped_share,
+    count_id_switches,
+    count_swapped,
+    measure_joint_errors,
 )
 from flowing_puppet_ros.report.bag_pictures import (
     STRIP_HEIGHT,
     BodyShot,
     FlowShot,
-    body_meshes,
-    body_shot,
-    each,
-    facing,
-    fetch,
-    flow_shot,
-    moving_stamps,
-    people_box,
-    picture_of,
-    spread_over,
-    track_shot,
+    body_axes,
+    decode_picture,
+    draw_body_shot,
+    draw_flow_shot,
+    draw_track,
+    fetch_messages,
+    find_moving_stamps,
+    find_people_box,
+    pick_evenly,
+    read_body_meshes,
+    read_messages,
 )
-from flowing_puppet_ros.report.scene_3d import SceneFrame, frames_in_budget, scene_data
+from flowing_puppet_ros.report.scene_3d import SceneFrame, count_affordable_frames, make_scene_data
 from flowing_puppet_ros.stream.messages.images import decode_image
 
-STRIP_FRAMES, FLOW_FRAMES, BODY_FRAMES, MOST_VIEWS = 120, 4, 3, 6
+MAX_STRIP_FRAMES, MAX_FLOW_FRAMES, MAX_BODY_FRAMES, MAX_VIEWS = 120, 4, 3, 6
+"""Maximum numbers of pictures: of the track, of the flow, of bodies, and of cameras per body."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +75,7 @@ class CameraData:
     errors_cm: JointErrors  # centimetres at the person
     swapped: dict[str, tuple[int, int]]  # limb -> (swapped, comparable) frames
     part_names: tuple[str, ...]
-    part_confidence: np.ndarray  # (P,T)
+    part_confidence: np.ndarray  # (P, T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,14 +87,14 @@ class BodiesData:
     errors: JointErrors  # metres, against triangulated detections
     swapped: dict[str, tuple[int, int]]
     part_names: tuple[str, ...]
-    part_confidence: np.ndarray  # (P,T)
+    part_confidence: np.ndarray  # (P, T)
     clouds: int
     frame: str
 
 
 @dataclass(slots=True, eq=False)
 class ReportData:
-    """Everything on the page; empty lists and None stand for what the bags do not hold."""
+    """Everything on the page; empty lists and None stand for what the bags do not contain."""
 
     input_name: str
     output_name: str
@@ -109,25 +110,25 @@ class ReportData:
     scene: Mapping[str, Any] | None = None
 
     def seconds(self, stamp: int) -> float:
-        """Time since the first stamp."""
+        """Return the seconds from the first stamp to `stamp` (ns)."""
         return (stamp - self.start) * 1e-9
 
     def camera(self, name: str) -> CameraData | None:
-        """The camera called `name`."""
+        """Return the camera called `name`, or None."""
         return next((camera for camera in self.cameras if camera.name == name), None)
 
 
-def gather(input_bag: Path, output_bag: Path, summary: Mapping[str, Any] | None = None) -> ReportData:
-    """Read both bags of a replay, also where they are cut off.
+def gather_data(input_bag: Path, output_bag: Path, summary: Mapping[str, Any] | None = None) -> ReportData:
+    """Gather the data from both bags of a replay, even if they are cut off.
 
-    Raises InputError when one is no bag or the output has neither puppets nor bodies.
+    InputError if one is not a bag or the output has neither puppets nor bodies.
     """
     with open_bag(input_bag, salvage=True) as given, open_bag(output_bag, salvage=True) as made:
         recording = read_recording(given, made)
-        told = _recorded(made) | dict(summary or {})
-        data = ReportData(input_bag.name, output_bag.name, told, recording.start, recording.counts)
+        summary = _read_summary(made) | dict(summary or {})
+        data = ReportData(input_bag.name, output_bag.name, summary, recording.start, recording.counts)
         tracked = [camera for camera in recording.cameras.values() if camera.puppets]
-        data.cameras = [_camera_data(camera, recording.start) for camera in tracked]
+        data.cameras = [_make_camera_data(camera, recording.start) for camera in tracked]
         if tracked:
             shown = max(tracked, key=lambda camera: frontality(camera.puppets))
             data.shown_camera = shown.name
@@ -135,54 +136,54 @@ def gather(input_bag: Path, output_bag: Path, summary: Mapping[str, Any] | None 
             if not data.strip:
                 _add_overlays(data, shown, made)
         if recording.bodies:
-            data.bodies = _bodies_data(recording)
+            data.bodies = _make_bodies_data(recording)
             _add_bodies(data, recording, given, made)
             _add_scene(data, recording, given, made)
     return data
 
 
-def _recorded(made: Bag) -> dict[str, Any]:
-    """What the replay wrote into its bag about itself."""
+def _read_summary(made: Bag) -> dict[str, Any]:
+    """Return the summary that the replay stored in its bag; empty if there is none."""
     try:
-        return dict(json.loads(made.note(NOTE).get("replay", "{}")))
+        return dict(json.loads(made.read_metadata(METADATA_NAME).get("replay", "{}")))
     except (ValueError, TypeError):
         return {}
 
 
-def _camera_data(camera: CameraRecord, start: int) -> CameraData:
+def _make_camera_data(camera: CameraRecord, start: int) -> CameraData:
     stamps = sorted(camera.puppets)
     people = [camera.puppets[stamp] for stamp in stamps]
-    frames, reference = track_and_detections(camera)
+    frames, reference = match_track_to_detections(camera)
     frames = {stamp: frames[stamp] for stamp in stamps if stamp in frames}
-    errors = joint_errors(frames, reference)
+    errors = measure_joint_errors(frames, reference)
     scale = np.array([camera.puppets[stamp][0].scale for stamp in frames], float)
     with np.errstate(divide="ignore", invalid="ignore"):
         centimetres = JointErrors(errors.names, errors.distance * 100 / np.where(scale > 0, scale, np.nan)[:, None])
-    names, confidence = _confidence([persons[0] if persons else None for persons in people])
+    names, confidence = _collect_confidence([persons[0] if persons else None for persons in people])
     return CameraData(
         name=camera.name,
         seconds=(np.array(stamps) - start) * 1e-9,
         energy=np.array([persons[0].energy if persons else np.nan for persons in people], float),
         tracked=sum(bool(persons) for persons in people),
         images=len(stamps),
-        switches=id_switches([[person.id for person in persons] for persons in people]),
-        errors=_all_rows(errors, list(frames), stamps),
-        errors_cm=_all_rows(centimetres, list(frames), stamps),
-        swapped=_swaps(frames, reference),
+        switches=count_id_switches([[person.id for person in persons] for persons in people]),
+        errors=_spread_rows(errors, list(frames), stamps),
+        errors_cm=_spread_rows(centimetres, list(frames), stamps),
+        swapped=_count_swaps(frames, reference),
         part_names=names,
         part_confidence=confidence,
     )
 
 
-def _all_rows(errors: JointErrors, have: list[int], stamps: list[int]) -> JointErrors:
-    """Put the rows at `have` among rows of NaN for all `stamps`."""
+def _spread_rows(errors: JointErrors, known: list[int], stamps: list[int]) -> JointErrors:
+    """Return the errors with one row for each of `stamps`, NaN for those without errors."""
     distance = np.full((len(stamps), len(errors.names)), np.nan)
-    distance[np.searchsorted(stamps, have)] = errors.distance
+    distance[np.searchsorted(stamps, known)] = errors.distance
     return JointErrors(errors.names, distance)
 
 
-def _confidence(people: list[Any]) -> tuple[tuple[str, ...], np.ndarray]:
-    """Names (P) and confidences (P,T) of the parts of one person (or None) a frame."""
+def _collect_confidence(people: list[Any]) -> tuple[tuple[str, ...], np.ndarray]:
+    """Return names (P) and confidences (P, T) of the parts of one person (or None) per frame."""
     names: dict[str, None] = {}
     for person in people:
         names |= dict.fromkeys(part.name for part in person.parts) if person else {}
@@ -194,22 +195,22 @@ def _confidence(people: list[Any]) -> tuple[tuple[str, ...], np.ndarray]:
     return tuple(names), values
 
 
-def _swaps(frames: Mapping[int, Joints], reference: Mapping[int, Joints]) -> dict[str, tuple[int, int]]:
+def _count_swaps(frames: Mapping[int, Joints], reference: Mapping[int, Joints]) -> dict[str, tuple[int, int]]:
     limbs = {"arms": ARM_JOINTS, "legs": LEG_JOINTS}
-    return {limb: swapped_share(frames, reference, joints) for limb, joints in limbs.items()}
+    return {limb: count_swapped(frames, reference, joints) for limb, joints in limbs.items()}
 
 
-def _bodies_data(recording: Recording) -> BodiesData:
-    bodies = first_bodies(recording)
+def _make_bodies_data(recording: Recording) -> BodiesData:
+    bodies = select_first_bodies(recording)
     stamps = sorted(bodies)
     frames = {stamp: body_joints(bodies[stamp]) for stamp in stamps}
-    reference = triangulated(recording, frames)
-    names, confidence = _confidence([bodies[stamp] for stamp in stamps])
+    reference = triangulate_detections(recording, frames)
+    names, confidence = _collect_confidence([bodies[stamp] for stamp in stamps])
     return BodiesData(
         seconds=(np.array(stamps, float) - recording.start) * 1e-9,
         energy=np.array([bodies[stamp].energy for stamp in stamps], float),
-        errors=joint_errors(frames, reference),
-        swapped=_swaps(frames, reference),
+        errors=measure_joint_errors(frames, reference),
+        swapped=_count_swaps(frames, reference),
         part_names=names,
         part_confidence=confidence,
         clouds=len(recording.bodies),
@@ -218,30 +219,30 @@ def _bodies_data(recording: Recording) -> BodiesData:
 
 
 def _add_track(data: ReportData, camera: CameraRecord, given: Bag) -> None:
-    """Pictures of one camera: the frames with puppets, and the flow at its liveliest frames."""
+    """Add the pictures of one camera: frames with puppets, and the flow at the frames with most motion."""
     stamps = sorted(camera.puppets)
-    moving = moving_stamps(camera, FLOW_FRAMES)
+    moving = find_moving_stamps(camera, MAX_FLOW_FRAMES)
     following = {stamp: stamps[stamps.index(stamp) + 1] for stamp in moving}
-    seen = [stamp for stamp in stamps if camera.puppets[stamp]]
-    strip = spread_over([stamp for stamp in stamps if seen and seen[0] <= stamp <= seen[-1]], STRIP_FRAMES)
+    tracked = [stamp for stamp in stamps if camera.puppets[stamp]]
+    strip = pick_evenly([stamp for stamp in stamps if tracked and tracked[0] <= stamp <= tracked[-1]], MAX_STRIP_FRAMES)
     people = [camera.puppets[stamp] for stamp in (*strip, *moving)]
-    for (_, stamp), message in each(given, {camera.image_topic: strip}):
+    for (_, stamp), message in read_messages(given, {camera.image_topic: strip}):
         with suppress(InputError):
             image = decode_image(message)
-            picture = track_shot(image, camera.puppets[stamp], people_box(people, image.shape))
+            picture = draw_track(image, camera.puppets[stamp], find_people_box(people, image.shape))
             data.strip.append((stamp, picture))
-    images = fetch(given, {camera.image_topic: {*following, *following.values()}})
+    images = fetch_messages(given, {camera.image_topic: {*following, *following.values()}})
     for stamp in moving:
-        pair = [picture_of(images, camera.image_topic, s) for s in (stamp, following[stamp])]
+        pair = [decode_picture(images, camera.image_topic, s) for s in (stamp, following[stamp])]
         if pair[0] is not None and pair[1] is not None and pair[0].shape == pair[1].shape:
-            box = people_box(people, pair[0].shape)
-            data.flow.append(flow_shot(stamp, pair[0], pair[1], camera.puppets[stamp], box))
+            box = find_people_box(people, pair[0].shape)
+            data.flow.append(draw_flow_shot(stamp, pair[0], pair[1], camera.puppets[stamp], box))
 
 
 def _add_overlays(data: ReportData, camera: CameraRecord, made: Bag) -> None:
-    """The overlays that the replay made, for want of the input's images."""
+    """Add the overlays that the replay made, if the input's images are missing."""
     for topic in (f"{camera.namespace}/overlay/compressed", f"{camera.namespace}/overlay"):
-        for (_, stamp), message in each(made, {topic: spread_over(list(camera.puppets), STRIP_FRAMES)}):
+        for (_, stamp), message in read_messages(made, {topic: pick_evenly(list(camera.puppets), MAX_STRIP_FRAMES)}):
             with suppress(InputError):
                 data.strip.append((stamp, shrink(decode_image(message), STRIP_HEIGHT)))
         if data.strip:
@@ -249,64 +250,66 @@ def _add_overlays(data: ReportData, camera: CameraRecord, made: Bag) -> None:
 
 
 def _add_bodies(data: ReportData, recording: Recording, given: Bag, made: Bag) -> None:
-    """Pictures of a few bodies, spread over those that were found."""
-    bodies = first_bodies(recording)
-    stamps = spread_over(list(bodies), BODY_FRAMES)
-    clouds = _clouds(recording, given, made, stamps)
-    views = [c for c in recording.cameras.values() if c.camera is not None and c.image_topic][:MOST_VIEWS]
-    images = fetch(given, {camera.image_topic: stamps for camera in views})
+    """Add pictures of a few bodies, spread evenly over all."""
+    bodies = select_first_bodies(recording)
+    stamps = pick_evenly(list(bodies), MAX_BODY_FRAMES)
+    clouds = _fetch_clouds(recording, given, made, stamps)
+    views = [c for c in recording.cameras.values() if c.camera is not None and c.image_topic][:MAX_VIEWS]
+    images = fetch_messages(given, {camera.image_topic: stamps for camera in views})
     for stamp in stamps:
-        meshes = body_meshes([bodies[stamp]], clouds.vertices.get(stamp), recording.triangles, clouds.points.get(stamp))
+        meshes = read_body_meshes(
+            [bodies[stamp]], clouds.vertices.get(stamp), recording.triangles, clouds.points.get(stamp)
+        )
         if not meshes:
             continue
-        shown = [(c, picture_of(images, c.image_topic, stamp)) for c in views]
-        placed = [(c.name, c.camera, image) for c, image in shown if c.camera is not None and image is not None]
-        data.body_shots.append(body_shot(stamp, bodies[stamp], meshes[0], placed))
+        shown = [(c, decode_picture(images, c.image_topic, stamp)) for c in views]
+        images_of = [(c.name, c.camera, image) for c, image in shown if c.camera is not None and image is not None]
+        data.body_shots.append(draw_body_shot(stamp, bodies[stamp], meshes[0], images_of))
 
 
 def _add_scene(data: ReportData, recording: Recording, given: Bag, made: Bag) -> None:
-    """The meshes of as many stamps as one page can hold."""
+    """Add the meshes of as many stamps as fit on one page."""
     found = [stamp for stamp, bodies in recording.bodies.items() if bodies]
     if not found or not len(recording.triangles):
         return
-    most = max(len(recording.bodies[stamp]) for stamp in found)
-    stamps = spread_over(found, frames_in_budget(most, int(recording.triangles.max()) + 1))
-    clouds = _clouds(recording, given, made, stamps)
+    max_bodies = max(len(recording.bodies[stamp]) for stamp in found)
+    stamps = pick_evenly(found, count_affordable_frames(max_bodies, int(recording.triangles.max()) + 1))
+    clouds = _fetch_clouds(recording, given, made, stamps)
     frames = []
     for stamp in stamps:
         vertices, points = clouds.vertices.get(stamp), clouds.points.get(stamp)
-        meshes = body_meshes(recording.bodies[stamp], vertices, recording.triangles, points)
+        meshes = read_body_meshes(recording.bodies[stamp], vertices, recording.triangles, points)
         if meshes:
             frames.append(SceneFrame(data.seconds(stamp), meshes))
     if frames:
-        forward, _, up = facing(body_joints(recording.bodies[stamps[0]][0]))
-        data.scene = scene_data(frames, forward, up)
+        forward, _, up = body_axes(body_joints(recording.bodies[stamps[0]][0]))
+        data.scene = make_scene_data(frames, forward, up)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Clouds:
-    """Messages by stamp: the vertices of the bodies, and the points that they were fitted to."""
+    """Messages by stamp: vertices of the bodies, and the points that they were fitted to."""
 
     vertices: dict[int, Any]
     points: dict[int, Any]
 
 
-def _clouds(recording: Recording, given: Bag, made: Bag, stamps: list[int]) -> _Clouds:
+def _fetch_clouds(recording: Recording, given: Bag, made: Bag, stamps: list[int]) -> _Clouds:
     topics = recording.cloud_topics
-    vertices = fetch(made, {topics.get("body_vertices", ""): stamps})
-    points = {stamp: one for (_, stamp), one in fetch(made, {topics.get("hull", ""): stamps}).items()}
-    for topic in () if points else sensed_clouds(recording):
-        for (_, stamp), message in each(given, {topic: stamps}):
+    vertices = fetch_messages(made, {topics.get("body_vertices", ""): stamps})
+    points = {stamp: one for (_, stamp), one in fetch_messages(made, {topics.get("hull", ""): stamps}).items()}
+    for topic in () if points else sensor_cloud_topics(recording):
+        for (_, stamp), message in read_messages(given, {topic: stamps}):
             with suppress(InputError):
-                points[stamp] = as_cloud(recording, topic, message)
+                points[stamp] = to_cloud(recording, topic, message)
     return _Clouds({stamp: one for (_, stamp), one in vertices.items()}, points)
 
 
-def energy_series(data: ReportData) -> list[Series]:
-    """Energy of the first puppet over time, a line per camera."""
+def make_energy_series(data: ReportData) -> list[Series]:
+    """Return the energy of the first puppet over time, one line per camera."""
     return [Series(camera.name, camera.seconds, camera.energy) for camera in data.cameras]
 
 
-def error_series(data: ReportData) -> list[Series]:
-    """Mean limb-joint error over time in pixels, a line per camera."""
+def make_error_series(data: ReportData) -> list[Series]:
+    """Return the mean limb-joint error over time in pixels, one line per camera."""
     return [Series(camera.name, camera.seconds, camera.errors.per_frame()) for camera in data.cameras]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Building blocks of a self-contained HTML page: no file beside it, no network, light and dark, usable by keyboard."""
+"""Elements of a self-contained HTML page: no other file, no network, light and dark, usable by keyboard."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.draw.pictures import data_uri
+from flowing_puppet_ros.draw.pictures import encode_data_uri
 
 CSS = """
 :root{--bg:#fbfbfa;--fg:#1c1f23;--soft:#5b636d;--rule:#d9dce0;--card:#fff;--accent:#0b66b3;
@@ -61,18 +61,18 @@ details{margin:10px 0}summary{cursor:pointer}
 tr:has(>:nth-child(5))>*{white-space:nowrap}}
 """ + "".join(f".s{k}{{stroke:var(--c{k})}}.d{k}{{fill:var(--c{k})}}.k{k}{{background:var(--c{k})}}" for k in range(8))
 
-# Without scripts every frame is shown, one below the other, and what needs them is not.
+# Without scripts every frame is shown, one below the other, and what needs scripts is hidden.
 NO_SCRIPT = "<noscript><style>.frame{display:block}.scrub,.space,.timeline svg .now{display:none}</style></noscript>"
 
 
-def script(name: str) -> str:
-    """The text of one of the page's scripts, report/web/`name`."""
+def read_script(name: str) -> str:
+    """Return the text of the page's script report/web/`name`."""
     return (files("flowing_puppet_ros.report") / "web" / name).read_text("utf8")
 
 
-def page(title: str, lead: str, sections: Sequence[tuple[str, str]], scripts: Sequence[str] = ()) -> str:
-    """Join a whole page from a title (text), a lead (HTML), sections of (heading text, HTML) and names of scripts."""
-    code = "".join(f"<script>{script(name)}</script>" for name in scripts)
+def build_page(title: str, lead: str, sections: Sequence[tuple[str, str]], scripts: Sequence[str] = ()) -> str:
+    """Build the page from a title (text), a lead (HTML), sections of (heading text, HTML) and names of scripts."""
+    code = "".join(f"<script>{read_script(name)}</script>" for name in scripts)
     ids = [f"part{index + 1}" for index in range(len(sections))]
     links = "".join(
         f'<li><a href="#{name}">{escape(heading)}</a></li>' for name, (heading, _) in zip(ids, sections, strict=True)
@@ -92,12 +92,12 @@ def page(title: str, lead: str, sections: Sequence[tuple[str, str]], scripts: Se
 
 
 def paragraph(text: str, soft: bool = False) -> str:
-    """One paragraph of plain text."""
+    """Make a paragraph of plain text."""
     return f"<p{' class=soft' if soft else ''}>{escape(text)}</p>"
 
 
 def table(heads: Sequence[str], rows: Sequence[Sequence[str]], numeric: Sequence[int], caption: str) -> str:
-    """Make a table of text cells; `numeric` are the columns set flush right, the first cell of a row is its head."""
+    """Make a table of text cells; the columns `numeric` are right-aligned, the first cell of a row is its head."""
 
     def kind(column: int) -> str:
         return ' class="n"' if column in numeric else ""
@@ -114,19 +114,19 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]], numeric: Sequence
 
 
 def figure(image: np.ndarray, alt: str, caption: str = "", kind: str = "jpg") -> str:
-    """Make a figure of an RGB image (H,W,3) with its description and caption."""
+    """Make a figure of an RGB image (H, W, 3) with its description and caption."""
     text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     size = f'width="{image.shape[1]}" height="{image.shape[0]}"'
-    return f'<figure><img src="{data_uri(image, kind)}" {size} alt="{escape(alt)}">{text}</figure>'
+    return f'<figure><img src="{encode_data_uri(image, kind)}" {size} alt="{escape(alt)}">{text}</figure>'
 
 
 def row(figures: Sequence[str], kind: str = "") -> str:
-    """Set figures beside each other; `kind` is "three" or "views"."""
+    """Set figures side by side; `kind` is "three", "views" or empty."""
     return f'<div class="row {kind}">{"".join(figures)}</div>'
 
 
 def json_block(name: str, value: Any) -> str:
-    """Data for the page's scripts, in an element with the attribute data-`name`."""
+    """Make the element, with the attribute data-`name`, of data for the page's scripts."""
     # A slash after an angle bracket would end the element.
     text = json.dumps(value, separators=(",", ":")).replace("</", "<\\/")
     return f'<script type="application/json" data-{name}>{text}</script>'

@@ -20,13 +20,13 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bag.recording import (
     CameraRecord,
     Recording,
-    as_cloud,
     body_joints,
     puppet_joints,
     read_recording,
-    sensed_clouds,
+    sensor_cloud_topics,
+    to_cloud,
 )
-from flowing_puppet_ros.report.bag_pictures import body_meshes
+from flowing_puppet_ros.report.bag_pictures import read_body_meshes
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image
@@ -34,11 +34,11 @@ from flowing_puppet_ros.stream.messages.images import decode_image
 WORLD = "world"
 TIMELINE = "stamp"
 POINT_COLOUR = (31, 111, 208)
-POINT_METRES = 0.004
+POINT_RADIUS_M = 0.004  # joints are four times as large
 
 
-def rerun_sdk() -> Any:
-    """The package rerun-sdk; InputError says how to get it where it is not installed."""
+def import_rerun() -> Any:
+    """Return the package rerun-sdk; InputError says how to install it if it is missing."""
     try:
         import rerun
     except ImportError as error:
@@ -47,9 +47,9 @@ def rerun_sdk() -> Any:
 
 
 def write_replay(input_bag: Path, output_bag: Path, path: Path) -> None:
-    """Write what a replay had and made as one recording, in the time of the stamps.
+    """Write the input and the results of a replay as one recording, in the time of the stamps.
 
-    Raises InputError for bags that cannot be used, places that cannot be written, and without rerun-sdk.
+    InputError if a bag cannot be used, the file cannot be written, or rerun-sdk is missing.
     """
     with open_bag(input_bag, salvage=True) as given, open_bag(output_bag, salvage=True) as made:
         recording = read_recording(given, made)
@@ -64,47 +64,47 @@ def write_replay(input_bag: Path, output_bag: Path, path: Path) -> None:
 
 
 def write_fits(fits: Iterable[tuple[str, np.ndarray, Path]], path: Path) -> None:
-    """Write fits as one recording: (name, points (N, 3) of the scan, the .npz that `fit` wrote) each."""
+    """Write fits, each as (name, points (N, 3) of the scan, the .npz that `fit` wrote), as one recording."""
     log = _Log(path)
     for name, points, archive in fits:
         place = f"{WORLD}/{name}"
         with np.load(archive) as fit:
             colours = part_colours(fit["part_names"].tolist())[fit["part_of_vertex"]]
-            log.mesh(f"{place}/body", fit["vertices"], fit["faces"], colours)
-            log.points(f"{place}/body/joints", fit["joints"], fit["joint_names"].tolist())
-        log.points(f"{place}/scan", points)
+            log.log_mesh(f"{place}/body", fit["vertices"], fit["faces"], colours)
+            log.log_points(f"{place}/body/joints", fit["joints"], fit["joint_names"].tolist())
+        log.log_points(f"{place}/scan", points)
     log.close()
 
 
 class _Log:
-    """A recording that is being written; everything goes to the time that was set last, or to all times."""
+    """A recording being written; everything is logged at the stamp that was set last, or at all times."""
 
     def __init__(self, path: Path) -> None:
-        self._rerun = rerun_sdk()
+        self._rerun = import_rerun()
         self._stream = self._rerun.RecordingStream("flowing_puppet_ros")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.open("wb").close()
         except OSError as error:
-            raise InputError(f"cannot write {path}: {error.strerror}; choose another place") from error
+            raise InputError(f"cannot write {path}: {error.strerror}; choose another path") from error
         self._stream.save(str(path))
         self._static = True
-        self.put(WORLD, self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self.log(WORLD, self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP)
 
-    def at(self, stamp: int) -> None:
-        """From here on everything is at a stamp in ns."""
+    def set_stamp(self, stamp: int) -> None:
+        """Log at a stamp in nanoseconds from here on."""
         self._stream.set_time(TIMELINE, timestamp=np.datetime64(stamp, "ns"))
         self._static = False
 
-    def always(self) -> None:
-        """From here on everything is there at all times."""
+    def set_static(self) -> None:
+        """Log at all times from here on."""
         self._static = True
 
-    def put(self, place: str, what: Any) -> None:
+    def log(self, place: str, what: Any) -> None:
         self._stream.log(place, what, static=self._static)
 
-    def mesh(self, place: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> None:
-        self.put(
+    def log_mesh(self, place: str, vertices: np.ndarray, faces: np.ndarray, colours: np.ndarray) -> None:
+        self.log(
             place,
             self._rerun.Mesh3D(
                 vertex_positions=vertices.astype(np.float32),
@@ -113,8 +113,8 @@ class _Log:
             ),
         )
 
-    def points(self, place: str, points: np.ndarray, names: Sequence[str] = ()) -> None:
-        """Points of one colour, or named joints in the colours of their sides."""
+    def log_points(self, place: str, points: np.ndarray, names: Sequence[str] = ()) -> None:
+        """Log points of one colour, or named joints in the colours of their sides."""
         colours = [joint_colour(name) for name in names] or [POINT_COLOUR]
         known = np.isfinite(points).all(axis=1)
         if names:
@@ -122,84 +122,84 @@ class _Log:
             colours = [colour for colour, there in zip(colours, known, strict=True) if there]
         found = self._rerun.Points3D(
             positions=points[known].astype(np.float32),
-            radii=[4 * POINT_METRES if names else POINT_METRES],
+            radii=[4 * POINT_RADIUS_M if names else POINT_RADIUS_M],
             colors=np.array(colours, np.uint8),
             labels=list(names) or None,
             show_labels=False,
         )
-        self.put(place, found)
+        self.log(place, found)
 
-    def pixels(self, place: str, points: np.ndarray, names: Sequence[str]) -> None:
+    def log_pixels(self, place: str, points: np.ndarray, names: Sequence[str]) -> None:
         colours = np.array([joint_colour(name) for name in names], np.uint8)
         found = self._rerun.Points2D(
             positions=points.astype(np.float32), radii=[4.0], colors=colours, labels=list(names), show_labels=False
         )
-        self.put(place, found)
+        self.log(place, found)
 
-    def outlines(self, place: str, strips: Sequence[np.ndarray], colours: np.ndarray) -> None:
+    def log_outlines(self, place: str, strips: Sequence[np.ndarray], colours: np.ndarray) -> None:
         closed = [np.concatenate([strip, strip[:1]]).astype(np.float32) for strip in strips]
-        self.put(place, self._rerun.LineStrips2D(strips=closed, colors=colours))
+        self.log(place, self._rerun.LineStrips2D(strips=closed, colors=colours))
 
-    def image(self, place: str, message: Any) -> None:
-        """An image message; what is compressed stays as it is."""
+    def log_image(self, place: str, message: Any) -> None:
+        """Log an image message; compressed data stays as it is."""
         kind = str(getattr(message, "format", ""))
         if "jpeg" in kind or "jpg" in kind or "png" in kind:
             media = "image/png" if "png" in kind else "image/jpeg"
             encoded = self._rerun.EncodedImage(contents=bytes(message.data), media_type=media)
-            self.put(place, encoded)
+            self.log(place, encoded)
         else:
-            self.put(place, self._rerun.Image(decode_image(message)))
+            self.log(place, self._rerun.Image(decode_image(message)))
 
-    def camera(self, place: str, record: CameraRecord) -> None:
+    def log_camera(self, place: str, record: CameraRecord) -> None:
         assert record.camera is not None
         camera = record.camera
-        self.put(place, self._rerun.Transform3D(translation=camera.centre, mat3x3=camera.rotation.T))
-        self.put(place, self._rerun.Pinhole(image_from_camera=camera.matrix, resolution=list(camera.size)))
+        self.log(place, self._rerun.Transform3D(translation=camera.centre, mat3x3=camera.rotation.T))
+        self.log(place, self._rerun.Pinhole(image_from_camera=camera.matrix, resolution=list(camera.size)))
 
     def clear(self, place: str) -> None:
-        self.put(place, self._rerun.Clear(recursive=True))
+        self.log(place, self._rerun.Clear(recursive=True))
 
     def close(self) -> None:
         self._stream.flush()
         self._stream.disconnect()
 
 
-def _place(camera: CameraRecord) -> str:
+def _entity_path(camera: CameraRecord) -> str:
     return f"{WORLD}/cameras/{camera.name}" if camera.camera is not None else f"cameras/{camera.name}"
 
 
 def _log_camera(log: _Log, camera: CameraRecord) -> None:
-    log.always()
+    log.set_static()
     if camera.camera is not None:
-        log.camera(_place(camera), camera)
+        log.log_camera(_entity_path(camera), camera)
 
 
 def _log_images(log: _Log, camera: CameraRecord, given: Bag) -> None:
     for record in given.messages([camera.image_topic] if camera.image_topic else []):
         with suppress(InputError):
-            log.at(stamp_ns(record.message))
-            log.image(f"{_place(camera)}/image", record.message)
+            log.set_stamp(stamp_ns(record.message))
+            log.log_image(f"{_entity_path(camera)}/image", record.message)
 
 
 def _log_puppets(log: _Log, camera: CameraRecord) -> None:
     shown: set[str] = set()
     for stamp in sorted(camera.puppets):
-        log.at(stamp)
-        places = {f"{_place(camera)}/image/puppets/{person.id}": person for person in camera.puppets[stamp]}
+        log.set_stamp(stamp)
+        places = {f"{_entity_path(camera)}/image/puppets/{person.id}": person for person in camera.puppets[stamp]}
         for place in sorted(shown - places.keys()):
             log.clear(place)
         for place, person in places.items():
             joints = puppet_joints(person)
             if joints:
-                log.pixels(f"{place}/joints", np.stack(list(joints.values())), list(joints))
+                log.log_pixels(f"{place}/joints", np.stack(list(joints.values())), list(joints))
             drawn = DrawnPuppet.from_message(person)
             if drawn.contours:
-                log.outlines(f"{place}/outlines", drawn.contours, part_colours(drawn.part_names))
+                log.log_outlines(f"{place}/outlines", drawn.contours, part_colours(drawn.part_names))
         shown = set(places)
 
 
 def _log_bodies(log: _Log, recording: Recording, made: Bag) -> None:
-    """Meshes, or joints alone where a bag has no vertices; a body that is gone is cleared."""
+    """Log meshes, or joints alone if a bag has no vertices; clear a body that is gone."""
     topic = recording.cloud_topics.get("body_vertices")
     vertices = {}
     for record in made.messages([topic]) if topic else ():
@@ -208,25 +208,28 @@ def _log_bodies(log: _Log, recording: Recording, made: Bag) -> None:
     shown: set[str] = set()
     for stamp in sorted(recording.bodies):
         bodies = recording.bodies[stamp]
-        log.at(stamp)
+        log.set_stamp(stamp)
         places = [f"{WORLD}/bodies/{body.id}" for body in bodies]
         for place in sorted(shown - set(places)):
             log.clear(place)
-        meshes = body_meshes(bodies, vertices.get(stamp), recording.triangles, None)
+        meshes = read_body_meshes(bodies, vertices.get(stamp), recording.triangles, None)
         for place, mesh in zip(places, meshes, strict=False):
-            log.mesh(place, mesh.vertices, mesh.faces, mesh.colours)
+            log.log_mesh(place, mesh.vertices, mesh.faces, mesh.colours)
         for place, body in zip(places, bodies, strict=True):
             joints = body_joints(body)
             if joints:
-                log.points(f"{place}/joints", np.stack(list(joints.values())), list(joints))
+                log.log_points(f"{place}/joints", np.stack(list(joints.values())), list(joints))
         shown = set(places)
 
 
 def _log_points(log: _Log, recording: Recording, given: Bag, made: Bag) -> None:
     hull = recording.cloud_topics.get("hull")
-    for bag, name, topics in ((made, "hull", [hull] if hull else []), (given, "points", sensed_clouds(recording))):
+    for bag, name, topics in (
+        (made, "hull", [hull] if hull else []),
+        (given, "points", sensor_cloud_topics(recording)),
+    ):
         for record in bag.messages(topics) if topics else ():
             with suppress(InputError):
-                points = decode_cloud(as_cloud(recording, record.topic, record.message))[0]
-                log.at(stamp_ns(record.message))
-                log.points(f"{WORLD}/{name}", points)
+                points = decode_cloud(to_cloud(recording, record.topic, record.message))[0]
+                log.set_stamp(stamp_ns(record.message))
+                log.log_points(f"{WORLD}/{name}", points)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the report's 3D view shows: the meshes of many stamps and the points around them, small enough for one page."""
+"""The data of the report's 3D view: meshes and points of many stamps, small enough for one page."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 
 from flowing_puppet_ros.report.bag_pictures import BodyMesh
 
-FRAMES, POINTS = 240, 2000
-BUDGET = 6_000_000
-"""Bytes of all meshes and points; with many people or a fine mesh fewer stamps are shown."""
-LARGEST = 32767
+MAX_FRAMES, MAX_POINTS = 240, 2000  # stamps, and points of each
+MAX_BYTES = 6_000_000
+"""Maximum bytes of all meshes and points; with many people or a fine mesh fewer stamps are shown."""
+MAX_STEPS = 32767  # steps of a position from the centre: 16-bit integers
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,53 +27,52 @@ class SceneFrame:
 
     @property
     def points(self) -> np.ndarray:
-        """At most 2000 of the points (N, 3), evenly taken."""
+        """At most MAX_POINTS of the points (N, 3), evenly sampled."""
         points = self.meshes[0].points
         points = points[np.isfinite(points).all(axis=1)]
-        return points[:: max(1, -(-len(points) // POINTS))]
+        return points[:: max(1, -(-len(points) // MAX_POINTS))]
 
 
-def frames_in_budget(bodies: int, vertices: int) -> int:
-    """How many stamps may be shown when each has so many bodies of so many vertices."""
-    return max(1, min(FRAMES, BUDGET // (6 * (bodies * vertices + POINTS))))
+def count_affordable_frames(bodies: int, vertices: int) -> int:
+    """Return how many stamps can be shown if each has this many bodies of this many vertices."""
+    return max(1, min(MAX_FRAMES, MAX_BYTES // (6 * (bodies * vertices + MAX_POINTS))))
 
 
-def scene_data(frames: Sequence[SceneFrame], forward: np.ndarray, up: np.ndarray) -> Mapping[str, Any]:
-    """What scene.js reads, for JSON: places as whole numbers of a step, turned so that `up` (3,) is +z.
+def make_scene_data(frames: Sequence[SceneFrame], forward: np.ndarray, up: np.ndarray) -> Mapping[str, Any]:
+    """Return the data for scene.js, ready for JSON: positions as whole steps, rotated so that `up` (3,) is +z.
 
-    `forward` (3,) is where the first person faces and the first view comes from.
-
-    Places are exact to half a step, one 65,534th of the scene's extent.
+    `forward` (3,) is where the first person faces and the first view comes from. Positions are exact to half a step,
+    which is one 65,534th of the scene's extent.
     """
-    turn = _upright(up)
-    meshes = [np.concatenate([mesh.vertices for mesh in frame.meshes]) @ turn.T for frame in frames]
-    clouds = [frame.points @ turn.T for frame in frames]
-    # Stray points far away must not make the bodies coarse.
+    rotation = _rotation_to_z_up(up)
+    meshes = [np.concatenate([mesh.vertices for mesh in frame.meshes]) @ rotation.T for frame in frames]
+    clouds = [frame.points @ rotation.T for frame in frames]
+    # Distant outliers must not reduce the resolution of the bodies.
     low, high = _bounds(meshes)
     margin = 0.25 * float((high - low).max())
     clouds = [cloud[((cloud > low - margin) & (cloud < high + margin)).all(axis=1)] for cloud in clouds]
     low, high = low - margin, high + margin
-    step, origin = float((high - low).max()) / (2 * LARGEST), (low + high) / 2
+    step, origin = float((high - low).max()) / (2 * MAX_STEPS), (low + high) / 2
     first = frames[0].meshes[0]
 
-    def whole(places: np.ndarray) -> str:
-        return _text(np.rint((places - origin) / step).astype("<i2"))
+    def quantise(points: np.ndarray) -> str:
+        return _encode_base64(np.rint((points - origin) / step).astype("<i2"))
 
     floor = float(min(mesh[:, 2].min() for mesh in meshes))
-    middle, extent = _bounds(meshes[:1])
-    ahead = turn @ forward
+    first_low, first_high = _bounds(meshes[:1])
+    ahead = rotation @ forward
     return {
         "azimuth": float(np.arctan2(ahead[1], ahead[0])),
         "step": step,
         "origin": origin.tolist(),
         "vertices": len(first.vertices),
-        "faces": _text(first.faces.astype("<u4")),
-        "colours": _text(np.rint(first.colours).astype(np.uint8)),
-        "centre": ((middle + extent) / 2).tolist(),
-        "size": float((extent - middle).max()),
+        "faces": _encode_base64(first.faces.astype("<u4")),
+        "colours": _encode_base64(np.rint(first.colours).astype(np.uint8)),
+        "centre": ((first_low + first_high) / 2).tolist(),
+        "size": float((first_high - first_low).max()),
         "floor": floor,
         "frames": [
-            {"t": frame.seconds, "bodies": len(frame.meshes), "mesh": whole(mesh), "points": whole(cloud)}
+            {"t": frame.seconds, "bodies": len(frame.meshes), "mesh": quantise(mesh), "points": quantise(cloud)}
             for frame, mesh, cloud in zip(frames, meshes, clouds, strict=True)
         ],
     }
@@ -84,12 +83,12 @@ def _bounds(clouds: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return joined.min(axis=0), joined.max(axis=0)
 
 
-def _text(array: np.ndarray) -> str:
+def _encode_base64(array: np.ndarray) -> str:
     return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode("ascii")
 
 
-def _upright(up: np.ndarray) -> np.ndarray:
-    """A rotation (3, 3) that takes `up` to +z."""
+def _rotation_to_z_up(up: np.ndarray) -> np.ndarray:
+    """Return a rotation (3, 3) that takes `up` to +z."""
     up = up / np.linalg.norm(up)
     helper = np.eye(3)[int(np.abs(up).argmin())]
     if up[2] > 0.99:

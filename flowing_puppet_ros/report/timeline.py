@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The part of the report that a slider moves: pictures, the 3D view, and marks in the plots over time."""
+"""The part of the report that follows a slider: pictures, the 3D view, and marks in the plots over time."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flowing_puppet_ros.report.page import figure, json_block
 
 SCRIPTS = ("scene.js", "timeline.js")
 
-_THREE = (
+_SCENE_VIEW = (
     '<div class="space"><canvas tabindex="0" role="application" aria-label="3D view of the bodies: drag or arrow keys '
     'turn, plus and minus zoom, Home resets"></canvas><div class="controls">'
     '<label><input type="checkbox" checked data-shows="mesh"> bodies</label>'
@@ -24,12 +24,12 @@ _THREE = (
 )
 
 
-def timeline(
+def make_timeline(
     frames: Sequence[tuple[float, np.ndarray, str]], scene: Mapping[str, Any] | None, plots: str, label: str
 ) -> str:
-    """Pictures (seconds, image, caption) beside the 3D `scene`, plots below, and the slider that moves them all.
+    """Make pictures (seconds, image, caption) beside the 3D `scene`, plots below, and the slider for all of them.
 
-    `scene` is what `report_scene.scene_data` returns; `label` says what the slider moves through.
+    `scene` is what `scene_3d.make_scene_data` returns; `label` is that of the slider.
     """
     times = sorted({round(seconds, 6) for seconds, _, _ in frames} | {round(t, 6) for t in _scene_times(scene)})
     pictures = "".join(
@@ -38,7 +38,7 @@ def timeline(
     )
     panes = f'<div class="pictures">{pictures}</div>' if frames else ""
     if scene is not None:
-        panes += json_block("scene", scene) + _THREE
+        panes += json_block("scene", scene) + _SCENE_VIEW
     controls = (
         f'<div class="controls scrub"{"" if len(times) > 1 else " hidden"}>'
         '<button type="button" data-play>Play</button>'

@@ -2,5 +2,5 @@
 """ROS messages in, ROS messages out, without ROS: what the live nodes and the bag replay both run.
 
 `component` says what a component is; `components` has one for each node, `messages` the conversions. Inputs that belong
-together are paired here (`time_synchronizer`, `stamp_buffer`, `depth_pairs`). Read `component` first.
+together are synchronised here (`time_synchronizer`, `stamp_buffer`, `depth_pairs`). Read `component` first.
 """

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every stream component is: ports, settings, counters, and messages in and out.
+"""The base of all stream components: ports, settings, counters, and messages in and out.
 
-A live node wraps one component and so does the bag replay: a component converts messages, keeps what it must wait
-for, runs one algorithm object and returns the messages to publish. It knows no clock and no middleware, so the same
-messages give the same answers live and replayed.
+A live node wraps one component and so does the bag replay. A component converts messages, keeps what must wait for a
+partner, runs one algorithm object and returns the messages to publish. It knows no clock and no middleware, so the
+same messages give the same results live and replayed.
 """
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable
 from concurrent.futures import Executor
@@ -16,27 +15,26 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory
 
 Output = list[tuple[str, Any]]
-"""Names of output ports, or of a person's topic of one (`Port.of`), each with a message; None closes such a topic."""
+"""Names of output ports, or of one person's topic (`Port.person_topic`), each with a message; None closes the topic."""
 _ID = "{id}"
-MAX_WARNINGS = 100
-"""Different sentences that a component logs in its life; what can be wrong with hostile input has no end."""
 
 COMPRESSED, COMPRESSED_DEPTH = "compressed", "compressedDepth"  # transports of images
 
 
 def base_topic(topic: str) -> str:
-    """Return the topic of an image that travels on `topic`: without the word of a transport, where there is one."""
+    """Return the image topic that `topic` belongs to: without the suffix of an image transport, if it has one."""
     for transport in (COMPRESSED, COMPRESSED_DEPTH):
         topic = topic.removesuffix(f"/{transport}")
     return topic
 
 
-def sends_depth(topic: str) -> bool:
-    """Whether a topic is that of the transport of depth images."""
+def is_compressed_depth_topic(topic: str) -> bool:
+    """Return whether a topic carries compressed depth images."""
     return topic.endswith(f"/{COMPRESSED_DEPTH}")
 
 
@@ -44,14 +42,16 @@ def sends_depth(topic: str) -> bool:
 class Port:
     """One topic of a component: its name relative to the node's namespace, or global when it starts with a slash.
 
-    qos: "sensor" (best effort, what sensors publish), "reliable" or "latched" (transient local).
-    lazy: worth making only when somebody listens. transport: the image also travels as CompressedImage on
-    `<name>/<transport>`, COMPRESSED or, an input, COMPRESSED_DEPTH; empty when it does not. optional: an input the
-    component works without.
+    `qos`: "sensor" (best effort, as sensors publish), "reliable" or "latched" (transient local).
+    `lazy`: an output that is made only while it has subscribers.
+    `transport`: the image also travels as CompressedImage on `<name>/<transport>`; COMPRESSED or, for an input,
+    COMPRESSED_DEPTH; empty when it does not.
+    `optional`: an input that the component works without.
+    `recorded`: a replay writes this output into its bag; False for what is too large.
 
-    An output with `{id}` in its name is one topic a person. The component puts `port.of(id)` beside each message; who
-    runs the component opens that topic at its first message and closes it at a message that is None, which says that
-    the person is lost. Such a port is neither lazy nor has it a transport.
+    An output with `{id}` in its name is one topic per person. The component puts `port.person_topic(id)` beside each
+    message. The caller opens that topic at its first message and closes it at a message that is None: the person is
+    lost. Such a port is never lazy and has no transport.
     """
 
     name: str
@@ -60,111 +60,99 @@ class Port:
     lazy: bool = False
     transport: str = ""
     optional: bool = False
+    recorded: bool = True
 
     @property
     def per_person(self) -> bool:
-        """Whether this is a topic for every person."""
+        """Whether every person has a topic of their own."""
         return _ID in self.name
 
-    def of(self, identity: str) -> str:
-        """Return the name of a person's topic."""
+    def person_topic(self, identity: str) -> str:
+        """Return the name of one person's topic."""
         return self.name.replace(_ID, identity)
 
     def covers(self, name: str) -> bool:
-        """Whether `name` is this port's, or that of one of its people."""
-        before, found, after = self.name.partition(_ID)
-        if not found:
+        """Return whether `name` is this port's or, for a port per person, that of one person's topic."""
+        before, placeholder, after = self.name.partition(_ID)
+        if not placeholder:
             return name == self.name
         identity = name[len(before) : len(name) - len(after)]
-        return bool(identity) and "/" not in identity and name == self.of(identity)
+        return bool(identity) and "/" not in identity and name == self.person_topic(identity)
 
 
-class Component:
-    """Base of the stream components."""
+class Component[S: Settings]:
+    """Base of the stream components; S is the type of the settings."""
 
     settings_type: ClassVar[type[Settings]]
     fixed: ClassVar[frozenset[str]] = frozenset()
-    """Settings that stay as they were when the node was started."""
+    """Settings that cannot change after the node was started."""
     hot_settings: ClassVar[frozenset[str]] = frozenset()
-    """Settings that `adopt` changes; a change of any other needs a new component."""
+    """Settings that `reconfigure` changes while the component runs; a change of any other needs a new component."""
     background: Executor | None = None
-    """Where a live node lets slow work run beside the messages; None: all work is done at once, as in a replay."""
+    """Executor of slow work in a live node; None: all work is done at once, as in a replay."""
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
 
-    def __init__(self, settings: Settings, factory: MessageFactory) -> None:
-        """Make a component whose messages `factory` makes; nobody listens to its lazy outputs yet."""
+    def __init__(self, settings: S, factory: MessageFactory) -> None:
+        """Make a component that creates its messages with `factory`; its lazy outputs have no subscribers yet."""
         self.settings = settings
         self.factory = factory
-        self.counters: Counter[str] = Counter()
-        self.warnings: list[str] = []
-        self._warned: set[str] = set()
+        self.report = Report()
         self._expected: set[str] = set()
-        self._wanted: set[str] = set()
+        self._subscribed: set[str] = set()
 
     def handle(self, port: str, message: Any) -> Output:
-        """Take one message and return the messages that it made ready, in the order they should be published.
+        """Process one message and return the messages that are now ready, in the order of publication.
 
-        A message that cannot be used (an unknown encoding, an empty cloud) is counted under `unusable` and leaves
-        one sentence in `warnings` for every new reason; the run goes on.
+        A message that cannot be used (an unknown encoding, an empty cloud) is counted under `unusable` and adds one
+        sentence to the `report` for every new reason; the component continues.
         """
         self.counters[f"received {port}"] += 1
-        return self._guarded(port, message)
+        return self._try_process(port, message)
 
     def flush(self) -> Output:
-        """Return what was still waiting for a partner when the input ended."""
+        """Return the messages for what still waits for a partner at the end of the input."""
         return []
 
     def warm_up(self) -> None:
-        """Load and compile what the first message would wait for; nothing else of the component changes."""
+        """Load and compile what the first message would otherwise wait for; the component's state does not change."""
 
     def reset(self) -> None:
-        """Forget the past: the next message starts a new recording."""
+        """Clear the state: the next message starts a new recording."""
 
-    def reconfigure(self, settings: Settings) -> None:
-        """Go on with settings that differ from the present ones in `adoptable` ones only."""
+    def reconfigure(self, settings: S) -> None:
+        """Continue with settings that differ from the present ones in `hot_settings` only."""
         self.settings = settings
 
     def set_expected(self, port: str, expected: bool) -> None:
-        """Say whether anybody publishes on an optional input, so that the component knows what to wait for."""
+        """Set whether an optional input has publishers, so that the component knows what to wait for."""
         self._switch(self._expected, self.inputs, port, expected)
 
-    def set_subscribed(self, port: str, wanted: bool) -> None:
-        """Say whether anybody listens to a lazy output."""
-        self._switch(self._wanted, self.outputs, port, wanted)
+    def set_subscribed(self, port: str, subscribed: bool) -> None:
+        """Set whether a lazy output has subscribers."""
+        self._switch(self._subscribed, self.outputs, port, subscribed)
 
-    def output(self, name: str) -> Port:
-        """Return the output port that `name`, as it stands beside a message, belongs to; KeyError when none does."""
+    def find_output(self, name: str) -> Port:
+        """Return the output port of `name`, the name beside a message; KeyError when there is none."""
         for port in self.outputs:
             if port.covers(name):
                 return port
         raise KeyError(name)
 
-    def drain_warnings(self) -> list[str]:
-        """Return the sentences to log that arose since the last call."""
-        warnings, self.warnings = self.warnings, []
-        return warnings
+    @property
+    def counters(self) -> Counter[str]:
+        """What was counted since the start, by name."""
+        return self.report.counters
 
     def _process(self, port: str, message: Any) -> Output:
         raise NotImplementedError
 
-    def _guarded(self, port: str, message: Any) -> Output:
+    def _try_process(self, port: str, message: Any) -> Output:
         try:
             return self._process(port, message)
         except InputError as error:
-            self._unusable(error)
+            self.report.count_unusable(error)
             return []
-
-    def _unusable(self, error: InputError) -> None:
-        self._warn(str(error))
-        self.counters["unusable"] += 1
-
-    def _warn(self, sentence: str) -> None:
-        """Log `sentence` once in the component's life; sentences that differ in their numbers only are the same."""
-        reason = re.sub(r"[0-9.]+", "#", sentence)
-        if reason not in self._warned and len(self._warned) < MAX_WARNINGS:
-            self._warned.add(reason)
-            self.warnings.append(sentence)
 
     @staticmethod
     def _switch(switches: set[str], ports: Iterable[Port], port: str, on: bool) -> None:

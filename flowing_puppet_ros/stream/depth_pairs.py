@@ -12,35 +12,35 @@ from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 class DepthPairs:
     """Pairs depth images with their camera_info by the stamp.
 
-    A depth image whose own camera_info has not come when the next depth image does is paired with the newest there is:
-    some drivers stamp it apart or send it once, and calibrations stay.
+    A depth image without a camera_info of its stamp is paired with the newest camera_info once the next depth image
+    arrives: some drivers stamp it differently or send it only once, and calibrations rarely change.
     """
 
     def __init__(self) -> None:
-        """Start empty."""
+        """Start with nothing that waits."""
         self._images = PendingQueue()
         self._infos = StampBuffer()
-        self._newest: Any = None
+        self._newest_info: Any = None
 
     def reset(self) -> None:
-        """Forget the images that wait; the calibration stays."""
+        """Drop the images that wait; keep the newest calibration."""
         self._images.clear()
         self._infos.clear()
 
     def add(self, port: str, message: Any) -> list[tuple[Any, Any]]:
-        """Take a message of `depth` or `camera_info`; return the pairs (image, info or None) that are complete."""
+        """Add a message of `depth` or `camera_info`; return the pairs (image, info or None) that are now complete."""
         if port == "depth":
             self._images.waiting.append((stamp_ns(message), message))
         else:
-            self._newest = message
+            self._newest_info = message
             self._infos.put(stamp_ns(message), message)
-        return self._complete(final=False)
+        return self._pop_pairs(final=False)
 
     def flush(self) -> list[tuple[Any, Any]]:
         """Return the pairs of the images that still wait."""
-        return self._complete(final=True)
+        return self._pop_pairs(final=True)
 
-    def _complete(self, final: bool) -> list[tuple[Any, Any]]:
+    def _pop_pairs(self, final: bool) -> list[tuple[Any, Any]]:
         pairs = []
         while self._images.waiting:
             stamp, image = self._images.waiting[0]
@@ -49,5 +49,5 @@ class DepthPairs:
                 break
             self._images.pop()
             self._infos.drop_until(stamp)
-            pairs.append((image, info or self._newest))
+            pairs.append((image, info or self._newest_info))
         return pairs

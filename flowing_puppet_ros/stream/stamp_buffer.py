@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inputs that wait for the partner of the same stamp: a leading input, and others that come sooner or later."""
+"""Buffers of inputs that wait for a partner of the same stamp: a leading input, and others before or after it."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 
 
 class StampBuffer:
-    """Messages of one input by their stamp, the newest `depth` of them."""
+    """The newest `depth` messages of one input, by stamp (nanoseconds)."""
 
     def __init__(self, depth: int = 60) -> None:
-        """Keep at most `depth` messages."""
+        """Make an empty buffer of at most `depth` messages."""
         self._items: dict[int, Any] = {}
         self._depth = depth
 
     def put(self, stamp: int, item: Any) -> None:
-        """Keep `item`; the longest kept one goes when there are too many."""
+        """Store `item`; drop the oldest one when the buffer is full."""
         self._items.pop(stamp, None)
         self._items[stamp] = item
         if len(self._items) > self._depth:
@@ -29,7 +29,7 @@ class StampBuffer:
         return self._items.get(stamp)
 
     def drop_until(self, stamp: int) -> int:
-        """Drop the items up to and with `stamp` and return how many there were."""
+        """Drop the items up to and including `stamp`; return how many there were."""
         old = [key for key in self._items if key <= stamp]
         for key in old:
             del self._items[key]
@@ -41,24 +41,24 @@ class StampBuffer:
 
 
 class PendingQueue:
-    """Items of the leading input in the order they came; the last one that left tells what is late."""
+    """Items of the leading input in order of arrival; what is late follows from the stamp popped last."""
 
     def __init__(self) -> None:
-        """Start empty."""
+        """Make an empty queue."""
         self.waiting: deque[tuple[int, Any]] = deque()
-        self.left: int | None = None
+        self.last_popped: int | None = None
 
     def pop(self) -> tuple[int, Any]:
-        """Let the first one leave."""
+        """Remove and return the first (stamp, item)."""
         stamp, item = self.waiting.popleft()
-        self.left = stamp
+        self.last_popped = stamp
         return stamp, item
 
     def is_late(self, stamp: int) -> bool:
-        """Whether a partner of this stamp comes after its leading item has left (and is no restart)."""
-        return self.left is not None and 0 <= self.left - stamp < BACKWARD_JUMP_NS
+        """Return whether a partner of this stamp comes after its leading item was popped (and is not a restart)."""
+        return self.last_popped is not None and 0 <= self.last_popped - stamp < BACKWARD_JUMP_NS
 
     def clear(self) -> None:
-        """Start again."""
+        """Drop everything."""
         self.waiting.clear()
-        self.left = None
+        self.last_popped = None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pairing of several inputs by their stamps, whatever order they arrive in."""
+"""Synchronisation of several inputs by their stamps, in whatever order they arrive."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from collections import Counter
 from typing import Any
 
 BACKWARD_JUMP_NS = 100_000_000
-"""A stamp this much before its predecessor on the same input is a restart of the recording, not disorder."""
+"""Nanoseconds; a stamp this much before its predecessor on the same input is a restart, not disorder."""
 
 
 class _Queue:
-    """Items of one input that wait for their partners, by increasing stamp."""
+    """Items of one input that wait for their partners, in the order of their stamps."""
 
     def __init__(self) -> None:
         self.stamps: list[int] = []
         self.items: list[Any] = []
-        self.last: int | None = None
+        self.last_stamp: int | None = None
 
     def drop(self, count: int) -> None:
         del self.stamps[:count]
         del self.items[:count]
 
-    def forget_after(self, stamp: int) -> int:
+    def drop_after(self, stamp: int) -> int:
         keep = bisect_left(self.stamps, stamp + 1)
-        lost = len(self.stamps) - keep
+        dropped = len(self.stamps) - keep
         del self.stamps[keep:]
         del self.items[keep:]
-        return lost
+        return dropped
 
-    def nearest(self, stamp: int, final: bool) -> int | None:
-        """Index of the item nearest to `stamp` (the earlier of two as near), None while a nearer one may come."""
+    def find_nearest(self, stamp: int, final: bool) -> int | None:
+        """Return the index of the item nearest to `stamp` (the earlier on a tie); None while a nearer one may come."""
         after = bisect_left(self.stamps, stamp)
         if after == len(self.stamps):
             return after - 1 if final else None
@@ -39,27 +39,27 @@ class _Queue:
             return after - 1
         return after
 
-    def near(self, index: int, stamp: int, slop: int) -> bool:
+    def is_near(self, index: int, stamp: int, slop: int) -> bool:
         return index >= 0 and abs(self.stamps[index] - stamp) <= slop
 
 
 class TimeSynchronizer:
-    """Makes sets of one item an input.
+    """Makes sets of one item from each input.
 
-    The first name leads: each of its items is joined with the nearest item of every other input, if all lie within
-    `slop_ns`; no item is used twice and sets come in the order of their stamps. A set is made as soon as no later
-    message can change it, so the sets do not depend on how the inputs interleave as long as no more than `depth`
-    items an input wait. What finds no partner is counted in `counters`: `unpaired` (its partners came and were too
-    far or used up), `dropped` (more than `depth` waited), `disordered` (stamp not after the one before on the same
-    input), `restarts` (stamp more than BACKWARD_JUMP_NS back: everything later than it is forgotten).
+    The first input leads: each of its items is joined with the nearest item of every other input, if all lie within
+    `slop_ns`. No item is used twice, and sets come in the order of their stamps. A set is made as soon as no later
+    message can change it, so the sets do not depend on how the inputs interleave while at most `depth` items of each
+    input wait. `counters` has what found no partner: `unpaired` (its partners came, but were too far away or used
+    up), `dropped` (more than `depth` items waited), `disordered` (stamp not after the previous one of the same
+    input), `restarts` (stamp more than BACKWARD_JUMP_NS back: everything later is dropped).
 
-    With `patience` sets of at least two items are made without the inputs that have no item near enough (counted in
-    `incomplete`): as soon as that is sure, or when more than `patience` items of the leading input wait. The first
-    input that has anything leads when all before it have nothing.
+    With `patience` > 0, sets of at least two items are made without the inputs that have no item near enough
+    (counted in `incomplete`): as soon as that is certain, or when more than `patience` items of the leading input
+    wait. While the inputs before it have no items, the first input that has some leads.
     """
 
     def __init__(self, names: tuple[str, ...], slop_ns: int = 0, depth: int = 60, patience: int = 0) -> None:
-        """Pair the inputs `names`, of which the first leads; no `patience`: every set is complete."""
+        """Synchronise the inputs `names`, of which the first leads; without `patience` every set is complete."""
         self._queues = {name: _Queue() for name in names}
         self._leader = names[0]
         self._patience = patience
@@ -68,46 +68,46 @@ class TimeSynchronizer:
         self.counters: Counter[str] = Counter()
 
     def add(self, name: str, stamp: int, item: Any) -> list[dict[str, tuple[int, Any]]]:
-        """Take one item and return the sets, name -> (stamp, item), that are now complete."""
+        """Add one item and return the sets, name -> (stamp, item), that are now ready."""
         queue = self._queues[name]
-        if queue.last is not None and stamp <= queue.last:
-            if queue.last - stamp < BACKWARD_JUMP_NS:
+        if queue.last_stamp is not None and stamp <= queue.last_stamp:
+            if queue.last_stamp - stamp < BACKWARD_JUMP_NS:
                 self.counters["disordered"] += 1
                 return []
             self.counters["restarts"] += 1
             for other in self._queues.values():
-                self.counters["unpaired"] += other.forget_after(stamp + BACKWARD_JUMP_NS)
-        queue.last = stamp
+                self.counters["unpaired"] += other.drop_after(stamp + BACKWARD_JUMP_NS)
+        queue.last_stamp = stamp
         queue.stamps.append(stamp)
         queue.items.append(item)
-        sets = self._complete(final=False)
+        sets = self._pop_sets(final=False)
         if len(queue.stamps) > self._depth:
             queue.drop(1)
             self.counters["dropped"] += 1
         return sets
 
     def flush(self) -> list[dict[str, tuple[int, Any]]]:
-        """Return the sets of what waits, as if nothing more came, and forget the rest."""
-        sets = self._complete(final=True)
+        """Return the sets of the waiting items as if the input had ended; drop the rest."""
+        sets = self._pop_sets(final=True)
         for queue in self._queues.values():
-            self.counters["unpaired"] += queue.forget_after(-1)
+            self.counters["unpaired"] += queue.drop_after(-1)
         return sets
 
     def reset(self) -> None:
-        """Forget everything that waits."""
+        """Drop everything that waits."""
         self._queues = {name: _Queue() for name in self._queues}
 
-    def _complete(self, final: bool) -> list[dict[str, tuple[int, Any]]]:
+    def _pop_sets(self, final: bool) -> list[dict[str, tuple[int, Any]]]:
         sets: list[dict[str, tuple[int, Any]]] = []
-        while (leader := self._leading(final)) is not None:
+        while (leader := self._choose_leader(final)) is not None:
             stamp = leader.stamps[0]
             impatient = 0 < self._patience < len(leader.stamps)
             indices: dict[str, int] = {}
             for name, queue in self._queues.items():
-                index = queue.nearest(stamp, final or impatient)
+                index = queue.find_nearest(stamp, final or impatient)
                 if index is None:
                     return sets
-                if queue.near(index, stamp, self._slop):
+                if queue.is_near(index, stamp, self._slop):
                     indices[name] = index
             if len(indices) < (min(2, len(self._queues)) if self._patience else len(self._queues)):
                 leader.drop(1)
@@ -122,10 +122,10 @@ class TimeSynchronizer:
                 self._queues[name].drop(index + 1)
         return sets
 
-    def _leading(self, final: bool) -> _Queue | None:
-        """The input whose first item the next set is made around, None while there is nothing to do."""
+    def _choose_leader(self, final: bool) -> _Queue | None:
+        """Return the input whose first item leads the next set; None while there is nothing to do."""
         first = self._queues[self._leader]
         if first.stamps or not self._patience:
             return first if first.stamps else None
-        least = 1 if final else self._patience + 1
-        return next((queue for queue in self._queues.values() if len(queue.stamps) >= least), None)
+        min_items = 1 if final else self._patience + 1
+        return next((queue for queue in self._queues.values() if len(queue.stamps) >= min_items), None)

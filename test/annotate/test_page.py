@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page, ViewportSize
 
-from flowing_puppet_ros.annotate.store import FILE
+from flowing_puppet_ros.annotate.store import FILE_NAME
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
+
+pytestmark = pytest.mark.slow
 
 ELBOW = JOINT_NAMES[10].index("left_elbow")
 WINDOW = ViewportSize(width=1100, height=700)
@@ -47,7 +49,7 @@ class Tool:
         return self.process.wait(20)
 
     def people(self, key: str) -> list[dict[str, Any]]:
-        path = self.folder / FILE
+        path = self.folder / FILE_NAME
         return list(json.loads(path.read_text())["images"].get(key, [])) if path.exists() else []
 
     def open(self, context: Any, key: str = "") -> Page:
@@ -246,8 +248,8 @@ def test_a_broken_image_is_said_and_the_others_go_on(tool: Tool, context: Any) -
 def test_what_cannot_be_served_is_one_sentence(tmp_path: Path, tool: Tool) -> None:
     for arguments, reason in (
         ([str(tool.folder), "--port", "0"], "another run"),
-        ([str(tmp_path / "none")], "no folder"),
-        ([str(tool.folder), "--host", "0.0.0.0"], "names no machine"),
+        ([str(tmp_path / "none")], "not a folder"),
+        ([str(tool.folder), "--host", "0.0.0.0"], "does not name a machine"),
     ):
         command = [sys.executable, "-m", "flowing_puppet_ros", "annotate", *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60)

@@ -11,7 +11,7 @@ import pytest
 from flask.testing import FlaskClient
 
 from flowing_puppet_ros.annotate.folder import ImageFolder
-from flowing_puppet_ros.annotate.server import MOST_REQUEST, make_app
+from flowing_puppet_ros.annotate.server import MAX_REQUEST_BYTES, make_app
 from flowing_puppet_ros.annotate.store import AnnotationStore
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -98,7 +98,7 @@ def test_people_are_carried_by_the_flow(client: FlaskClient) -> None:
     assert carried[0]["gender"] == "female"
 
 
-@pytest.mark.parametrize(("key", "reason"), [("0.png", "none to copy from"), ("1.png", "nobody is annotated")])
+@pytest.mark.parametrize(("key", "reason"), [("0.png", "none to copy from"), ("1.png", "no one is annotated")])
 def test_there_is_nobody_to_carry(client: FlaskClient, key: str, reason: str) -> None:
     answer = client.post("/api/carry", json={"key": key})
     assert answer.status_code == 400
@@ -159,7 +159,7 @@ def test_joints_in_one_place_are_one_sentence(client: FlaskClient) -> None:
 
 
 def test_huge_and_broken_bodies_are_refused(client: FlaskClient) -> None:
-    huge = client.put("/api/annotation", data=b"[" * (MOST_REQUEST + 1), content_type="application/json")
+    huge = client.put("/api/annotation", data=b"[" * (MAX_REQUEST_BYTES + 1), content_type="application/json")
     assert huge.status_code == 413
     broken = client.put("/api/annotation", data=b"{", content_type="application/json")
     assert broken.status_code == 400

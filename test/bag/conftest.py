@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The golden bag and two replays of it, made once."""
+"""The golden bag and a replay of it, made once."""
 
 import json
 from dataclasses import dataclass
@@ -11,25 +11,25 @@ import pytest
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 
 GOLDEN = Path(__file__).resolve().parents[2] / "bags" / "golden"
-SETTINGS = {"visual_hull": {"every": 4}}
+SETTINGS = {"visual_hull": {"hull_every": 4}}
 
 
 @dataclass(frozen=True)
 class Golden:
-    """The golden recording, what is true in it, what a replay is expected to say, and two replays."""
+    """The golden recording, what is true in it, what a replay should say, and a replay with its options."""
 
     source: Path
     truth: dict[str, dict[str, list[float]]]
     expected: dict[str, Any]
-    replays: tuple[Path, Path]
+    replay: Path
+    options: ReplayOptions
     summary: dict[str, Any]
 
 
 @pytest.fixture(scope="session")
 def golden(tmp_path_factory: pytest.TempPathFactory) -> Golden:
-    folder = tmp_path_factory.mktemp("golden")
-    replays = folder / "first" / "out.mcap", folder / "second" / "out.mcap"
+    path = tmp_path_factory.mktemp("golden") / "out.mcap"
     options = ReplayOptions(settings=SETTINGS, progress=False)
-    summaries = [replay(GOLDEN / "golden.mcap", path, options) for path in replays]
+    summary = replay(GOLDEN / "golden.mcap", path, options)
     truth, expected = (json.loads((GOLDEN / f"{name}.json").read_text()) for name in ("truth", "expected"))
-    return Golden(GOLDEN / "golden.mcap", truth, expected, replays, summaries[0])
+    return Golden(GOLDEN / "golden.mcap", truth, expected, path, options, summary)

@@ -20,15 +20,20 @@ TO_OPTICAL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 
 def fitter(**settings: Any) -> BodyFitterComponent:
-    fast = {"local_iterations": 1, "local_particles": 6, "refine_iterations": 6, "cloud_points": 2000}
-    component = BodyFitterComponent(BodyFitterSettings(**{**fast, **settings}), FACTORY)
+    fast = {
+        "fitter.local_iterations": 1,
+        "fitter.local_particles": 6,
+        "fitter.gauss_newton_steps": 6,
+        "fitter.max_points": 2000,
+    }
+    component = BodyFitterComponent(BodyFitterSettings.from_mapping({**fast, **settings}), FACTORY)
     component.set_expected("initial", True)
     return component
 
 
 @pytest.fixture(scope="module")
 def inputs(golden: Any) -> dict[str, list[Any]]:
-    with open_bag(golden.replays[0]) as bag:
+    with open_bag(golden.replay) as bag:
         return {topic: [r.message for r in bag.messages([topic])] for topic in ("/hull", "/hull/joints")}
 
 
@@ -60,7 +65,7 @@ def test_a_fit_does_not_depend_on_the_order_or_on_the_past(inputs: dict[str, lis
 
 
 def test_another_seed_is_another_search(inputs: dict[str, list[Any]], second: Any) -> None:
-    component = fitter(seed=1)
+    component = fitter(**{"fitter.seed": 1})
     component.handle("points", inputs["/hull"][1])
     other = dict(component.handle("initial", inputs["/hull/joints"][1]))["bodies"]
     assert raw(other) != raw(second)
@@ -101,6 +106,7 @@ def test_clouds_of_optical_frames_are_fitted_upright(inputs: dict[str, list[Any]
     assert axes[:, 2] @ [0, -1, 0] > 0.9, "z of the body frame points to the head"
 
 
+@pytest.mark.slow
 def test_each_body_of_the_start_is_fitted_and_a_lost_one_is_deleted(inputs: dict[str, list[Any]]) -> None:
     component = fitter()
     component.set_subscribed("body_meshes", True)

@@ -14,17 +14,19 @@ from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.report.data import gather
+from flowing_puppet_ros.report.data import gather_data
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import BODIES, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 
+pytestmark = pytest.mark.slow
+
 FACTORY = BagMessageFactory()
 FAST = {
-    "local_particles": 6, "local_iterations": 1, "refine_iterations": 6, "cloud_points": 1500, "limb_rounds": 0,
-    "joint_strength": 0.0,
+    "fitter.local_particles": 6, "fitter.local_iterations": 1, "fitter.gauss_newton_steps": 6,
+    "fitter.max_points": 1500, "fitter.max_limb_repairs": 0, "fitter.joint_weight": 0.0,
 }  # fmt: skip
 FOCAL, HEIGHT, WIDTH = 200.0, 240, 320
 AWAY = 2.6
@@ -111,7 +113,7 @@ def test_a_recorded_depth_camera_gives_the_bodies_that_it_gives_live(encoding: s
     with open_bag(tmp_path / "out.mcap") as out:
         found = list(out.messages(["/rig/depth/bodies"]))
         assert out.details["/rig/depth/camera_info"].count == 2, "a viewer needs the calibration"
-    live = BodyFitterComponent(BodyFitterSettings(**FAST), FACTORY)  # type: ignore[arg-type]
+    live = BodyFitterComponent(BodyFitterSettings.from_mapping(FAST), FACTORY)
     live.set_expected("initial", True)
     ports = {f"/rig/depth/{name}": "depth"}
     inputs = [(ports.get(topic, topic.rpartition("/")[2]), message) for topic, _, message in stream]
@@ -127,7 +129,7 @@ def test_a_recorded_depth_camera_gives_the_bodies_that_it_gives_live(encoding: s
         off = np.median([found - true for true, found in common], axis=0)
         assert len(common) > 12 and np.abs(off).max() < 0.04, "where the depth has it, not where it was believed"
     if encoding == "16UC1":
-        scene = gather(bag, tmp_path / "out.mcap").scene
+        scene = gather_data(bag, tmp_path / "out.mcap").scene
         assert scene is not None and len(scene["frames"]) == 2
         assert all(len(frame["points"]) > 1000 for frame in scene["frames"]), (
             "a report shows the bodies in their points"

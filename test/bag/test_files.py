@@ -150,10 +150,10 @@ def database(path: Path) -> None:
     ("name", "make", "sentence"),
     [
         ("missing.mcap", lambda path: None, "there is no bag"),
-        ("text.mcap", lambda path: path.write_text("hello"), "is no ROS 2 bag that can be read"),
-        ("text.txt", lambda path: path.write_text("hello"), "is no ROS 2 bag that can be read"),
-        ("empty.mcap", lambda path: path.touch(), "is no ROS 2 bag that can be read"),
-        ("cats.db3", database, "is no ROS 2 bag that can be read"),
+        ("text.mcap", lambda path: path.write_text("hello"), "is not a readable ROS 2 bag"),
+        ("text.txt", lambda path: path.write_text("hello"), "is not a readable ROS 2 bag"),
+        ("empty.mcap", lambda path: path.touch(), "is not a readable ROS 2 bag"),
+        ("cats.db3", database, "is not a readable ROS 2 bag"),
         ("folder", lambda path: path.mkdir(), "has no metadata.yaml and 0 bag files"),
     ],
 )

@@ -98,7 +98,7 @@ def test_messages_are_in_the_pixels_and_frames_of_the_videos(recipe: ModuleType,
     frames.add(found["/tf_static"])
     for name in calibration:
         info = found[f"/{name}/camera_info"]
-        placed = frames.pose(info.header.frame_id, frames.root(info.header.frame_id))
+        placed = frames.lookup_pose(info.header.frame_id, frames.find_root(info.header.frame_id))
         assert placed is not None
         position, rotation = placed
         local = rotation.T @ (point - position)

@@ -29,7 +29,7 @@ SHOWN_BY = {
 @pytest.fixture(scope="module")
 def topics(golden: Any) -> dict[str, str]:
     """Topics and types of the demo's output: those of the golden replay under the names of the demo's cameras."""
-    with open_bag(golden.replays[0]) as bag:
+    with open_bag(golden.replay) as bag:
         held = {name: detail.type for name, detail in bag.details.items() if detail.count}
     cameras = [f"cam{number:02d}" for number in range(1, 5)]
     assert set(cameras) == set(tomllib.loads((CONFIG.parent / "bags" / "calibration.toml").read_text()))
@@ -59,11 +59,11 @@ def test_rviz_shows_topics_of_its_displays_types(topics: dict[str, str]) -> None
 
 def test_the_fixed_frame_holds_everything(golden: Any, layout: dict[str, Any]) -> None:
     frames = FrameTree()
-    with open_bag(golden.replays[0]) as bag:
+    with open_bag(golden.replay) as bag:
         for record in bag.messages(["/tf_static"]):
             frames.add(record.message)
         shown = {record.message.header.frame_id for record in bag.messages(["/bodies", "/hull", "/part_poses"])}
-    assert {frames.root(frame) for frame in shown} == {rviz()["Global Options"]["Fixed Frame"]} == {"world"}
+    assert {frames.find_root(frame) for frame in shown} == {rviz()["Global Options"]["Fixed Frame"]} == {"world"}
     assert layout["configById"]["3D!bodies"]["followTf"] == "world"
 
 

@@ -10,10 +10,10 @@ from flowing_puppet_ros.body.fit.initialisation import sample_bodies
 from flowing_puppet_ros.body.search import energy, levenberg
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
 from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles
-from flowing_puppet_ros.body.search.part_points import PartPoints, part_points
+from flowing_puppet_ros.body.search.part_points import PartPoints, build_part_points
 from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.schedule import four_stages
-from flowing_puppet_ros.evaluate.body.synthetic_scans import surface_samples
+from flowing_puppet_ros.evaluate.body.synthetic_scans import sample_surface
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.inference import diverse
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -28,13 +28,13 @@ def model() -> StitchedPuppet:
 
 @pytest.fixture(scope="module")
 def points(model: StitchedPuppet) -> tuple[PartPoints, ...]:
-    return part_points(model)
+    return build_part_points(model)
 
 
 @pytest.fixture(scope="module")
 def grid(model: StitchedPuppet) -> CloudGrid:
     rng = np.random.default_rng(1)
-    cloud, normals = surface_samples(model.vertices(model.sample(rng)), model.faces, rng, 3000)
+    cloud, normals = sample_surface(model.vertices(model.sample(rng)), model.faces, rng, 3000)
     return CloudGrid.build(cloud + 0.003 * rng.standard_normal(cloud.shape), normals)
 
 
@@ -75,10 +75,10 @@ def test_costs_are_the_same(
     model: StitchedPuppet, points: tuple[PartPoints, ...], grid: CloudGrid, start: list[Particles]
 ) -> None:
     targets = _targets(model)
-    fast = [ScoredParticles.judge(p, group, grid, targets) for p, group in zip(points, start, strict=True)]
+    fast = [ScoredParticles.score(p, group, grid, targets) for p, group in zip(points, start, strict=True)]
     cloud = plain_search.PlainCloud.of_grid(grid)
     for part, group in enumerate(fast):
-        slow = ScoredParticles.judge(points[part], start[part], cloud, targets)
+        slow = ScoredParticles.score(points[part], start[part], cloud, targets)
         np.testing.assert_allclose(group.distance, slow.distance, rtol=1e-9)
         np.testing.assert_array_equal(group.mismatch, slow.mismatch)
     for edge, (a, b) in enumerate(model.tree.edges):

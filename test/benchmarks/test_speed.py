@@ -31,6 +31,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(streams, "FRAMES", 3)
 
 
+@pytest.mark.slow
 def test_each_step_is_compared_with_the_plain_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "look-ups", "steps", "search", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
@@ -43,6 +44,7 @@ def test_each_step_is_compared_with_the_plain_one(capsys: pytest.CaptureFixture[
     assert 0 <= looked["grid_too_far_mm"] < 25
 
 
+@pytest.mark.slow
 def test_growth_changes_one_size_at_a_time(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "growth", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out)["growth"]
@@ -55,11 +57,11 @@ def test_tracking_is_measured_without_the_first_search(monkeypatch: pytest.Monke
 
     def fit(fitter: BodyFitter, points: Any, normals: Any, *, viewpoint: Any, **_: Any) -> BodyFit:
         searched.append(viewpoint is None)
-        return fitter.result(made._body, fitter.cloud(points, normals, viewpoint))
+        return fitter.assess(made._body, fitter.prepare_cloud(points, normals, viewpoint))
 
     monkeypatch.setattr(BodyFitter, "fit", fit)
     made = speed.Bench()
-    rows = made.tracking()
+    rows = made.measure_tracking()
     assert [row["sides"] for row in rows] == ["all", "one"]
     assert [row["searched"] for row in rows] == [1, 1]
     assert searched == [True, False]
@@ -75,12 +77,12 @@ def test_images_are_measured_by_size_and_people_who_are_all_tracked(capsys: pyte
 
 def test_a_fit_is_compared_with_gradients_at_equal_time_and_at_equal_error() -> None:
     curve = np.array([[1.0, 0.30], [2.0, 0.10], [4.0, 0.04], [9.0, 0.02]])
-    row = peer_runs.gradient_row(0.05, 3.0, curve)
+    row = peer_runs.compare_curve(0.05, 3.0, curve)
     assert row["gradient_cm_then"] == pytest.approx(10)
     assert row["gradient_seconds_as_good"] == 4.0
     assert row["gradient_cm_end"] == pytest.approx(2)
-    assert peer_runs.gradient_row(0.01, 0.5, curve)["gradient_seconds_as_good"] == float("inf")
-    assert np.isnan(peer_runs.gradient_row(0.01, 0.5, curve)["gradient_cm_then"])
+    assert peer_runs.compare_curve(0.01, 0.5, curve)["gradient_seconds_as_good"] == float("inf")
+    assert np.isnan(peer_runs.compare_curve(0.01, 0.5, curve)["gradient_cm_then"])
 
 
 def test_a_peer_is_installed_once_and_speaks_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,11 +126,11 @@ def test_unusable_arguments_of_peers_are_named(
 
 def test_tables_are_headed_by_what_was_measured(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", "look-ups"]) == 0
-    assert capsys.readouterr().out.startswith("look-ups: Closest points by the grid")
+    assert capsys.readouterr().out.startswith("look-ups: Measure closest points by the grid")
 
 
 @pytest.mark.parametrize(
-    ("flags", "named"), [(["nothing"], "'nothing' is no part"), (["--seed", "-2"], "--seed is -2")]
+    ("flags", "named"), [(["nothing"], "'nothing' is not a part"), (["--seed", "-2"], "--seed is -2")]
 )
 def test_unusable_arguments_are_named(flags: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["bench", *flags]) == 2
@@ -137,4 +139,4 @@ def test_unusable_arguments_are_named(flags: list[str], named: str, capsys: pyte
 
 def test_the_parts_are_the_benchs_own() -> None:
     measured = [name for name in vars(speed.Bench) if not name.startswith("_")]
-    assert [part.replace("-", "_") for part in PARTS] == measured
+    assert ["measure_" + part.replace("-", "_") for part in PARTS] == measured

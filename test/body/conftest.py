@@ -3,11 +3,11 @@
 
 import pytest
 
-from flowing_puppet_ros.body.search.part_points import PartPoints, part_points
+from flowing_puppet_ros.body.search.part_points import PartPoints, build_part_points
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 
 @pytest.fixture(scope="session")
 def points(model: StitchedPuppet) -> tuple[PartPoints, ...]:
     """Return the points of every part of the neutral model."""
-    return part_points(model)
+    return build_part_points(model)

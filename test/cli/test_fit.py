@@ -15,13 +15,15 @@ from flowing_puppet_ros.body.scans.scan import read_scan
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
+pytestmark = pytest.mark.slow
+
 FAST = ["--particles", "4", "--iterations", "3", "--local-particles", "4", "--local-iterations", "0", "--restarts", "0"]
-FAST += ["--lm-steps", "2", "--refine-iterations", "10", "--cloud-points", "1500", "--no-surface-finish"]
-FAST += ["--limb-rounds", "0"]
+FAST += ["--levenberg-steps", "2", "--gauss-newton-steps", "10", "--max-points", "1500", "--no-nonrigid"]
+FAST += ["--max-limb-repairs", "0"]
 
 
 def fitted(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, list[dict[str, Any]], list[str]]:
-    """Exit status, the JSON objects and the sentences on stderr."""
+    """Return the exit status, the JSON objects and the sentences on stderr."""
     status = main(["fit", *map(str, arguments), "--json"])
     output = capsys.readouterr()
     sentences = [line for line in output.err.replace("\r", "\n").splitlines() if "flowing-puppet fit:" in line]
@@ -75,7 +77,7 @@ def test_every_field_of_the_contract(
 
 
 def _in_the_input_frame(fit: dict[str, np.ndarray], points: np.ndarray) -> None:
-    """Everything lies in millimetres at the input's place, and up is y."""
+    """Check that everything is in millimetres at the input's place, with y up."""
     np.testing.assert_allclose(fit["vertices"].mean(axis=0), points.mean(axis=0), atol=100)
     np.testing.assert_allclose(np.ptp(fit["vertices"][:, 1]), np.ptp(points[:, 1]), rtol=0.1)
     joint = dict(zip(fit["joint_names"].tolist(), fit["joints"], strict=True))
@@ -112,8 +114,8 @@ def test_people_of_a_scene_become_files_of_their_own(
     arguments: list[str | Path] = ["--scene", "--view", "full", "--out", tmp_path / "o", *FAST]
     inputs = [tmp_path / "hall.npy", tmp_path / "empty_hall.npy"]
     status, (summary, empty), sentences = fitted(capsys, *inputs, *arguments)
-    assert status == 1 and "nobody" in empty["error"]
-    assert [sentence for sentence in sentences if "empty_hall" in sentence and "nobody" in sentence]
+    assert status == 1 and "shows no person" in empty["error"]
+    assert [sentence for sentence in sentences if "empty_hall" in sentence and "shows no person" in sentence]
     assert len(summary["people"]) == 2
     middles = []
     for number, person in enumerate(summary["people"], start=1):

@@ -13,7 +13,7 @@ from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order, render_labels
 
 MODEL = DeformableStructures.load()
-JOINTS = MODEL.likely().joints * 70 + [110, 60]
+JOINTS = MODEL.likely_puppet().joints * 70 + [110, 60]
 QUICK = ("--particles", "12", "--iterations", "1")
 
 
@@ -80,6 +80,7 @@ def test_models_and_parts_by_choice(tmp_path: Path, person: Path, init: Path) ->
     assert sum(puppet["gender_probability"].values()) == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(1, 1), (200, 220), (20, 3000)])
 def test_images_without_a_person_have_none(tmp_path: Path, shape: tuple[int, int]) -> None:
     path, out = tmp_path / "empty.png", tmp_path / "poses.json"
@@ -98,7 +99,7 @@ def test_a_folder_with_a_broken_image_is_done_but_for_that(
     (folder / "c.png").write_bytes(person.read_bytes())
     assert main(["pose", str(folder), "--out", str(out), "--init", str(init), *QUICK]) == 1
     assert [len(frame["puppets"]) for frame in poses(out)["frames"]] == [1, 2]
-    assert "b.png is no readable image" in capsys.readouterr().err
+    assert "b.png is not a readable image" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("case", ["missing", "broken", "video", "output", "late", "folder", "value"])

@@ -6,7 +6,7 @@ import colorsys
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.draw.flow_colour import flow_legend, flow_scale, flow_to_rgb
+from flowing_puppet_ros.draw.flow_colour import draw_flow_legend, flow_scale, flow_to_rgb
 
 
 def colour(u: float, v: float, scale: float = 1.0) -> tuple[int, int, int]:
@@ -59,6 +59,6 @@ def test_scale_ignores_unknown_pixels_and_outliers() -> None:
 
 
 def test_legend_shows_the_motion_from_its_centre() -> None:
-    legend = flow_legend(101)
+    legend = draw_flow_legend(101)
     assert (legend[0, 0] == 255).all() and (legend[50, 50] > 245).all()
     assert legend[50, 99, 0] == 255 and legend[50, 99, 1] < 20

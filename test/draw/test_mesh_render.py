@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.draw.mesh_render import Canvas, orthographic, render
+from flowing_puppet_ros.draw.mesh_render import Canvas, fit_orthographic_camera, render
 
 BOX = np.array([[x, y, z] for x in (-0.2, 0.2) for y in (-0.3, 0.3) for z in (-0.5, 0.5)])
 # Faces of the box, counter-clockwise seen from outside.
@@ -22,7 +22,7 @@ class Pinhole:
 
 def test_orthographic_view_has_the_size_of_the_box() -> None:
     size = (200, 220)
-    camera = orthographic(BOX, looking=(-1, 0, 0), size=size, margin=0.05)
+    camera = fit_orthographic_camera(BOX, direction=(-1, 0, 0), size=size, margin=0.05)
     picture = render(BOX, FACES, camera, size)
     rows, columns = np.nonzero(picture.mask)
     assert np.ptp(rows) + 1 == pytest.approx(198, abs=1.5)  # 1 m high fills 90 % of 220 rows
@@ -34,13 +34,15 @@ def test_orthographic_view_has_the_size_of_the_box() -> None:
 
 
 def test_front_view_shows_the_persons_left_on_the_right() -> None:
-    pixels, depth = orthographic(BOX, (-1, 0, 0), (100, 100)).project(np.array([[0, 0.3, 0], [0, 0, 0.4], [0.2, 0, 0]]))
+    pixels, depth = fit_orthographic_camera(BOX, (-1, 0, 0), (100, 100)).project(
+        np.array([[0, 0.3, 0], [0, 0, 0.4], [0.2, 0, 0]])
+    )
     assert pixels[0, 0] > 60 and pixels[1, 1] < 30
     assert depth[2] < depth[0]
 
 
 def test_fixed_scale_is_kept() -> None:
-    camera = orthographic(BOX, (0, -1, 0), (300, 300), scale=123.0)
+    camera = fit_orthographic_camera(BOX, (0, -1, 0), (300, 300), scale=123.0)
     pixels, _ = camera.project(np.array([[0, 0, 0], [0, 0, 1.0]]))
     assert np.linalg.norm(pixels[1] - pixels[0]) == pytest.approx(123)
 
@@ -51,8 +53,8 @@ def test_nearest_surface_wins_in_any_order(near_first: bool) -> None:
     canvas = Canvas(Pinhole(), (200, 200))
     meshes = [(near, (255, 0, 0)), (far, (0, 0, 255))]
     for vertices, colour in meshes if near_first else meshes[::-1]:
-        canvas.mesh(vertices, FACES, colour)
-    rgb = canvas.picture().rgb
+        canvas.draw_mesh(vertices, FACES, colour)
+    rgb = canvas.compose().rgb
     assert rgb[100, 100, 0] > 100 and rgb[100, 100, 2] == 0
 
 
@@ -65,14 +67,14 @@ def test_perspective_mesh_stands_where_its_projection_is() -> None:
 
 
 def test_inside_faces_are_darker() -> None:
-    camera = orthographic(BOX, (-1, 0, 0), (80, 80))
+    camera = fit_orthographic_camera(BOX, (-1, 0, 0), (80, 80))
     outside = render(BOX, FACES, camera, (80, 80), smooth=False).rgb[40, 40]
     inside = render(BOX, FACES[:, ::-1], camera, (80, 80), smooth=False).rgb[40, 40]
     assert (inside.astype(int) < outside.astype(int) - 60).all()
 
 
 def test_face_and_vertex_colours() -> None:
-    camera = orthographic(BOX, (-1, 0, 0), (80, 80))
+    camera = fit_orthographic_camera(BOX, (-1, 0, 0), (80, 80))
     per_face = np.zeros((len(FACES), 3))
     per_face[2:4] = (0, 200, 0)  # the side at +x, that the camera sees
     assert render(BOX, FACES, camera, (80, 80), per_face).rgb[40, 40].argmax() == 1
@@ -91,8 +93,8 @@ def test_faces_behind_the_camera_and_nan_are_left_out() -> None:
 
 def test_points_are_discs_hidden_by_nearer_ones() -> None:
     canvas = Canvas(Pinhole(), (200, 200), samples=1)
-    canvas.points(np.array([[0, 0, 0], [1.0, 0, 0]]), np.array([[255, 0, 0], [0, 0, 255]]), radius=4)
-    picture = canvas.picture()
+    canvas.draw_points(np.array([[0, 0, 0], [1.0, 0, 0]]), np.array([[255, 0, 0], [0, 0, 255]]), radius=4)
+    picture = canvas.compose()
     red = (picture.rgb == (255, 0, 0)).all(axis=2)
     assert red.sum() == sum(x * x + y * y <= 16 for x in range(-4, 5) for y in range(-4, 5))
     assert not (picture.rgb == (0, 0, 255)).all(axis=2).any()
@@ -101,7 +103,7 @@ def test_points_are_discs_hidden_by_nearer_ones() -> None:
 def test_opacity_blends_with_the_background_image() -> None:
     background = np.full((200, 200, 3), 100, np.uint8)
     canvas = Canvas(Pinhole(), (200, 200))
-    canvas.mesh(BOX, FACES, (200, 0, 0))
-    full, half = canvas.picture(background).rgb, canvas.picture(background, opacity=0.5).rgb
+    canvas.draw_mesh(BOX, FACES, (200, 0, 0))
+    full, half = canvas.compose(background).rgb, canvas.compose(background, opacity=0.5).rgb
     assert (full[0, 0] == 100).all() and (half[0, 0] == 100).all()
     assert np.abs(half.astype(float) - (full.astype(float) + 100) / 2).max() <= 1

@@ -69,17 +69,17 @@ def test_puppets_outside_the_image_and_grey_images() -> None:
 
 
 def test_labels_write_beside_the_puppet() -> None:
-    image, big = np.full((420, 600, 3), 50, np.uint8), puppet().placed(3)
+    image, big = np.full((420, 600, 3), 50, np.uint8), puppet().transform(3)
     plain, labelled = (draw_puppets(image, [big], labels=flag) for flag in (False, True))
     changed = (plain != labelled).any(axis=2)
     assert changed[:, 380:].any() and changed[:, :110].any() and changed[:114].any()
 
 
 def test_placed_keeps_pixel_centres() -> None:
-    half = puppet().placed(0.5)
+    half = puppet().transform(0.5)
     assert half.joints[0] == pytest.approx([74.75, 14.75])  # (x + 0.5) / 2 - 0.5
     assert half.contours[0][0] == pytest.approx([19.75, 19.75])
-    cropped = puppet().placed(1.0, (10, 20))
+    cropped = puppet().transform(1.0, (10, 20))
     assert cropped.joints[0] == pytest.approx([140, 10]) and cropped.contours[0][0] == pytest.approx([30, 20])
 
 

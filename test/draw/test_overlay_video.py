@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.draw.overlay import DrawnPuppet
-from flowing_puppet_ros.draw.overlay_video import check_overlay, drawn_tracks, write_overlay
+from flowing_puppet_ros.draw.overlay_video import check_overlay, read_drawn_tracks, write_overlay
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.tracks_json import write_tracks
 
@@ -72,7 +72,7 @@ def test_tracks_are_read_line_by_line(tmp_path: Path) -> None:
     frames = [{"index": 0, "puppets": []}, {"index": 3, "puppets": [entry]}]
     write_tracks(tmp_path / "t.json", ("neck", "face"), 30.0, frames)
     assert json.loads((tmp_path / "t.json").read_text())["frames"] == frames
-    (first, nobody), (second, (drawn,)) = drawn_tracks(tmp_path / "t.json")
+    (first, nobody), (second, (drawn,)) = read_drawn_tracks(tmp_path / "t.json")
     assert (first, nobody, second) == (0, [], 3)
     assert drawn.order == (1, 0)
     assert np.isnan(drawn.joints[1]).all()

@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.draw.palette import PART_COLOURS, part_colours
-from flowing_puppet_ros.draw.pictures import caption, contact_sheet, data_uri, row, save, shrink
+from flowing_puppet_ros.draw.pictures import add_caption, encode_data_uri, join_row, make_contact_sheet, save, shrink
 from flowing_puppet_ros.errors import InputError
 
 
 def test_contact_sheet_places_every_image() -> None:
     images = [np.full((10, 20, 3), value, np.uint8) for value in (10, 20, 30)]
-    sheet = contact_sheet(images, columns=2, gap=2)
+    sheet = make_contact_sheet(images, columns=2, gap=2)
     assert sheet.shape == (2 * 12 + 2, 2 * 22 + 2, 3)
     for value in (10, 20, 30):
         assert (sheet[..., 0] == value).sum() == 200
 
 
 def test_row_has_one_height() -> None:
-    joined = row([np.zeros((40, 20, 3), np.uint8), np.zeros((20, 20, 3), np.uint8)], height=20, gap=4)
+    joined = join_row([np.zeros((40, 20, 3), np.uint8), np.zeros((20, 20, 3), np.uint8)], height=20, gap=4)
     assert joined.shape == (20, 10 + 4 + 20, 3)
 
 
@@ -34,12 +34,12 @@ def test_shrink_keeps_the_aspect_and_small_images() -> None:
 
 def test_caption_leaves_the_original_alone() -> None:
     image = np.zeros((40, 120, 3), np.uint8)
-    assert caption(image, "front").max() > 200 and image.max() == 0
+    assert add_caption(image, "front").max() > 200 and image.max() == 0
 
 
 def test_png_data_uri_holds_the_rgb_pixels() -> None:
     image = np.random.default_rng(0).integers(0, 255, (6, 5, 3), dtype=np.uint8)
-    kind, data = data_uri(image, "png").split(",", 1)
+    kind, data = encode_data_uri(image, "png").split(",", 1)
     assert kind == "data:image/png;base64"
     decoded = cv2.imdecode(np.frombuffer(base64.b64decode(data), np.uint8), cv2.IMREAD_COLOR)
     assert np.array_equal(np.asarray(decoded)[..., ::-1], image)

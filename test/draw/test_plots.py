@@ -10,14 +10,14 @@ import pytest
 from flowing_puppet_ros.draw.plots import (
     HEIGHT,
     LEFT,
-    MOST_POINTS,
+    MAX_POINTS,
     RIGHT,
     TOP,
     WIDTH,
     Series,
-    heat_strip,
-    line_plot,
-    ramp,
+    colour_ramp,
+    draw_heat_strip,
+    draw_line_plot,
     ticks,
 )
 
@@ -35,7 +35,7 @@ def points(html: str) -> np.ndarray:
 
 
 def test_line_plot_is_to_scale() -> None:
-    html = line_plot([Series("<error>", X, 2 * X)], "Error & more", "time [s]", "px")
+    html = draw_line_plot([Series("<error>", X, 2 * X)], "Error & more", "time [s]", "px")
     assert svg_of(html).tag == "svg"
     assert "&lt;error&gt;" in html and "Error &amp; more" in html
     drawn = points(html)
@@ -46,28 +46,28 @@ def test_line_plot_is_to_scale() -> None:
 
 def test_unknown_values_break_the_line_and_single_points_are_dots() -> None:
     y = np.array([1.0, 2.0, np.nan, 3.0, np.nan])
-    html = line_plot([Series("a", X, y)], "t", "x", "y")
+    html = draw_line_plot([Series("a", X, y)], "t", "x", "y")
     assert html.count("<circle") == 1 and len(points(html)) == 2
     assert "nan" not in html.lower()
 
 
 def test_nothing_known_gives_nothing() -> None:
-    assert line_plot([Series("a", X, np.full(5, np.nan))], "t", "x", "y") == ""
-    assert line_plot([], "t", "x", "y") == ""
-    assert heat_strip([], np.zeros((0, 0)), np.zeros(0), "t", "x") == ""
+    assert draw_line_plot([Series("a", X, np.full(5, np.nan))], "t", "x", "y") == ""
+    assert draw_line_plot([], "t", "x", "y") == ""
+    assert draw_heat_strip([], np.zeros((0, 0)), np.zeros(0), "t", "x") == ""
 
 
 def test_constant_lines_and_single_frames_can_be_drawn() -> None:
     for y in (np.zeros(5), np.full(5, -3.0), np.full(5, 1e9)):
-        assert "nan" not in line_plot([Series("a", X, y)], "t", "x", "y", from_zero=False).lower()
-    assert "<circle" in line_plot([Series("a", X[:1], X[:1])], "t", "x", "y")
-    assert "<svg" in heat_strip(["torso"], np.ones((1, 1)), np.zeros(1), "t", "x")
+        assert "nan" not in draw_line_plot([Series("a", X, y)], "t", "x", "y", from_zero=False).lower()
+    assert "<circle" in draw_line_plot([Series("a", X[:1], X[:1])], "t", "x", "y")
+    assert "<svg" in draw_heat_strip(["torso"], np.ones((1, 1)), np.zeros(1), "t", "x")
 
 
 def test_long_lines_are_averaged() -> None:
     x = np.arange(5000.0)
-    drawn = points(line_plot([Series("a", x, x)], "t", "x", "y"))
-    assert len(drawn) == MOST_POINTS
+    drawn = points(draw_line_plot([Series("a", x, x)], "t", "x", "y"))
+    assert len(drawn) == MAX_POINTS
     assert np.allclose(np.diff(drawn[:, 1]), np.diff(drawn[:, 1]).mean(), atol=0.11)
 
 
@@ -82,11 +82,11 @@ def test_ticks_are_round_and_inside(low: float, high: float) -> None:
 
 
 def test_heat_strip_names_its_rows() -> None:
-    html = heat_strip(["torso", "left_hand"], np.array([[0, 0.5], [np.nan, 1]]), X[:2], "confidence", "time [s]")
+    html = draw_heat_strip(["torso", "left_hand"], np.array([[0, 0.5], [np.nan, 1]]), X[:2], "confidence", "time [s]")
     texts = [element.text for element in svg_of(html).iter("text")]
     assert {"torso", "left_hand", "time [s]"} <= set(texts)
 
 
 def test_ramp_gets_lighter() -> None:
-    lightness = ramp(np.linspace(0, 1, 20)) @ [0.2126, 0.7152, 0.0722]
+    lightness = colour_ramp(np.linspace(0, 1, 20)) @ [0.2126, 0.7152, 0.0722]
     assert (np.diff(lightness) > 0).all()

@@ -40,7 +40,7 @@ def test_large_images_are_reduced_and_the_flow_stays_in_their_pixels() -> None:
     forward, _ = flow(rgb[:, 40:], rgb[:, :-40])
     assert forward.shape == (880, 1160, 2)
     np.testing.assert_allclose(np.median(forward, axis=(0, 1)), [40, 0], atol=1.5)
-    small, _ = flow.at_working_scale(rgb[:, 40:], rgb[:, :-40])
+    small, _ = flow.estimate_at_working_scale(rgb[:, 40:], rgb[:, :-40])
     assert small.shape == (228, 300, 2)
     np.testing.assert_allclose(np.median(small, axis=(0, 1)), [40 * 300 / 1160, 0], atol=0.4)
 

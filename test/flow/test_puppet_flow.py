@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from flowing_puppet_ros.flow.puppet_flow import explained_fraction, motion_field, part_motions, puppet_flow
+from flowing_puppet_ros.flow.puppet_flow import explained_fraction, fit_part_motions, fit_puppet_flow, motion_field
 
 
 def layered() -> tuple[np.ndarray, np.ndarray]:
@@ -18,7 +18,7 @@ def layered() -> tuple[np.ndarray, np.ndarray]:
 
 def test_field_follows_the_layers_and_explains_them() -> None:
     labels, flow = layered()
-    result = puppet_flow(labels, flow)
+    result = fit_puppet_flow(labels, flow)
     np.testing.assert_allclose(result.field, flow, atol=0.05)
     np.testing.assert_allclose(result.background, np.array([[1, 0, 0], [0, 1, -0.5]]), atol=1e-3)
     assert result.affine.shape == (3, 2, 3)
@@ -38,7 +38,7 @@ def test_explained_counts_the_pixels_under_parts_alone() -> None:
 
 def test_a_hidden_part_moves_with_its_neighbours_and_a_hidden_person_with_the_background() -> None:
     labels, flow = layered()
-    motions, background = part_motions(labels, (-1, 0, 1, -1, 3), flow)
+    motions, background = fit_part_motions(labels, (-1, 0, 1, -1, 3), flow)
     np.testing.assert_allclose(motions.affine[1], (motions.affine[0] + motions.affine[2]) / 2)
     np.testing.assert_array_equal(motions.affine[3:], [background, background])
     assert motions.known.tolist() == [True, False, True, False, False]
@@ -46,7 +46,7 @@ def test_a_hidden_part_moves_with_its_neighbours_and_a_hidden_person_with_the_ba
 
 def test_hidden_chain_takes_the_motion_of_the_nearest_visible_part() -> None:
     labels, flow = layered()
-    motions, _ = part_motions(np.where(labels == 1, 1, 0).astype(np.uint8), (-1, 0, 1, 2), flow)
+    motions, _ = fit_part_motions(np.where(labels == 1, 1, 0).astype(np.uint8), (-1, 0, 1, 2), flow)
     np.testing.assert_array_equal(motions.affine[1:], np.repeat(motions.affine[:1], 3, axis=0))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Work for the tests of batches, which the processes that they start can import."""
+"""Work for the tests of batches, importable by the processes that they start."""
 
 import os
 import signal
@@ -12,13 +12,13 @@ from flowing_puppet_ros.errors import InputError
 
 @dataclass(frozen=True)
 class Plan:
-    """What the work below does with some inputs."""
+    """Options of the work below: where to leave marks."""
 
     marks: Path
 
 
 def work(source: Path, plan: Plan) -> dict[str, Any]:
-    """Return the process; leave a mark, die, once or always, or fail for inputs that are called so."""
+    """Return the process; depending on the input's name, leave a mark, die (once or always), or fail."""
     mark = plan.marks / source.name
     if source.name == "dies" or (source.name == "dies_once" and not mark.exists()):
         mark.touch()

@@ -23,7 +23,7 @@ TRUNK = (
 
 
 def joints_of(bend: float = 0.3, raise_left: float = 0.6, raise_right: float = 0.3) -> dict[str, np.ndarray]:
-    """Joints in metres: facing +x, left at +y; arms raised sideways by angles (rad), elbows bent forward."""
+    """Return joints in metres: facing +x, left at +y; arms raised sideways by angles (rad), elbows bent forward."""
     joints = {name: np.array([0.0, 0.0, height]) for name, height in HEIGHTS.items()}
     joints["face"] = np.array([0.04, 0.0, HEIGHTS["face"]])
     for side, sign, lift in (("left", 1.0, raise_left), ("right", -1.0, raise_right)):
@@ -42,7 +42,7 @@ def joints_of(bend: float = 0.3, raise_left: float = 0.6, raise_right: float = 0
 
 
 def cloud_of(joints: dict[str, np.ndarray], count: int = 6000, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Outer surface points (count, 3) and normals (count, 3) of the capsules along the joints."""
+    """Sample outer surface points (count, 3) and normals (count, 3) of the capsules along the joints."""
     mirrored = [(a.replace("left", "right"), b.replace("left", "right"), ra, rb) for a, b, ra, rb in LIMBS]
     capsules = [(joints[a], joints[b], ra, rb) for a, b, ra, rb in (*LIMBS, *mirrored, *TRUNK)]
     for sign in (1.0, -1.0):
@@ -52,7 +52,7 @@ def cloud_of(joints: dict[str, np.ndarray], count: int = 6000, seed: int = 0) ->
 
 
 def dog() -> tuple[np.ndarray, np.ndarray]:
-    """Outer surface points (4000, 3) and normals of a dog 1.2 m long."""
+    """Sample outer surface points (4000, 3) and normals of a dog 1.2 m long."""
     capsules = [
         (np.array([-0.35, 0, 0]), np.array([0.35, 0, 0.02]), 0.14, 0.16),
         (np.array([0.4, 0, 0.1]), np.array([0.55, 0, 0.3]), 0.08, 0.08),

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """People drawn with capsules that move in known ways, and a body model of capsules to track them with.
 
-The model has the interface of the Deformable Structures model, so that the tracker is tested alone.
+The model has the interface of the Deformable Structures model, so the tracker is tested on its own.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ class CapsuleModel:
         return float(np.ptp(self.mean_joints()[[NAMES.index("left_shoulder"), NAMES.index("right_shoulder")], 0]))
 
     def mean_joints(self) -> Floats:
-        """The upright person of `MEAN`."""
+        """Return the upright person of `MEAN`."""
         return np.array(list(MEAN.values()))
 
     def estimate_scale(self, joints: Floats, confidence: Floats) -> float:
-        """Ratio of the joints' spread to that of the same mean joints; InputError from fewer than two places."""
+        """Return the ratio of the joints' spread to that of the mean joints; InputError for fewer than two places."""
         known = np.isfinite(joints).all(axis=1) & (confidence > 0)
         spread = np.linalg.norm(joints[known] - joints[known].mean(axis=0)) if known.sum() > 1 else 0.0
         if not spread > 0:
@@ -79,19 +79,19 @@ class CapsuleModel:
         return float(spread / np.linalg.norm(mean - mean.mean(axis=0)))
 
     def estimate_view(self, joints: Floats, confidence: Floats) -> View:
-        """Front when the left shoulder is right of the right one in the image."""
+        """Return front when the left shoulder is to the right of the right one in the image."""
         left, right = (joints[list(MEAN).index(side + "_shoulder"), 0] for side in ("left", "right"))
         return "back" if left < right else "front"
 
     def complete_joints(self, joints: Floats, confidence: Floats, scale: float, view: View) -> Floats:
-        """Unknown joints where the mean person has them around the known ones."""
+        """Place unknown joints where the mean person has them relative to the known ones."""
         known = np.isfinite(joints).all(axis=1)
         mean = self.mean_joints() * scale * np.array([1.0 if view == "front" else -1.0, 1.0])
         offset = (joints[known] - mean[known]).mean(axis=0)
         return np.where(known[:, None], joints, mean + offset)
 
     def puppet_from_joints(self, joints: Floats, scale: float, view: View = "front") -> PuppetShape:
-        """Capsules around the bones."""
+        """Put capsules around the bones."""
         contours = []
         for name, (a, b) in zip(self.tree.names, self.bone, strict=True):
             radius = RADIUS[name.removeprefix("right_").removeprefix("left_")] * scale
@@ -101,17 +101,17 @@ class CapsuleModel:
     def puppets_from_joints(
         self, joints: Floats, scale: Floats, view: View = "front", edges: Sequence[int] | None = None
     ) -> tuple[tuple[Floats, ...], Floats]:
-        """The same for P persons (P, J, 2): contours (P, K, 2) of every part; no energy."""
+        """Do the same for P people (P, J, 2): return contours (P, K, 2) of every part, and no energy."""
         shapes = [self.puppet_from_joints(own, size, view) for own, size in zip(joints, scale, strict=True)]
         return tuple(np.array(part) for part in zip(*(s.contours for s in shapes), strict=True)), np.zeros(len(joints))
 
     def energy(self, shape: PuppetShape) -> float:
-        """No prior."""
+        """Return 0: there is no prior."""
         return 0.0
 
 
 def capsule(a: Floats, b: Floats, radius: float) -> Floats:
-    """Outline (26, 2) of the points within `radius` of the segment from a to b."""
+    """Return the outline (26, 2) of the points within `radius` of the segment from a to b."""
     along = np.arctan2(b[1] - a[1], b[0] - a[0])
     half = np.linspace(np.pi / 2, 3 * np.pi / 2, 13) + along
     first = a + radius * np.column_stack([np.cos(half), np.sin(half)])
@@ -127,7 +127,7 @@ BACKGROUND = cv2.resize(rng.integers(0, 200, (60, 80, 3)).astype(np.uint8), SIZE
 
 
 def pose(time: float, offset: tuple[float, float] = (150, 118)) -> Floats:
-    """Joints (15, 2) px: the person walks right, and the left forearm swings about its elbow."""
+    """Return the joints (15, 2) px: the person walks right, and the left forearm swings about its elbow."""
     joints = CapsuleModel().mean_joints() * SCALE + offset + [1.5 * time, 0.0]
     elbow, wrist = NAMES.index("left_elbow"), NAMES.index("left_wrist")
     angle = -0.05 * time
@@ -137,9 +137,9 @@ def pose(time: float, offset: tuple[float, float] = (150, 118)) -> Floats:
 
 
 def draw(*people: Floats, shirts: Sequence[tuple[float, float, float]] = ()) -> NDArray[np.uint8]:
-    """A picture in which every capsule carries its own texture along; later people stand before earlier ones.
+    """Draw people whose capsules move with their own texture; later people stand in front of earlier ones.
 
-    `shirts` are the people's colours, shares of red, green and blue that are left of the texture.
+    `shirts` are the people's colours: factors on red, green and blue of the texture.
     """
     image = BACKGROUND.copy()
     for joints, shirt in zip(people, [*shirts, *[(1.0, 1.0, 1.0)] * (len(people) - len(shirts))], strict=True):
@@ -156,16 +156,16 @@ def draw(*people: Floats, shirts: Sequence[tuple[float, float, float]] = ()) -> 
 
 
 def detection(joints: Floats, confidence: float = 0.9) -> Keypoints:
-    """The person as a detector reports it."""
+    """Return the person as a detector reports it."""
     return Keypoints(NAMES, joints.copy(), np.full(len(joints), confidence))
 
 
 def tracker(**settings: float) -> FlowingPuppetTracker:
-    """A tracker with the capsule model."""
+    """Make a tracker with the capsule model."""
     return FlowingPuppetTracker(CapsuleModel(), TrackerSettings(**settings))  # type: ignore[arg-type]
 
 
 def error(result: TrackResult, truth: Floats, name: str) -> float:
-    """Distance in px of the only puppet's joint from where it is."""
+    """Return the distance in px of the only puppet's joint from its true place."""
     (puppet,) = result.puppets
     return float(np.linalg.norm((puppet.joints - truth)[NAMES.index(name)]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Painted upper bodies on cluttered ground, with their joints: pictures to learn a detector from and to try it on."""
+"""Painted upper bodies on a cluttered background, with their joints: images to train and test a detector on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SIZE = (240, 180)
 
 
 def ground(rng: np.random.Generator, size: tuple[int, int] = SIZE) -> NDArray[np.uint8]:
-    """Blotches with a few lines and boxes."""
+    """Paint a background of blotches with a few lines and boxes."""
     image = cv2.resize(rng.integers(0, 256, (7, 9, 3)).astype(np.uint8), size, interpolation=cv2.INTER_CUBIC)
     for _ in range(6):
         a, b = (tuple(int(v) for v in rng.integers(0, size)) for _ in range(2))
@@ -32,7 +32,7 @@ def ground(rng: np.random.Generator, size: tuple[int, int] = SIZE) -> NDArray[np
 
 
 def joints_at(neck: tuple[float, float], scale: float, rng: np.random.Generator) -> Floats:
-    """Joints (11, 2) of somebody with shoulders `scale` px wide, the arms anywhere."""
+    """Return the joints (11, 2) of a person with shoulders `scale` px wide and random arms."""
     place = {"neck": (0.0, 0.0), "belly": (0.0, 1.0), "face": (0.0, -0.45)}
     place |= {"right_shoulder": (-0.5, 0.15), "left_shoulder": (0.5, 0.15)}
     place |= {"right_hip": (-0.3, 1.6), "left_hip": (0.3, 1.6)}
@@ -67,7 +67,7 @@ def paint(image: NDArray[np.uint8], joints: Floats, scale: float, rng: np.random
 def picture(
     rng: np.random.Generator, scale: float | None = None, size: tuple[int, int] = SIZE
 ) -> tuple[NDArray[np.uint8], Floats, float]:
-    """A picture (H, W, 3) with one person, their joints (11, 2) and shoulder width."""
+    """Paint a picture (H, W, 3) with one person; return it, their joints (11, 2) and shoulder width, all in px."""
     width = float(rng.uniform(30, 50)) if scale is None else scale
     neck = rng.uniform((1.2 * width, 0.9 * width), (size[0] - 1.2 * width, size[1] - 1.7 * width))
     joints = joints_at((float(neck[0]), float(neck[1])), width, rng)
@@ -77,5 +77,5 @@ def picture(
 
 
 def keypoints(joints: Floats) -> Keypoints:
-    """The joints as an annotation."""
+    """Return the joints as an annotation."""
     return Keypoints(NAMES, joints, np.ones(len(NAMES)))

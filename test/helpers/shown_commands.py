@@ -13,7 +13,7 @@ from pathlib import Path
 
 import yaml
 
-from flowing_puppet_ros.cli import verb_with_parser
+from flowing_puppet_ros.cli import make_verb_parser
 from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_settings
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,7 +70,7 @@ def _check_verb(given: list[str]) -> None:
     if given == ["--version"] or not given or given[-1] == "--help":
         return
     try:
-        _, parser, left = verb_with_parser(given[0], given[1:])
+        _, parser, left = make_verb_parser(given[0], given[1:])
     except ImportError as error:
         raise WrongCommand(f"there is no verb {given[0]!r}") from error
     said = io.StringIO()
@@ -97,7 +97,7 @@ def _check_node(name: str, given: list[str]) -> None:
             if left not in infos:
                 raise WrongCommand(f"{name} has no parameter {left!r}")
             text = infos[left].type is str
-            infos[left].checked(right if text else yaml.safe_load(right))
+            infos[left].check(right if text else yaml.safe_load(right))
         if option == "--params-file":
             _check_files([value])
         if option not in ("-r", "-p", "--params-file", "--enclave"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Gaussian algebra against densities that are computed another way."""
+"""Gaussian algebra against densities computed independently."""
 
 import numpy as np
 import pytest
@@ -50,6 +50,6 @@ def test_singular_covariance_can_be_sampled() -> None:
     assert samples.std() > 0.1
 
 
-def test_shapes_that_do_not_belong_together_are_refused() -> None:
+def test_shapes_that_do_not_agree_are_refused() -> None:
     with pytest.raises(ValueError, match="covariance of shape"):
         Gaussian(np.zeros(3), np.eye(2))

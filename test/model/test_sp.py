@@ -160,7 +160,7 @@ def test_mirror_image_of_a_body(model: StitchedPuppet) -> None:
     np.testing.assert_array_equal(other[other], np.arange(len(other)))
     state = random_state(model, 7)
     image = model.vertices(state)[other] * MIRROR
-    np.testing.assert_allclose(model.vertices(model.mirrored(state)), image, atol=1e-6)
+    np.testing.assert_allclose(model.vertices(model.mirror(state)), image, atol=1e-6)
 
 
 def test_relative_rotations_are_as_likely_in_the_mirror(model: StitchedPuppet) -> None:

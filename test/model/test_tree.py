@@ -28,7 +28,7 @@ def test_neighbours_are_mutual() -> None:
 
 
 @pytest.mark.parametrize("parents", [(0,), (-1, 2, 1), (-1, -1), ()])
-def test_a_graph_that_is_no_rooted_tree_is_refused(parents: tuple[int, ...]) -> None:
+def test_a_graph_that_is_not_a_rooted_tree_is_refused(parents: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match=r"part tree|come before"):
         PartTree(tuple("abc"[: len(parents)]), parents)
 

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from flowing_puppet_ros.multiview.distance_transform import MAX_DISTANCE, distance_transform, signed_distance
+from flowing_puppet_ros.multiview.distance_transform import MAX_DISTANCE_PX, distance_transform, signed_distance
 
 
 def test_distance_is_the_nearest_pixels() -> None:
@@ -16,9 +16,9 @@ def test_distance_is_the_nearest_pixels() -> None:
 
 
 def test_without_a_mask_everything_is_far() -> None:
-    assert (distance_transform(np.zeros((4, 5), bool)) == MAX_DISTANCE).all()
-    assert (signed_distance(np.zeros((4, 5), np.uint8)) == MAX_DISTANCE - 0.5).all()
-    assert (signed_distance(np.ones((4, 5), np.uint8)) == 0.5 - MAX_DISTANCE).all()
+    assert (distance_transform(np.zeros((4, 5), bool)) == MAX_DISTANCE_PX).all()
+    assert (signed_distance(np.zeros((4, 5), np.uint8)) == MAX_DISTANCE_PX - 0.5).all()
+    assert (signed_distance(np.ones((4, 5), np.uint8)) == 0.5 - MAX_DISTANCE_PX).all()
 
 
 def test_the_sign_changes_half_a_pixel_outside_the_mask() -> None:

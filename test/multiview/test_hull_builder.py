@@ -14,7 +14,7 @@ from flowing_puppet_ros.multiview.hull_builder import CameraObservation, HullBui
 Ring = Callable[..., list[Camera]]
 RADIUS = 0.35
 JOINTS = np.array([[0, 0, 0.3], [0, 0.3, 0], [0, -0.3, 0], [0, 0, -0.3]])
-SETTINGS = HullBuilderSettings(margin=0.2)
+SETTINGS = HullBuilderSettings.from_mapping({"hull.margin": 0.2})
 
 
 def builder(cameras: list[Camera]) -> HullBuilder:
@@ -27,7 +27,7 @@ def builder(cameras: list[Camera]) -> HullBuilder:
 def ball(camera: Camera, radius: float = RADIUS) -> np.ndarray:
     """Labels of a ball at the origin as `camera` sees it."""
     pixels = np.stack(np.meshgrid(*map(np.arange, camera.size)), axis=-1)
-    rays = camera.rays(pixels)
+    rays = camera.cast_rays(pixels)
     gap = np.linalg.norm(np.cross(rays, camera.centre), axis=-1)
     return (gap < radius).astype(np.uint8)
 
@@ -104,7 +104,7 @@ def test_contradicting_cameras_are_a_problem_not_an_error(ring: Ring) -> None:
     assert "no common space" in made.carve(made.segment(views)).problem
 
 
-def test_a_moved_camera_learns_its_background_anew(ring: Ring) -> None:
+def test_a_moved_camera_learns_its_background_again(ring: Ring) -> None:
     made = builder(ring(2))
     for seed in range(4):
         view(made, "cam0", seed)

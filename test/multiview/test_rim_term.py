@@ -9,7 +9,7 @@ import pytest
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.multiview.rim_term import Outline, RimTerm, distances_outside, mesh_edges
+from flowing_puppet_ros.multiview.rim_term import Outline, RimTerm, measure_outside, mesh_edges
 
 Ring = Callable[..., list[Camera]]
 CENTRE, RADII = np.array([0.05, -0.04, 0.1]), np.array([0.25, 0.4, 0.7])
@@ -29,7 +29,7 @@ def sphere(rings: int = 24, sectors: int = 36) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ellipsoid_mask(camera: Camera) -> np.ndarray:
-    rays = camera.rays(np.stack(np.meshgrid(*map(np.arange, camera.size)), axis=-1)) / RADII
+    rays = camera.cast_rays(np.stack(np.meshgrid(*map(np.arange, camera.size)), axis=-1)) / RADII
     offset = (camera.centre - CENTRE) / RADII
     b, a = rays @ offset, (rays**2).sum(axis=-1)
     return np.where(b * b - a * (offset @ offset - 1) >= 0, 255, 0).astype(np.uint8)
@@ -65,7 +65,7 @@ def test_an_ellipsoid_finds_place_and_size(ring: Ring, count: int) -> None:
     np.testing.assert_allclose(radii, RADII, atol=0.008)
 
 
-def test_a_body_on_its_outlines_is_hardly_drawn(ring: Ring) -> None:
+def test_a_body_on_its_outlines_is_hardly_attracted(ring: Ring) -> None:
     unit, faces = sphere()
     seen = outlines(ring(4, size=(240, 400)))
     there = attraction(CENTRE + RADII * unit, faces, seen, 0.05)
@@ -98,7 +98,7 @@ def test_the_quadratic_is_the_squared_change_of_the_signed_distance(ring: Ring) 
         assert energy(quadratic, move) == pytest.approx(expected, rel=0.1, abs=4e-4)
 
 
-def test_what_no_camera_sees_is_not_drawn(ring: Ring) -> None:
+def test_what_no_camera_sees_is_not_attracted(ring: Ring) -> None:
     unit, faces = sphere()
     seen = outlines(ring(2, size=(240, 400)))
     behind = seen[0].camera.centre * 2 + 0.1 * unit
@@ -132,8 +132,10 @@ def test_distances_to_a_silhouette_are_metres_at_the_depth(ring: Ring) -> None:
     for depth in (2.0, 3.0, 5.0):
         columns = np.array([60.0, 90.0, 130.0])
         plane = np.stack([columns, np.full(3, 200.0)], axis=1)
-        points = camera.centre + camera.rays(plane) * (depth / (camera.rays(plane) @ camera.rotation[2]))[:, None]
-        seen, distance, slope = distances_outside(points, outline)
+        points = (
+            camera.centre + camera.cast_rays(plane) * (depth / (camera.cast_rays(plane) @ camera.rotation[2]))[:, None]
+        )
+        seen, distance, slope = measure_outside(points, outline)
         assert seen.tolist() == [0, 1, 2]
         np.testing.assert_allclose(distance, (99.5 - columns) * depth / camera.focal, atol=1e-6)
         np.testing.assert_allclose(slope, [[-1, 0]] * 3, atol=1e-6)

@@ -91,7 +91,7 @@ def test_background_follows_slow_change_and_forgets_after_a_cut() -> None:
     for grey in range(100, 150):
         background.update(np.full((4, 4, 3), grey, np.uint8), everywhere)
     assert 135 < background.mean.min() <= background.mean.max() < 150
-    for _ in range(2):  # a flash is no new scene
+    for _ in range(2):  # a flash is not a new scene
         background.update(np.full((4, 4, 3), 250, np.uint8), everywhere)
     background.update(np.full((4, 4, 3), 150, np.uint8), everywhere)
     assert background.known.all()
@@ -123,7 +123,7 @@ def test_a_shadow_is_darker_by_one_factor_in_all_channels() -> None:
     image[0, 1] = (120, 90, 60)
     image[0, 2] = (120, 140, 60)
     image[0, 3] = (10, 8, 5)
-    assert background.shadow(image).tolist() == [[False, True, False, False]]
+    assert background.find_shadows(image).tolist() == [[False, True, False, False]]
 
 
 def test_silhouette_is_much_better_than_the_puppet() -> None:
@@ -196,6 +196,7 @@ def test_same_frames_same_bits() -> None:
     assert walk(SilhouetteEstimator(), 6)[0].tobytes() == walk(SilhouetteEstimator(), 6)[0].tobytes()
 
 
+@pytest.mark.slow
 def test_a_mask_unlike_the_recent_ones_raises_the_alarm() -> None:
     estimator = SilhouetteEstimator()
     truth = person(150)

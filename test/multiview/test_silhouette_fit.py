@@ -96,6 +96,7 @@ def errors(fitter: SilhouetteFitter, fit: BodyFit) -> np.ndarray:
     return np.array([np.linalg.norm(fit.joints[names.index(name)] - man()[name]) for name in COMPARED])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("cameras", "bound"), [(2, 0.06), (3, 0.035), (4, 0.035)])
 def test_a_man_is_found_by_two_cameras_and_better_by_more(
     fitter: SilhouetteFitter, ring: Ring, cameras: int, bound: float
@@ -115,7 +116,7 @@ def test_the_same_input_gives_the_same_bits(fitter: SilhouetteFitter, ring: Ring
 
 def test_confused_sides_are_found_out(fitter: SilhouetteFitter, ring: Ring) -> None:
     # Both bodies overlap well with a man whose front is much like his back: both are tried because neither is enough.
-    demanding = SilhouetteFitter(fitter.model, SilhouetteFitterSettings(least_overlap=0.95))
+    demanding = SilhouetteFitter(fitter.model, SilhouetteFitterSettings(min_iou=0.95))
     fit = demanding.fit(seen_by(ring(4)), start(swapped=True))
     assert errors(fitter, fit).mean() < 0.06
     assert not fit.reliable
@@ -149,6 +150,6 @@ def test_joints_that_place_no_body_leave_the_start_to_the_body_before(fitter: Si
 
 def test_a_body_that_is_not_there_is_not_reliable(fitter: SilhouetteFitter, ring: Ring) -> None:
     aside = {name: (x + 0.5, y, z, c) for name, (x, y, z, c) in start().items()}
-    strict = SilhouetteFitter(fitter.model, SilhouetteFitterSettings(outline_steps=1))
+    strict = SilhouetteFitter(fitter.model, SilhouetteFitterSettings(gauss_newton_steps=1))
     fit = strict.fit(seen_by(ring(3)), aside)
     assert not fit.reliable and fit.confidence < 0.6

@@ -10,7 +10,12 @@ from hypothesis import strategies as st
 
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.rim_term import Outline
-from flowing_puppet_ros.multiview.silhouette_overlap import outline_gap, render_mask, shares_inside, silhouette_iou
+from flowing_puppet_ros.multiview.silhouette_overlap import (
+    measure_outline_gap,
+    measure_shares_inside,
+    render_mask,
+    silhouette_iou,
+)
 
 Ring = Callable[..., list[Camera]]
 FLAT = Camera(np.eye(3), np.zeros(5), (20, 15), np.eye(3), np.zeros(3))
@@ -60,10 +65,10 @@ def test_overlap_is_intersection_over_union() -> None:
 def test_the_gap_between_outlines_is_in_metres(shift: int) -> None:
     camera = Camera(np.diag([100.0, 100.0, 1.0]), np.zeros(5), (120, 120), np.eye(3), np.zeros(3))
     outline = Outline.of(camera, disc(30).astype(np.uint8))
-    gap, squared = outline_gap(disc(30 + shift), outline, 2.0)
+    gap, squared = measure_outline_gap(disc(30 + shift), outline, 2.0)
     assert gap == pytest.approx(shift * 0.02, abs=0.01)
     assert squared == pytest.approx((shift * 0.02) ** 2, rel=0.1, abs=0.0003)
-    assert np.isnan(outline_gap(np.zeros((120, 120), bool), outline, 2.0)).all()
+    assert np.isnan(measure_outline_gap(np.zeros((120, 120), bool), outline, 2.0)).all()
 
 
 def test_shares_inside_fall_with_the_distance_outside(ring: Ring) -> None:
@@ -72,10 +77,10 @@ def test_shares_inside_fall_with_the_distance_outside(ring: Ring) -> None:
     mask[100:220, 60:180] = 255
     outline = Outline.of(camera, mask)
     plane = np.array([(120.0, 160.0), (59.5, 160.0), (49.5, 160.0), (20.0, 160.0), (-500.0, 0.0)])
-    points = camera.centre + 3 * camera.rays(plane)
-    shares = shares_inside(points, [outline], 0.1)
+    points = camera.centre + 3 * camera.cast_rays(plane)
+    shares = measure_shares_inside(points, [outline], 0.1)
     assert shares[0] == 1 and shares[4] == 0
     assert shares[1] == pytest.approx(1, abs=0.01) and shares[2] == pytest.approx(0.25, abs=0.03)
     assert shares[3] < 0.05
-    both = shares_inside(points, [outline, Outline.of(camera, 255 - mask)], 0.1)
+    both = measure_shares_inside(points, [outline, Outline.of(camera, 255 - mask)], 0.1)
     assert both[0] < 0.6, "what one view contradicts counts half"

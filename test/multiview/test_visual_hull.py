@@ -42,7 +42,7 @@ def outside(centre: np.ndarray, rays: np.ndarray, capsules: list) -> np.ndarray:
 
 def mask(camera: Camera, capsules: list) -> np.ndarray:
     pixels = np.stack(np.meshgrid(*map(np.arange, camera.size)), axis=-1)
-    return np.where(outside(camera.centre, camera.rays(pixels), capsules) <= 0, 255, 0).astype(np.uint8)
+    return np.where(outside(camera.centre, camera.cast_rays(pixels), capsules) <= 0, 255, 0).astype(np.uint8)
 
 
 def hull_distance(cameras: list[Camera], points: np.ndarray, capsules: list) -> np.ndarray:
@@ -52,6 +52,7 @@ def hull_distance(cameras: list[Camera], points: np.ndarray, capsules: list) -> 
     return np.max([outside(c.centre, r, capsules) for c, r in zip(cameras, rays, strict=True)], axis=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("capsules", [BALL, CAPSULES], ids=["ball", "body"])
 @pytest.mark.parametrize("count", [2, 4, 8])
 def test_the_surface_lies_on_the_exact_cones(ring: Ring, count: int, capsules: list) -> None:
@@ -80,6 +81,7 @@ def test_no_part_of_the_body_is_carved_away(ring: Ring) -> None:
     assert points[:, 2].max() > 0.86 and points[:, 2].min() < -0.90
 
 
+@pytest.mark.slow
 def test_the_volume_of_a_balls_hull(ring: Ring) -> None:
     cameras = ring(8)
     points, _ = visual_hull(cameras, [mask(c, BALL) for c in cameras], BOX, HullSettings(tolerance=0.0))
@@ -99,7 +101,7 @@ def test_tolerance_swells_the_hull_by_as_much(ring: Ring) -> None:
 
 def test_masks_of_any_scale_fit_their_camera(ring: Ring) -> None:
     cameras = ring(4)
-    small = [mask(c.scaled(0.5), BALL) for c in cameras]
+    small = [mask(c.scale(0.5), BALL) for c in cameras]
     points, _ = visual_hull(cameras, small, BOX, HullSettings(tolerance=0.0))
     assert np.median(np.abs(hull_distance(cameras, points, BALL))) < 0.004
 
@@ -189,11 +191,11 @@ def test_too_few_or_contradicting_silhouettes_are_one_sentence(ring: Ring) -> No
 def test_unfit_masks_and_bounds_are_refused(ring: Ring) -> None:
     cameras = ring(2)
     masks = [mask(c, BALL) for c in cameras]
-    with pytest.raises(InputError, match="one mask a camera, got 1 for 2"):
+    with pytest.raises(InputError, match="one mask per camera, got 1 for 2"):
         visual_hull(cameras, masks[:1], BOX)
     with pytest.raises(InputError, match=r"mask 1 is \(320, 240\) of float64"):
         visual_hull(cameras, [masks[0], masks[1].astype(float)], BOX)
-    with pytest.raises(InputError, match="mask 1 is 320 x 240, no scaled 240 x 320 image"):
+    with pytest.raises(InputError, match="mask 1 is 320 x 240, which is not a scaled 240 x 320 image"):
         visual_hull(cameras, [masks[0], masks[1].T], BOX)
     with pytest.raises(InputError, match="low and high corner"):
         visual_hull(cameras, masks, BOX[::-1])

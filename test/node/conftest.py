@@ -5,7 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -16,6 +16,16 @@ from rclpy.node import Node
 
 PATIENCE = 120.0
 """Seconds after which a test gives up on a message; the machine may be busy."""
+QUICK_FIT = {
+    "fitter.particles": 4, "fitter.iterations": 1, "fitter.gauss_newton_steps": 1, "fitter.restarts": 0,
+    "fitter.max_limb_repairs": 0, "fitter.nonrigid": "false", "fitter.levenberg_steps": 0,
+}  # fmt: skip
+"""Parameters of a body_fitter for tests in which it does not matter how well a body fits."""
+
+
+def arguments(parameters: Mapping[str, object]) -> list[str]:
+    """Return ROS arguments that set parameters."""
+    return [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
 
 
 class Peer(Node):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from ruamel.yaml import YAML
 
-from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_settings, parameter_yaml
+from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_settings, parameter_yaml, published
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
 
@@ -23,7 +23,16 @@ def test_file_is_generated_from_the_settings(name: str) -> None:
 @pytest.mark.parametrize("name", COMPONENTS)
 def test_values_survive_the_file(name: str) -> None:
     read = YAML(typ="safe").load(parameter_yaml(name))[f"/**/{name}"]["ros__parameters"]
+    flat = {key: value for key, value in read.items() if not isinstance(value, dict)}
+    flat |= {
+        f"{key}.{leaf}": value for key, part in read.items() if isinstance(part, dict) for leaf, value in part.items()
+    }
     infos = [*COMPONENTS[name].settings_type.describe(), *node_settings(name).describe()]
-    assert [(key, type(value), value) for key, value in read.items()] == [
-        (info.name, info.type, info.default) for info in infos
-    ]
+    assert {key: (type(value), value) for key, value in flat.items()} == {
+        info.name: (info.type, info.default) for info in infos if not info.advanced
+    }
+
+
+@pytest.mark.parametrize("name", COMPONENTS)
+def test_a_stranger_is_offered_few_parameters(name: str) -> None:
+    assert len(published(name)) <= 24

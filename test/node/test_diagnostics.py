@@ -7,7 +7,7 @@ import pytest
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from flowing_puppet_ros.node.diagnostics import SILENCE, Diagnostics, NodeStatus
+from flowing_puppet_ros.node.diagnostics import MAX_SILENCE_S, Diagnostics, NodeStatus
 
 pytestmark = pytest.mark.ros
 
@@ -20,7 +20,7 @@ def values(report: object) -> dict[str, str]:
 def test_rates_latency_and_counters() -> None:
     diagnostics = Diagnostics("/cam01/puppet_tracker", "puppet_tracker")
     for _ in range(30):
-        diagnostics.received("image")
+        diagnostics.count_received("image")
     for seconds in (0.1, 0.1, 0.4):
         diagnostics.record_latency(seconds)
     diagnostics.people = 2
@@ -50,7 +50,7 @@ def test_level_follows_what_is_new() -> None:
     unusable = level(diagnostics, counters={"unusable": 2}, dropped={"image": 3})
     assert (unusable[0], unusable[1][:1]) == (DiagnosticStatus.WARN, "2")
     assert level(diagnostics, counters={"unusable": 2}, dropped={"image": 3})[0] == DiagnosticStatus.OK
-    diagnostics.failed("ZeroDivisionError: it broke")
+    diagnostics.record_failure("ZeroDivisionError: it broke")
     report = diagnostics.report(Time(), 1.0, NodeStatus())
     assert report.status[0].level == DiagnosticStatus.ERROR
     assert values(report)["last error"] == "ZeroDivisionError: it broke"
@@ -62,8 +62,8 @@ def test_states_and_silence_have_their_levels(monkeypatch: pytest.MonkeyPatch) -
     now = [100.0]
     monkeypatch.setattr("flowing_puppet_ros.node.diagnostics.time.monotonic", lambda: now[0])
     diagnostics = Diagnostics("/a", "a")
-    diagnostics.received("image")
-    now[0] += 2 * SILENCE
+    diagnostics.count_received("image")
+    now[0] += 2 * MAX_SILENCE_S
     stale = level(diagnostics, publishers={"/camera/image": 0})
     assert stale == (DiagnosticStatus.STALE, "no message for 10 s; topics and their publishers: /camera/image (0)")
     assert level(diagnostics, state="inactive")[0] == DiagnosticStatus.OK

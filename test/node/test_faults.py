@@ -22,15 +22,11 @@ from flowing_puppet_ros.node.factory import RosMessageFactory
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header
 from flowing_puppet_ros.stream.messages.images import make_image
-from test.node.conftest import Peer, running_nodes
+from test.node.conftest import QUICK_FIT, Peer, arguments, running_nodes
 
 pytestmark = pytest.mark.ros
 FACTORY = RosMessageFactory()
 PERSON = DrawnPerson((160, 120))
-QUICK = {
-    "particles": 4, "iterations": 1, "refine_iterations": 1, "restarts": 0, "limb_rounds": 0,
-    "surface_finish": "false", "lm_steps": 0,
-}  # fmt: skip
 
 
 class World:
@@ -100,14 +96,14 @@ def detections(header: Any) -> PuppetArray:
     """Return where the drawn person stands."""
     joints = [
         PuppetJoint(name=name, x=float(x), y=float(y), confidence=1.0)
-        for name, (x, y) in zip(JOINTS, PERSON.joints(0.0), strict=True)
+        for name, (x, y) in zip(JOINTS, PERSON.locate_joints(0.0), strict=True)
     ]
     return PuppetArray(header=header, puppets=[Puppet(joints=joints)])
 
 
 def image(header: Any) -> Image:
     """Return an image of the person."""
-    return make_image(FACTORY, header, PERSON.image(0.0), "rgb8")
+    return make_image(FACTORY, header, PERSON.draw(0.0), "rgb8")
 
 
 def kept(topic: str) -> dict[str, str]:
@@ -125,12 +121,12 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
         logs = {}
         for name, settings, topics in (
             ("puppet_tracker", {}, ("/image", "/detections")),
-            ("body_fitter", QUICK, ("/points", "/depth", "/camera_info")),
+            ("body_fitter", QUICK_FIT, ("/points", "/depth", "/camera_info")),
         ):
             given = {"queue": 5, **settings}
             for topic in topics:
                 given |= kept(topic)
-            logs[name] = run(name, *(part for key, value in given.items() for part in ("-p", f"{key}:={value}")))
+            logs[name] = run(name, *arguments(given))
         made = World(peer, logs)
         peer.spin_until(lambda: len(made.reports) == 2, "reports of both nodes")
         yield made

@@ -6,7 +6,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from flowing_puppet_ros.bag.reader import open_bag
+
+pytestmark = pytest.mark.slow
 
 GOLDEN = Path(__file__).resolve().parents[2] / "bags" / "golden" / "golden.mcap"
 WRITTEN, MEGABYTE = 40, 1024 * 1024

@@ -28,7 +28,7 @@ pytestmark = pytest.mark.ros
 FACTORY = RosMessageFactory()
 ENVIRONMENT = Path(__file__).resolve().parents[2] / "bags" / "cache" / "interop"
 VERSION = "cyclonedds==11.0.1"
-DOMAIN = 77
+DOMAIN = int(os.environ["ROS_DOMAIN_ID"])
 # The ROS wheels leave these two in their children; with them another environment's Python would load their libraries.
 FOREIGN = ("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "LD_LIBRARY_PATH", "PYTHONPATH", "VIRTUAL_ENV", "PYTHONHOME")
 # Discovery as ROS does it on one machine: no multicast, the ports of the first participants on the loopback.

@@ -17,11 +17,12 @@ from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import typestore
 from flowing_puppet_ros.node.factory import message_type
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
+from test.node.conftest import arguments
 
 pytestmark = pytest.mark.ros
 GOLDEN = Path(__file__).resolve().parents[2] / "bags" / "golden" / "golden.mcap"
 CAMERAS = ("cam1", "cam2", "cam3", "cam4")
-SETTINGS = {"visual_hull": {"every": 4}, "body_fitter": {"outline_steps": 3}}
+SETTINGS = {"visual_hull": {"hull_every": 4}, "body_fitter": {"silhouettes.gauss_newton_steps": 3}}
 COMPARED = {
     **{f"/{camera}/puppets": "flowing_puppet_msgs/msg/PuppetArray" for camera in CAMERAS},
     "/silhouettes": "flowing_puppet_msgs/msg/SilhouetteSet",
@@ -41,11 +42,6 @@ def expected(folder: Path) -> dict[str, dict[int, Any]]:
         for record in bag.messages(list(COMPARED)):
             found[record.topic][stamp_ns(record.message)] = record.message
     return found
-
-
-def arguments(settings: dict[str, Any]) -> list[str]:
-    """Return ROS arguments that set parameters."""
-    return [part for name, value in settings.items() for part in ("-p", f"{name}:={value}")]
 
 
 def kept(*topics: str) -> list[str]:

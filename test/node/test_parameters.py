@@ -10,7 +10,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.node.parameters import changed, declare, with_floats
+from flowing_puppet_ros.node.parameters import apply_changes, convert_to_floats, declare
 from flowing_puppet_ros.settings import Settings, setting
 
 pytestmark = pytest.mark.ros
@@ -66,15 +66,15 @@ def test_bad_values_are_one_sentence_with_the_name(name: str, value: object) -> 
 
 def test_a_change_is_checked_as_a_whole_and_changes_nothing_itself() -> None:
     before = Sample()
-    after = changed(before, [Parameter("count", value=7), Parameter("use_sim_time", value=True)])
+    after = apply_changes(before, [Parameter("count", value=7), Parameter("use_sim_time", value=True)])
     assert (before, after) == (Sample(), Sample(count=7))
     with pytest.raises(InputError, match="mode is 'c', which is not one of a, b"):
-        changed(before, [Parameter("count", value=8), Parameter("mode", value="c")])
+        apply_changes(before, [Parameter("count", value=8), Parameter("mode", value="c")])
 
 
 def test_whole_numbers_are_taken_for_floating_point_settings() -> None:
     given = [Parameter("ratio", value=2), Parameter("count", value=2), Parameter("mode", value="b")]
-    taken = {parameter.name: parameter.value for parameter in with_floats([Sample], given)}
+    taken = {parameter.name: parameter.value for parameter in convert_to_floats([Sample], given)}
     assert {name: (type(value), value) for name, value in taken.items()} == {
         "ratio": (float, 2.0), "count": (int, 2), "mode": (str, "b"),
     }  # fmt: skip

@@ -20,14 +20,15 @@ from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 from std_srvs.srv import Trigger
 
 from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.node import main as programs
 from flowing_puppet_ros.node.factory import RosMessageFactory
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header
 from flowing_puppet_ros.stream.messages.images import make_image
+from test.node.conftest import QUICK_FIT, arguments
 
 pytestmark = pytest.mark.ros
 FACTORY = RosMessageFactory()
-QUICK = ("-p", "particles:=8", "-p", "iterations:=2", "-p", "refine_iterations:=3")
 
 
 def image(number: int, encoding: str = "rgb8") -> Image:
@@ -126,7 +127,7 @@ def body_cloud(stamp: int) -> PointCloud2:
 
 
 def test_fitter_survives_bad_clouds_and_serves_goals(start: Callable[..., Path], peer: Any) -> None:
-    start("body_fitter", *QUICK, *kept("/points"))
+    start("body_fitter", *arguments(QUICK_FIT), *kept("/points"))
     bodies = received(peer, BodyArray, "bodies")
     points = connected(peer, PointCloud2, "points")
     points.publish(PointCloud2(header=make_header(FACTORY, 1_000_000_000, "world")))
@@ -170,7 +171,7 @@ def sent(peer: Any, client: ActionClient, cloud: PointCloud2, feedback: Callable
 
 
 def test_goals_that_wait_can_be_cancelled_and_do_not_outlive_the_node(start: Callable[..., Path], peer: Any) -> None:
-    start("body_fitter", "-p", "iterations:=10000")
+    start("body_fitter", *arguments(QUICK_FIT | {"fitter.iterations": 10000}))
     client = ActionClient(peer, FitBody, "fit_body")
     peer.spin_until(client.server_is_ready, "the action")
     feedback: list[Any] = []
@@ -204,16 +205,31 @@ def test_goals_that_wait_can_be_cancelled_and_do_not_outlive_the_node(start: Cal
         ("body_fitter", ["--ros-args", "--params-file", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
-def test_bad_parameters_are_one_sentence(name: str, given: list[str], named: str, tmp_path: Path) -> None:
-    command = [str(Path(sys.executable).with_name(name)), *given]
+def test_bad_parameters_are_one_sentence(
+    name: str,
+    given: list[str],
+    named: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert getattr(programs, name)(given) == 2
+    said = capfd.readouterr().err
+    assert named in said
+    assert len(said.strip().splitlines()) == 1
+
+
+def test_an_installed_program_exits_with_its_status(tmp_path: Path) -> None:
+    command = [str(Path(sys.executable).with_name("visual_hull")), "--ros-args", "-p", "cameras:=one"]
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2
-    assert named in done.stderr
+    assert "cameras is 'one'" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_help_lists_the_parameters() -> None:
     command = [str(Path(sys.executable).with_name("puppet_tracker")), "--help"]
     shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    assert "overlay_side [960]" in shown
+    assert "overlay_max_side [960]" in shown
     assert "queue [1]" in shown

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.ros
 TEXT = "std_msgs/msg/String"
 
 
-class Names(Component):
+class Names(Component[Settings]):
     """Says who is there: a message names the people, and each of them gets a topic of their own."""
 
     settings_type = Settings
@@ -38,9 +38,9 @@ class Names(Component):
 
     def _process(self, port: str, message: Any) -> Output:
         (_, _, own), names = self.outputs, message.data.split()
-        gone: Output = [(own.of(name), None) for name in self._known if name not in names]
+        gone: Output = [(own.person_topic(name), None) for name in self._known if name not in names]
         self._known = names
-        return [*gone, ("all", message), *((own.of(name), String(data=name)) for name in names)]
+        return [*gone, ("all", message), *((own.person_topic(name), String(data=name)) for name in names)]
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def test_a_publisher_whose_qos_does_not_fit_is_one_warning_with_topic_and_cure(
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     said: list[str] = []
-    session._complain = lambda sentence: said.append(sentence)  # type: ignore[method-assign]
+    session._warn = lambda sentence: said.append(sentence)  # type: ignore[method-assign]
     other = Node("other")
     publisher = other.create_publisher(String, "names", QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT))
     until = time.monotonic() + 60
@@ -149,6 +149,6 @@ def test_a_publisher_whose_qos_does_not_fit_is_one_warning_with_topic_and_cure(
     executor.shutdown()
     other.destroy_node()
     assert said == [
-        "/names: a publisher offers another reliability, so nothing passes between the two; set "
+        "/names: a publisher offers another reliability, so they do not connect; set "
         "qos_overrides./names.subscription.reliability of this node, or the reliability of the other, to fit"
     ]

@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.bag.replay import NOTE
+from flowing_puppet_ros.bag.replay import METADATA_NAME
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.evaluate.joints import LIMB_JOINTS
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header, make_point, make_transform
-from flowing_puppet_ros.stream.messages.images import jpeg
+from flowing_puppet_ros.stream.messages.images import encode_jpeg
 
 FACTORY = BagMessageFactory()
 SIZE = (120, 160)
@@ -99,7 +99,9 @@ def write_bags(folder: Path, content: Content) -> tuple[Path, Path]:
         _write(bag, _inputs(content))
     with BagWriter(made) as bag:
         _write(bag, _outputs(content))
-        bag.note(NOTE, {"replay": json.dumps({"settings": {"front/puppet_tracker": {"particles": 42}}})})
+        bag.add_metadata(
+            METADATA_NAME, {"replay": json.dumps({"settings": {"front/puppet_tracker": {"particles": 42}}})}
+        )
     return given, made
 
 
@@ -135,7 +137,7 @@ def _inputs(content: Content) -> list[tuple[str, str, int, Any]]:
             pixels = pixels_at(frame, view)
             if content.images:
                 kind = "sensor_msgs/msg/CompressedImage"
-                image = FACTORY.make(kind, header=header, format="jpeg", data=jpeg(picture(pixels), 95))
+                image = FACTORY.make(kind, header=header, format="jpeg", data=encode_jpeg(picture(pixels), 95))
                 messages.append((f"/{name}/image/compressed", kind, stamp, image))
             if content.detections:
                 people = [_person(pixels, "")]
@@ -158,7 +160,7 @@ def _outputs(content: Content) -> list[tuple[str, str, int, Any]]:
                 messages.append(_people(f"/{name}/puppets", header, stamp, people))
             if content.overlays:
                 kind = "sensor_msgs/msg/CompressedImage"
-                data = jpeg(np.full((64, 48, 3), 40 * frame, np.uint8), 95)
+                data = encode_jpeg(np.full((64, 48, 3), 40 * frame, np.uint8), 95)
                 image = FACTORY.make(kind, header=make_header(FACTORY, stamp, name), format="jpeg", data=data)
                 messages.append((f"/{name}/overlay/compressed", kind, stamp, image))
         if content.bodies and frame % 2 == 0:

@@ -14,6 +14,8 @@ from playwright.sync_api import Browser, BrowserContext, Page
 
 from flowing_puppet_ros.report.report import write_report
 
+pytestmark = pytest.mark.slow
+
 type Replay = Callable[..., tuple[Path, Path]]
 
 

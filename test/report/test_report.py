@@ -15,9 +15,9 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bag.recording import read_recording
-from flowing_puppet_ros.report.bag_pictures import Box, facing
-from flowing_puppet_ros.report.data import gather
-from flowing_puppet_ros.report.report import collage, report_page, write_report
+from flowing_puppet_ros.report.bag_pictures import ImageBox, body_axes
+from flowing_puppet_ros.report.data import gather_data
+from flowing_puppet_ros.report.report import build_report_page, make_collage, write_report
 
 type Replay = Callable[..., tuple[Path, Path]]
 
@@ -56,7 +56,7 @@ class Page(HTMLParser):
 
 
 def page_of(replay: Replay, **content: bool) -> tuple[str, Page]:
-    html = report_page(gather(*replay(**content)))
+    html = build_report_page(gather_data(*replay(**content)))
     return html, Page(html)
 
 
@@ -76,7 +76,7 @@ def test_the_whole_page_stands_alone(replay: Replay) -> None:
 
 
 def test_figures_are_those_of_the_bags(replay: Replay) -> None:
-    data = gather(*replay(), summary={"frames_per_second": 12.5, "settings": {"tracker": {"seed": 3}}})
+    data = gather_data(*replay(), summary={"frames_per_second": 12.5, "settings": {"tracker": {"seed": 3}}})
     assert data.shown_camera == "front"
     front = data.camera("front")
     assert front is not None and (front.tracked, front.images, front.switches) == (5, 5, 0)
@@ -88,12 +88,12 @@ def test_figures_are_those_of_the_bags(replay: Replay) -> None:
     assert data.bodies is not None
     assert data.bodies.errors.distance == pytest.approx(np.full((3, 12), 0.03), abs=2e-3)
     assert data.bodies.energy.tolist() == [2.5, 4.5, 6.5]
-    text = Page(report_page(data)).text
+    text = Page(build_report_page(data)).text
     assert "12.5 images/s" in text and "tracker: settings" in text and "arms 0 of 5, legs 0 of 5" in text
 
 
 def test_puppet_flow_follows_the_walk(replay: Replay) -> None:
-    data = gather(*replay())
+    data = gather_data(*replay())
     assert [shot.stamp for shot in data.flow] == sorted(shot.stamp for shot in data.flow) and len(data.flow) == 4
     for shot in data.flow:
         assert shot.explained > 0.9
@@ -105,7 +105,7 @@ def test_puppet_flow_follows_the_walk(replay: Replay) -> None:
 
 def test_body_is_drawn_where_the_cameras_see_it(replay: Replay) -> None:
     given, made = replay()
-    data = gather(given, made)
+    data = gather_data(given, made)
     assert sorted(name for name, _ in data.body_shots[0].views) == ["front", "side"]
     for shot in data.body_shots:
         for picture in (shot.front, shot.side):
@@ -117,11 +117,12 @@ def test_body_is_drawn_where_the_cameras_see_it(replay: Replay) -> None:
 
 
 def test_bystanders_do_not_disturb_the_reference(replay: Replay) -> None:
-    data = gather(*replay(bystander=True))
+    data = gather_data(*replay(bystander=True))
     assert data.bodies is not None and data.bodies.errors.mean == pytest.approx(0.03, abs=2e-3)
     assert all(camera.errors.mean == pytest.approx(3.0, abs=1e-4) for camera in data.cameras)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "sentences"),
     [
@@ -140,9 +141,9 @@ def test_missing_parts_are_said_in_a_sentence(replay: Replay, content: dict[str,
 def test_bags_without_results_are_refused(replay: Replay, tmp_path: Path) -> None:
     given, _ = replay(puppets=False, bodies=False, images=False)
     with pytest.raises(InputError, match="there is no bag"):
-        gather(given, tmp_path / "missing")
+        gather_data(given, tmp_path / "missing")
     with pytest.raises(InputError, match=r"neither puppets nor bodies; its topics are .*/front/detections"):
-        gather(given, given)
+        gather_data(given, given)
 
 
 def test_recording_knows_cameras_and_images(replay: Replay) -> None:
@@ -160,6 +161,7 @@ def test_recording_knows_cameras_and_images(replay: Replay) -> None:
     assert recording.body_frame == "world" and len(recording.triangles) == 12
 
 
+@pytest.mark.slow
 def test_command_line_writes_the_page_and_the_picture(
     replay: Replay, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -169,7 +171,7 @@ def test_command_line_writes_the_page_and_the_picture(
     assert main(["report", str(made), "--input", str(given), "--out", str(page), "--picture", str(picture)]) == 0
     assert capsys.readouterr().out.strip() == str(page)
     assert set(tmp_path.rglob("*")) - before == {page, picture}
-    assert cv2.imread(str(picture)).shape == collage(gather(given, made)).shape  # type: ignore[union-attr]
+    assert cv2.imread(str(picture)).shape == make_collage(gather_data(given, made)).shape  # type: ignore[union-attr]
 
 
 def test_command_line_says_what_is_wrong(replay: Replay, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -186,6 +188,7 @@ def test_command_line_says_what_is_wrong(replay: Replay, tmp_path: Path, capsys:
         assert error.count("\n") == 1 and "Traceback" not in error
 
 
+@pytest.mark.slow
 def test_the_same_bags_make_the_same_page(replay: Replay, tmp_path: Path) -> None:
     given, made = replay()
     pages = []
@@ -197,20 +200,21 @@ def test_the_same_bags_make_the_same_page(replay: Replay, tmp_path: Path) -> Non
 
 def test_the_output_alone_shows_its_overlays_bodies_and_settings(replay: Replay) -> None:
     _, made = replay(overlays=True)
-    data = gather(made, made)
+    data = gather_data(made, made)
     assert [round(float(picture.mean()) / 40) for _, picture in data.strip] == [0, 1, 2, 3, 4]
     assert data.scene is not None and len(data.scene["frames"]) == 3 and data.flow == []
-    text = Page(report_page(data)).text
+    text = Page(build_report_page(data)).text
     assert "front/puppet_tracker: settings" in text and "particles" in text and "42" in text
 
 
+@pytest.mark.slow
 def test_settings_that_are_alike_stand_in_one_table(replay: Replay) -> None:
     summary = {
         "settings": {"cam01/tracker": {"seed": 3}, "cam02/tracker": {"seed": 3}, "fitter": {"seed": 4}},
         "seconds_of": {"fitter": 1.25},
         "warnings": ["an image was <bad>"],
     }
-    text = Page(report_page(gather(*replay(), summary=summary))).text
+    text = Page(build_report_page(gather_data(*replay(), summary=summary))).text
     assert "cam01/tracker, cam02/tracker: settings" in text and "fitter: time" in text
     assert "1 warning(s)" in text and "an image was <bad>" in text
 
@@ -221,20 +225,20 @@ def test_facing_finds_up_in_other_frames() -> None:
         for side, y in (("left", 0.2), ("right", -0.2))
         for joint, z in (("shoulder", 1.4), ("hip", 0.9))
     }
-    assert np.allclose(facing(upright), np.eye(3))
+    assert np.allclose(body_axes(upright), np.eye(3))
     # In an optical frame (x right, y down, z away) a person who faces the camera has its left at the right.
     optical = {name: np.array([p[1], -p[2], 3 - p[0]]) for name, p in upright.items()}
-    assert np.allclose(facing(optical), [[0, 0, -1], [1, 0, 0], [0, -1, 0]])
-    assert np.allclose(facing({}), np.eye(3))
+    assert np.allclose(body_axes(optical), [[0, 0, -1], [1, 0, 0], [0, -1, 0]])
+    assert np.allclose(body_axes({}), np.eye(3))
 
 
 @pytest.mark.parametrize("points", [[[30, 40], [50, 90]], [[-80, 5], [20, 10]], [[90, 70], [130, 500]]])
 def test_boxes_hold_their_points_and_stay_in_the_image(points: list[list[float]]) -> None:
     shape = (120, 100, 3)
-    box = Box.around(np.array([*points, [np.nan, 3.0]]), shape, 0.1, aspect=0.75)
+    box = ImageBox.around(np.array([*points, [np.nan, 3.0]]), shape, 0.1, aspect=0.75)
     assert 0 <= box.left < box.right <= 100 and 0 <= box.top < box.bottom <= 120
     inside = np.clip(points, 0, (99, 119))
     assert (inside >= (box.left, box.top)).all() and (inside < (box.right, box.bottom)).all()
-    part = box.cut(np.zeros(shape))
+    part = box.crop(np.zeros(shape))
     assert part.shape[1] / part.shape[0] == pytest.approx(0.75, abs=0.02) or 100 in part.shape or 120 in part.shape
-    assert Box.around(np.full((2, 2), np.nan), shape, 0.1) == Box(0, 0, 100, 120)
+    assert ImageBox.around(np.full((2, 2), np.nan), shape, 0.1) == ImageBox(0, 0, 100, 120)

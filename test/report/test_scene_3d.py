@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.report.bag_pictures import BodyMesh
-from flowing_puppet_ros.report.scene_3d import BUDGET, POINTS, SceneFrame, frames_in_budget, scene_data
+from flowing_puppet_ros.report.scene_3d import (
+    MAX_BYTES,
+    MAX_POINTS,
+    SceneFrame,
+    count_affordable_frames,
+    make_scene_data,
+)
 
 X, Y, Z = np.eye(3)
 RNG = np.random.default_rng(0)
@@ -30,7 +36,7 @@ def places(scene: Any, text: str) -> np.ndarray:
 def test_places_are_those_of_the_bodies() -> None:
     cloud = np.concatenate([BODY[:50] + 0.01, [[500.0, 0, 0], [np.nan, 0, 0]]])
     frames = [SceneFrame(0.0, [mesh(0.0, cloud)]), SceneFrame(0.5, [mesh(1.0), mesh(2.0)])]
-    scene = scene_data(frames, X, Z)
+    scene = make_scene_data(frames, X, Z)
     assert scene["step"] < 1e-4, "a stray point makes all places coarse"
     first, second = scene["frames"]
     np.testing.assert_allclose(places(scene, first["mesh"]), BODY, atol=0.51 * scene["step"])
@@ -46,7 +52,7 @@ def test_places_are_those_of_the_bodies() -> None:
 @pytest.mark.parametrize("up", [Z, -Y, Y, X, -Z, Z + 0.1 * X])
 def test_up_is_up_whatever_the_frame(up: np.ndarray) -> None:
     up = up / np.linalg.norm(up)
-    scene = scene_data([SceneFrame(0.0, [mesh()])], np.roll(up, 1), up)
+    scene = make_scene_data([SceneFrame(0.0, [mesh()])], np.roll(up, 1), up)
     turned = places(scene, scene["frames"][0]["mesh"])
     np.testing.assert_allclose(turned[:, 2], BODY @ up, atol=scene["step"])
     centred = [cloud - cloud.mean(axis=0) for cloud in (turned, BODY)]
@@ -55,8 +61,8 @@ def test_up_is_up_whatever_the_frame(up: np.ndarray) -> None:
 
 
 def test_large_scenes_show_fewer_stamps() -> None:
-    assert frames_in_budget(1, 3707) >= 100
-    assert frames_in_budget(8, 20000) * 6 * (8 * 20000 + POINTS) <= BUDGET
-    assert frames_in_budget(100, 100_000) == 1
+    assert count_affordable_frames(1, 3707) >= 100
+    assert count_affordable_frames(8, 20000) * 6 * (8 * 20000 + MAX_POINTS) <= MAX_BYTES
+    assert count_affordable_frames(100, 100_000) == 1
     dense = SceneFrame(0.0, [mesh(0.0, RNG.uniform(0, 1, (50_001, 3)))])
-    assert 0.5 * POINTS <= len(dense.points) <= POINTS
+    assert 0.5 * MAX_POINTS <= len(dense.points) <= MAX_POINTS

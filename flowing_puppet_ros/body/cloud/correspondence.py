@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two-way correspondences between a body and a cloud, as one quadratic a vertex, and the two-way distance."""
+"""Two-way correspondences between a body and a cloud, as one quadratic per vertex, and the two-way distance."""
 
 from __future__ import annotations
 
@@ -7,26 +7,29 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 
-TANGENTIAL = 0.05
-MIN_COSINE = 0.2
-# Metres that a normal turned by one radian counts in the search for the closest point: the other side of a finger or of
-# an arm on the hip is farther away than it seems.
-TURN_LENGTH = 0.03
+# Weight of a pair's squared length beside its squared distance along the cloud's normal.
+TANGENTIAL_WEIGHT = 0.05
+# Cosine between the normals of a pair; pairs below it are dropped.
+MIN_NORMAL_COSINE = 0.2
+# Distance that a normal rotated by one radian adds in the search for the closest point, so that the other side of a
+# finger, or of an arm on the hip, is farther away.
+NORMAL_LENGTH_M = 0.03
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """A cloud to fit, seen from all around or from one place.
+    """A cloud to fit, seen from all sides or from one viewpoint.
 
     Attributes:
         points: (N, 3) metres.
         normals: (N, 3) unit normals, outward.
-        tree: of `points`.
-        viewpoint: (3,) where the sensor stood, or None when the body was seen from all around.
+        nearest: index of `points`.
+        viewpoint: (3,) position of the sensor in metres, None when the body was seen from all sides.
     """
 
     points: np.ndarray
@@ -40,7 +43,7 @@ class Cloud:
         return cls(points, normals, NearestPoints(points), viewpoint)
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Which vertices (V,) face the viewpoint; all of them when there is none."""
+        """Return which vertices (V,) face the viewpoint; all of them when there is none."""
         if self.viewpoint is None:
             return np.ones(len(vertices), dtype=bool)
         return ((self.viewpoint - vertices) * normals).sum(axis=1) > 0
@@ -60,57 +63,70 @@ class VertexQuadratic:
 
 
 class TwoWayCorrespondence:
-    """Matches both ways between a cloud and the bodies of one fit."""
+    """Correspondences in both directions between a cloud and the bodies of one fit."""
 
-    def __init__(self, cloud: Cloud, most: int | None = None) -> None:
-        """Prepare a cloud; of more than `most` points only every second, third ... looks for a vertex of its own."""
+    def __init__(self, cloud: Cloud, max_points: int | None = None) -> None:
+        """Index a cloud; of more than `max_points` points only every second, third ... is matched to a vertex."""
         self._cloud = cloud
-        self._tree = NearestPoints(cloud.points, cloud.normals, TURN_LENGTH)
-        step = 1 if most is None else max(1, -(-len(cloud.points) // most))
-        self._looking = np.arange(0, len(cloud.points), step)
+        self._nearest = NearestPoints(cloud.points, cloud.normals, NORMAL_LENGTH_M)
+        step = 1 if max_points is None else max(1, -(-len(cloud.points) // max_points))
+        self._matched = np.arange(0, len(cloud.points), step)
 
     def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float) -> VertexQuadratic:
-        """Match both ways and return what draws the vertices to the cloud.
+        """Match both ways and return the quadratic that attracts the vertices to the cloud.
 
-        Every vertex that the sensor sees goes to its closest cloud point, every cloud point to its closest vertex,
-        where opposite normals count as 6 cm more; pairs whose normals disagree are dropped. A pair costs its distance
-        along the cloud's normal, squared, plus 0.05 of its squared length, times the Geman-McClure weight
-        (sigma^2 / (sigma^2 + d^2))^2. Either way weighs 1 in all.
+        Every vertex that the sensor sees is matched to its closest cloud point, every cloud point to its closest
+        vertex, where opposite normals add 6 cm; pairs whose normals disagree are dropped. A pair costs its squared
+        distance along the cloud's normal plus 0.05 of its squared length, times `geman_mcclure`. Each direction has
+        a total weight of 1.
 
         Args:
             vertices: (V, 3) metres.
             faces: (F, 3), outward.
             sigma: width of the robust kernel, metres.
         """
-        cloud, looking = self._cloud, self._looking
+        cloud, matched = self._cloud, self._matched
         normals = vertex_normals(vertices, faces)
         seen = np.flatnonzero(cloud.sees(vertices, normals))
-        there = self._tree.query(vertices[seen], normals[seen])[1]
-        back = NearestPoints(vertices, normals, TURN_LENGTH).query(cloud.points[looking], cloud.normals[looking])[1]
-        matrix, vector = np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3))
-        for vertex, point in ((seen, there), (back, looking)):
+        to_cloud = self._nearest.query(vertices[seen], normals[seen])[1]
+        body = NearestPoints(vertices, normals, NORMAL_LENGTH_M)
+        to_body = body.query(cloud.points[matched], cloud.normals[matched])[1]
+        quadratic = VertexQuadratic(np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3)))
+        for pairs in ((seen, to_cloud), (to_body, matched)):
             _add_pairs(
-                vertex, point, vertices, normals, cloud.points, cloud.normals, sigma**2, 1 / max(len(point), 1),
-                matrix, vector,
+                pairs, (vertices, normals), (cloud.points, cloud.normals), sigma**2, 1 / max(len(pairs[1]), 1),
+                (quadratic.matrix, quadratic.vector),
             )  # fmt: skip
-        return VertexQuadratic(matrix, vector)
+        return quadratic
 
-    def nearest(self, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """How far vertices (V, 3) and cloud are apart where opposite normals count as 6 cm more.
+    def find_nearest(self, vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Measure how far vertices (V, 3) and cloud are apart where opposite normals add 6 cm.
 
         Returns:
-            Distances (V,) to the cloud, and for every looking cloud point its nearest vertex and the distance to it.
+            Distances (V,) to the cloud, and for every matched cloud point its nearest vertex and the distance to it.
         """
-        normals, looking = vertex_normals(vertices, faces), self._looking
-        body = NearestPoints(vertices, normals, TURN_LENGTH)
-        back, vertex = body.query(self._cloud.points[looking], self._cloud.normals[looking])
-        return self._tree.query(vertices, normals)[0], vertex, back
+        normals, matched = vertex_normals(vertices, faces), self._matched
+        body = NearestPoints(vertices, normals, NORMAL_LENGTH_M)
+        to_body, vertex = body.query(self._cloud.points[matched], self._cloud.normals[matched])
+        return self._nearest.query(vertices, normals)[0], vertex, to_body
+
+
+@register_jitable(inline="always")
+def geman_mcclure[Numbers: (float, np.ndarray)](squared_distance: Numbers, squared_width: float) -> Numbers:
+    """Return the Geman-McClure weight (w^2 / (w^2 + d^2))^2, 1 at distance 0 and a quarter at the width.
+
+    Args:
+        squared_distance: d^2, a number or an array of any shape; in Python and within compiled kernels.
+        squared_width: w^2.
+    """
+    return (squared_width / (squared_width + squared_distance)) ** 2
 
 
 @njit(cache=True, nogil=True)
-def _add_pairs(  # type: ignore[no-untyped-def]
-    vertex, point, vertices, normals, points, point_normals, squared_width, share, matrix, vector
-):
+def _add_pairs(pairs, body, cloud, squared_width, share, quadratic):  # type: ignore[no-untyped-def]
+    """Add the pairs (vertices (K,), points (K,)) of a body and a cloud (points and normals each) to a quadratic."""
+    (vertex, point), (vertices, normals), (points, point_normals) = pairs, body, cloud
+    matrix, vector = quadratic
     gap = np.empty(3)
     for k in range(len(vertex)):
         v, p = vertex[k], point[k]
@@ -120,26 +136,26 @@ def _add_pairs(  # type: ignore[no-untyped-def]
             cosine += normals[v, i] * point_normals[p, i]
             along += gap[i] * point_normals[p, i]
             squared += gap[i] ** 2
-        if cosine <= MIN_COSINE:
+        if cosine <= MIN_NORMAL_COSINE:
             continue
-        weight = share * (squared_width / (squared_width + squared)) ** 2
+        weight = share * geman_mcclure(squared, squared_width)
         for i in range(3):
-            vector[v, i] += weight * (along * point_normals[p, i] + TANGENTIAL * gap[i])
-            matrix[v, i, i] += weight * TANGENTIAL
+            vector[v, i] += weight * (along * point_normals[p, i] + TANGENTIAL_WEIGHT * gap[i])
+            matrix[v, i, i] += weight * TANGENTIAL_WEIGHT
             for j in range(3):
                 matrix[v, i, j] += weight * point_normals[p, i] * point_normals[p, j]
 
 
 def two_way_distance(vertices: np.ndarray, faces: np.ndarray, cloud: Cloud) -> float:
-    """Mean distance in metres, over both ways, between the body's surface points and the cloud.
+    """Return the mean distance in metres, over both directions, between the body's surface points and the cloud.
 
-    The surface is taken at vertices and face centres; of a one-sided cloud only the points that face the sensor.
+    The surface is sampled at vertices and face centres; for a one-sided cloud only where it faces the sensor.
     """
     normals = vertex_normals(vertices, faces)
     corners = vertices[faces]
     surface = np.concatenate([vertices, corners.mean(axis=1)])
     face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     seen = cloud.sees(surface, np.concatenate([normals, face_normals]))
-    there = cloud.nearest.query(surface[seen])[0].mean() if seen.any() else np.inf
-    back = NearestPoints(surface).query(cloud.points)[0].mean()
-    return float((there + back) / 2)
+    to_cloud = cloud.nearest.query(surface[seen])[0].mean() if seen.any() else np.inf
+    to_body = NearestPoints(surface).query(cloud.points)[0].mean()
+    return float((to_cloud + to_body) / 2)

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clipping a cloud to the surroundings of believed limbs; visual hulls grow fins where no camera looks."""
+"""Crops a cloud to the surroundings of limbs at known joints: visual hulls have fins where no camera looks."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Radius in metres at both ends of the limbs between joints.
-LIMBS: tuple[tuple[str, str, float, float], ...] = (
+# Tapered capsules between joints: two joints and the radius at each in metres; the limbs stand once for both sides.
+LIMB_CAPSULES: tuple[tuple[str, str, float, float], ...] = (
     ("shoulder", "elbow", 0.055, 0.045),
     ("elbow", "wrist", 0.045, 0.035),
     ("wrist", "hand", 0.045, 0.045),
@@ -14,7 +14,7 @@ LIMBS: tuple[tuple[str, str, float, float], ...] = (
     ("knee", "ankle", 0.065, 0.045),
     ("ankle", "toe", 0.05, 0.045),
 )
-TRUNK: tuple[tuple[str, str, float, float], ...] = (
+TRUNK_CAPSULES: tuple[tuple[str, str, float, float], ...] = (
     ("left_shoulder", "right_shoulder", 0.08, 0.08),
     ("neck", "pelvis", 0.13, 0.14),
     ("left_hip", "right_hip", 0.11, 0.11),
@@ -25,22 +25,24 @@ TRUNK: tuple[tuple[str, str, float, float], ...] = (
 
 
 def crop_to_limbs(points: np.ndarray, joints: dict[str, np.ndarray], factor: float) -> np.ndarray:
-    """Which points (N,) lie within `factor` limb radii of the limbs' axes.
+    """Return which points (N,) lie within `factor` limb radii of the limbs' axes.
 
     Args:
         points: (N, 3) metres.
-        joints: places (3,) of a body's joints, all that `LIMBS` and `TRUNK` name.
+        joints: positions (3,) of a body's joints in metres; capsules with an unknown joint are left out.
         factor: multiple of the radii, about 1.5 to 2.5 for hulls.
     """
-    sides = [(f"{side}_{a}", f"{side}_{b}", ra, rb) for side in ("left", "right") for a, b, ra, rb in LIMBS]
+    sides = [(f"{side}_{a}", f"{side}_{b}", ra, rb) for side in ("left", "right") for a, b, ra, rb in LIMB_CAPSULES]
     near = np.zeros(len(points), dtype=bool)
-    for first, second, first_radius, second_radius in (*sides, *TRUNK):
+    for first, second, first_radius, second_radius in (*sides, *TRUNK_CAPSULES):
         if first in joints and second in joints:
-            near |= _inside(points, joints[first], joints[second], factor * first_radius, factor * second_radius)
+            near |= _inside_capsule(
+                points, joints[first], joints[second], factor * first_radius, factor * second_radius
+            )
     return near
 
 
-def _inside(points: np.ndarray, a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> np.ndarray:
+def _inside_capsule(points: np.ndarray, a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> np.ndarray:
     axis = b - a
     along = np.clip((points - a) @ axis / max(float(axis @ axis), 1e-9), 0.0, 1.0)
     distance = np.linalg.norm(points - a - along[:, None] * axis, axis=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Small geometry of meshes and point sets."""
+"""Geometry of meshes and point sets that several rooms share."""
 
 from __future__ import annotations
 
@@ -8,19 +8,30 @@ from numba import njit
 
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Return indices of `count` points (or all) of (N, 3) `points`, each the farthest from those before it."""
+    """Return the indices of `count` of `points` (N, 3), or of all, each the farthest from those before it."""
     chosen = np.empty(min(count, len(points)), dtype=np.int64)
     distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
-    for turn in range(len(chosen)):
-        chosen[turn] = distance.argmax()
-        if turn == 0:
+    for k in range(len(chosen)):
+        chosen[k] = distance.argmax()
+        if k == 0:
             distance = np.full(len(points), np.inf)
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[turn]], axis=1))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[k]], axis=1))
     return chosen
 
 
+def sum_groups(values: np.ndarray, group: np.ndarray, count: int = 0) -> np.ndarray:
+    """Return the sums (G, K) of the rows of `values` (N, K) in each group (N,) of at least `count`, G."""
+    return np.stack([np.bincount(group, column, count) for column in values.T], axis=1)
+
+
+def triangulate_fans(polygons: list[list[int]]) -> np.ndarray:
+    """Return the triangles (F, 3) of polygons, each a fan around the polygon's first vertex."""
+    triangles = [[face[0], face[k], face[k + 1]] for face in polygons for k in range(1, len(face) - 1)]
+    return np.array(triangles, dtype=np.int64).reshape(-1, 3)
+
+
 def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Area-weighted unit normals (V, 3) of a triangle mesh; zero where a vertex has no face."""
+    """Return the area-weighted unit normals (V, 3) of a triangle mesh; zero where a vertex has no face."""
     return _vertex_normals(np.ascontiguousarray(vertices, dtype=np.float64), np.ascontiguousarray(faces))
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cloud from one sensor: what of a body it should have seen, and the space that it saw to be free."""
+"""A cloud from one viewpoint: what the sensor should have seen of a body, and the space that it saw to be free."""
 
 from __future__ import annotations
 
@@ -8,27 +8,29 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic, geman_mcclure
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.one_sided import OneSidedView
 
-VIEW_POINTS = 4000
-"""More points than that of one side add time and no accuracy."""
-NEAREST = 0.05
-"""Metres before the sensor."""
-DEPTH_TOLERANCE, NOISES, NOISE_NEIGHBOURS = 0.01, 2.5, 6
-"""Metres, and multiples of the noise, before the seen surface up to which a vertex is left alone. Noise that counted on
-one side only would push the body away from the sensor."""
+MAX_VIEW_POINTS = 4000
+"""More points of one side add time and no accuracy."""
+MIN_SENSOR_DISTANCE_M = 0.05
+"""Distance in front of the sensor that a cloud must keep."""
+MIN_DEPTH_TOLERANCE_M, TOLERANCE_PER_NOISE = 0.01, 2.5
+"""Distance in front of the seen surface, at least and in multiples of the noise, at which a vertex is not yet pushed
+back. Noise that counts on one side only would push the body away from the sensor."""
+NOISE_NEIGHBOURS = 6
+"""Points by which the noise is measured, with the point itself."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SingleViewCloud(Cloud):
-    """A cloud to fit that was seen from one place.
+    """A cloud to fit that was seen from one viewpoint.
 
     Attributes:
         view: the cloud as its sensor saw it.
-        before: metres before the seen surface up to which a vertex is left alone.
+        depth_tolerance: distance in front of the seen surface, metres, at which a vertex is not yet pushed back.
     """
 
     view: OneSidedView
@@ -36,13 +38,13 @@ class SingleViewCloud(Cloud):
 
     @classmethod
     def seen_from(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> SingleViewCloud:
-        """Index a cloud; arguments as of `Cloud`.
+        """Index a cloud; the arguments are those of `Cloud`.
 
         Raises:
             InputError: when part of the cloud lies behind the sensor.
         """
         forward = points.mean(axis=0) - viewpoint
-        if ((points - viewpoint) @ forward <= NEAREST * np.linalg.norm(forward)).any():
+        if ((points - viewpoint) @ forward <= MIN_SENSOR_DISTANCE_M * np.linalg.norm(forward)).any():
             raise InputError(
                 f"the sensor at {np.round(viewpoint, 2).tolist()} m stands within the cloud and cannot have seen one"
                 " side of it; check the frame or fit it as a whole cloud"
@@ -50,19 +52,26 @@ class SingleViewCloud(Cloud):
         near = points[cKDTree(points).query(points, k=min(NOISE_NEIGHBOURS, len(points)))[1]]
         noise = float(np.median(np.abs(((near - points[:, None]) * normals[:, None]).sum(axis=2)[:, 1:])))
         view = OneSidedView.build(points, viewpoint)
-        return cls(points, normals, NearestPoints(points), viewpoint, view, max(DEPTH_TOLERANCE, NOISES * noise))
+        return cls(
+            points,
+            normals,
+            NearestPoints(points),
+            viewpoint,
+            view,
+            max(MIN_DEPTH_TOLERANCE_M, TOLERANCE_PER_NOISE * noise),
+        )
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Which vertices (V,) face the sensor and are not hidden by what it saw."""
+        """Return which vertices (V,) face the sensor and are not hidden by what it saw."""
         facing = ((self.view.viewpoint - vertices) * normals).sum(axis=1) > 0
-        return np.asarray(facing & ~self.view.hidden(vertices))
+        return np.asarray(facing & ~self.view.find_hidden(vertices))
 
-    def free_space(self, vertices: np.ndarray, sigma: float) -> VertexQuadratic:
-        """Draw vertices (V, 3) out of the space that the sensor saw to be free.
+    def free_space_term(self, vertices: np.ndarray, sigma: float) -> VertexQuadratic:
+        """Return the quadratic that pulls vertices (V, 3) out of the space that the sensor saw to be free.
 
-        Beside the silhouette a vertex goes towards its nearest ray, before the surface along its ray back to it, both
-        with the Geman-McClure weight of width `sigma`, metres; all vertices together weigh 1, as either way of
-        `attract` does.
+        A vertex beside the silhouette moves towards its nearest ray, one in front of the surface along its own ray
+        back to it, both with the `geman_mcclure` weight of width `sigma` in metres. The total weight is 1, as in each
+        direction of `attract`.
         """
         beside, behind = self.view.compare(vertices)
         ray = vertices - self.view.viewpoint
@@ -70,14 +79,10 @@ class SingleViewCloud(Cloud):
         across = beside - (beside * ray).sum(axis=1, keepdims=True) * ray
         inside = ~beside.any(axis=1)
         depth = np.where(inside, np.minimum(behind + self.depth_tolerance, 0.0), 0.0)
-        weight = _geman_mcclure((across**2).sum(axis=1), sigma) * ~inside / len(vertices)
-        weight_along = _geman_mcclure(depth**2, sigma) * (depth < 0) / len(vertices)
+        weight = geman_mcclure((across**2).sum(axis=1), sigma**2) * ~inside / len(vertices)
+        weight_along = geman_mcclure(depth**2, sigma**2) * (depth < 0) / len(vertices)
         outer = ray[:, :, None] * ray[:, None, :]
         return VertexQuadratic(
             weight[:, None, None] * (np.eye(3) - outer) + weight_along[:, None, None] * outer,
             weight[:, None] * across + (weight_along * depth)[:, None] * ray,
         )
-
-
-def _geman_mcclure(squared: np.ndarray, sigma: float) -> np.ndarray:
-    return (sigma**2 / (sigma**2 + squared)) ** 2

@@ -1,40 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of a Stitched Puppet to a cloud: search, the body turned around, finish, confidences."""
+"""The fit of a Stitched Puppet to a cloud: hypotheses and search, refinement, confidences."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
-from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.cloud.limb_crop import crop_to_limbs
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
-from flowing_puppet_ros.body.cloud.single_view import VIEW_POINTS, SingleViewCloud
+from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleViewCloud
 from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses, FitterSettings, Progress, sub_progress
-from flowing_puppet_ros.body.fit.initialisation import body_from_joints, joint_targets
+from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.quality import assess_fit
-from flowing_puppet_ros.body.refine.gauss_newton import LOOSE, GaussNewton
+from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton
 from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
 from flowing_puppet_ros.body.refine.nonrigid import NonRigidRefinement, NonRigidWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, ExactCloud
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+from flowing_puppet_ros.threads import one_blas_thread
 
 __all__ = ["BodyFit", "BodyFitter", "FitterSettings", "Progress", "check_cloud"]
 
-MIN_POINTS = 50
-# Models that are warm in this process.
-_WARM: set[str] = set()
-WARM_VIEW = np.array([3.0, 0.0, 0.0])  # metres from the body
-# Points that a cloud needs before it may shape the surface more finely than the model does.
-DENSE_CLOUD = 3000
-COARSE_POINTS = 1500
-# Widest sides, in metres, between which a cloud may be a person or a part of one, with some surroundings.
-PERSON_EXTENT = (0.1, 20.0)
+MIN_CLOUD_POINTS = 50  # finite and distinct
+WARM_UP_VIEWPOINT_M = np.array([3.0, 0.0, 0.0])  # relative to the body
+# Points that a cloud needs before it may shape the surface beyond the model.
+MIN_DENSE_POINTS = 3000
+MAX_COARSE_POINTS = 1500  # of a cloud whose frames are compared
+# Longest side of a cloud that may be a person or a part of one, with some surroundings.
+MIN_PERSON_EXTENT_M, MAX_PERSON_EXTENT_M = 0.1, 20.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,13 +42,13 @@ class BodyFit:
 
     Attributes:
         state: the model's variables.
-        vertices: (V, 3) metres, in the cloud's frame; where a whole cloud is dense not just the model's surface.
+        vertices: (V, 3) metres, in the cloud's frame; refined beyond the model's surface where a whole cloud is dense.
         joints: (J, 3) metres, in the order of the model's `joint_names`.
         energy: Eq. 50 of the body, lower is better.
         part_confidence: (16,) 0 to 1, how much of each part lies on the cloud.
-        confidence: 0 to 1, parts on the cloud and cloud on the body together.
-        reliable: whether nothing speaks against the body, see `Judgement.reliable`.
-        two_way_distance: mean distance between body and cloud over both ways, metres.
+        confidence: 0 to 1, from the parts on the cloud and the cloud on the body.
+        reliable: whether the body can be trusted, see `FitQuality.reliable`.
+        two_way_distance: mean distance between body and cloud over both directions, metres.
     """
 
     state: BodyState
@@ -63,30 +62,22 @@ class BodyFit:
 
 
 class BodyFitter:
-    """Fits one model to clouds of one person; deterministic for a seed, whatever the number of threads."""
+    """The fit of one model to clouds of one person; deterministic for a seed, whatever the number of threads."""
 
     def __init__(self, model: StitchedPuppet, settings: FitterSettings) -> None:
         self.model = model
         self.settings = settings
-        self._finder = BodyHypotheses(model, settings)
-        self._surface_finish = NonRigidRefinement(model.faces, len(model.part_of_vertex), NonRigidWeights())
+        self.hypotheses = BodyHypotheses(model, settings)
+        self._nonrigid = NonRigidRefinement(model.faces, len(model.part_of_vertex), NonRigidWeights())
 
     @property
     def gauss_newton(self) -> GaussNewton:
-        """The Gauss-Newton over all parts."""
-        return self._finder.refiner
+        """Gauss-Newton over all parts."""
+        return self.hypotheses.gauss_newton
 
     def warm_up(self) -> None:
-        """Do beforehand what takes long the first time in a process: load compiled code, make the bank of bodies."""
-        if self.model.name in _WARM:
-            return
-        _WARM.add(self.model.name)
-        with one_blas_thread():
-            points = self.model.vertices(self.model.rest_state())
-            cloud = self.cloud(points, None, None)
-            view = SingleViewCloud.seen_from(cloud.points, cloud.normals, cloud.points.mean(axis=0) + WARM_VIEW)
-            self._finder.warm_up(cloud, view)
-            self.result(self.model.rest_state(), cloud)
+        """Load compiled code and make the pose bank, which takes long; done once for a model in a process."""
+        _warm_up(self.model)
 
     def fit(
         self,
@@ -97,77 +88,83 @@ class BodyFitter:
         viewpoint: np.ndarray | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
-        own_surface: bool = True,
+        nonrigid: bool = True,
         quick: bool = False,
     ) -> BodyFit:
         """Fit the model to a cloud.
+
+        Cases:
+            initial joints: the body that they describe, a search near it, Gauss-Newton.
+            single view, or sparse: the best of the hypotheses (cases in `BodyHypotheses.search`), with Gauss-Newton.
+            dense whole cloud: the same, then the hand poses.
+            dense whole cloud, `nonrigid`: the same, then every vertex by itself.
 
         Args:
             points: (N, 3) metres, z up, one person.
             normals: (N, 3) outward unit normals, or None to estimate them.
             initial: joints by name as (x, y, z in metres, confidence 0 to 1), NaN where unknown; without them the
-                person stands with unknown yaw.
-            viewpoint: (3,) where the sensor stood when the cloud shows one side only.
+                person is upright with unknown yaw.
+            viewpoint: (3,) position of the sensor in metres, for a cloud that shows one side only.
             seed: overrides the settings' seed.
             progress: called with the fraction done, 0 to 1.
-            own_surface: let vertices follow a dense whole cloud closer than the model can.
-            quick: without initial joints try a small search first, whose limbs may still be wrong.
+            nonrigid: refine the vertices beyond the model where a whole cloud is dense.
+            quick: without initial joints, try a small search first, whose limbs may be wrong.
 
         Raises:
             InputError: when the cloud cannot be the surface of a person or the initial joints place no body.
         """
+        progress = progress or _no_progress
         rng = np.random.default_rng(self.settings.seed if seed is None else seed)
         with one_blas_thread():
             points, normals = check_cloud(points, normals)
-            if initial is None:
-                cloud = self.cloud(points, normals, viewpoint)
-                state = self._finder.search(cloud, rng, progress or _no_progress, quick)
-                (progress or _no_progress)(1.0)
-                if not self._follows_surface(cloud):
-                    return self.result(state, cloud)
-                state = refine_hand_pose(self.model, self._finder.refiner, state, cloud)
-                if not own_surface:
-                    return self.result(state, cloud)
-                return self._refine_nonrigid(self.result(state, cloud), cloud)
-            return self._fit_from_joints(points, normals, initial, viewpoint, rng, progress or _no_progress)
+            if initial is not None:
+                return self._fit_from_joints(points, normals, initial, viewpoint, rng, progress)
+            cloud = self.prepare_cloud(points, normals, viewpoint)
+            state = self.hypotheses.search(cloud, rng, progress, quick)
+            progress(1.0)
+            if not self._is_dense(cloud):
+                return self.assess(state, cloud)
+            state = refine_hand_pose(self.model, self.gauss_newton, state, cloud)
+            fit = self.assess(state, cloud)
+            return self._refine_nonrigid(fit, cloud) if nonrigid else fit
 
-    def cloud(self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None) -> Cloud:
-        """Thin and index the points; InputError when they cannot be the surface of a person."""
-        points, normals = self.person_points(points, normals, viewpoint)
+    def prepare_cloud(self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None) -> Cloud:
+        """Downsample and index a cloud; InputError when it cannot be the surface of a person."""
+        points, normals = self.prepare_points(points, normals, viewpoint)
         if normals is None:
             normals = estimate_normals(points, viewpoint)
         return Cloud.of(points, normals) if viewpoint is None else SingleViewCloud.seen_from(points, normals, viewpoint)
 
-    def person_points(
+    def prepare_points(
         self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Thin the points; InputError when they cannot be the surface of a person."""
+        """Downsample a cloud; InputError when it cannot be the surface of a person."""
         extent = float(np.ptp(points, axis=0).max())
-        if not PERSON_EXTENT[0] <= extent <= PERSON_EXTENT[1]:
+        if not MIN_PERSON_EXTENT_M <= extent <= MAX_PERSON_EXTENT_M:
             raise InputError(
-                f"the cloud is {extent:.3g} m wide, which is no person; check the unit or cut out one person"
+                f"the cloud is {extent:.3g} m wide, which is not a person; check the unit or cut out one person"
             )
-        limit = self.settings.cloud_points
-        points, normals = downsample(points, normals, limit if viewpoint is None else min(limit, VIEW_POINTS))
-        # Along one axis alone that is quickly told, of nearly every cloud.
+        limit = self.settings.max_points
+        points, normals = downsample(points, normals, limit if viewpoint is None else min(limit, MAX_VIEW_POINTS))
+        # Counted along one axis first, which is fast and enough for nearly every cloud.
         places = len(np.unique(points[:, 2]))
-        if places < MIN_POINTS and (places := len(np.unique(points, axis=0))) < MIN_POINTS:
+        if places < MIN_CLOUD_POINTS and (places := len(np.unique(points, axis=0))) < MIN_CLOUD_POINTS:
             raise InputError(
-                f"the cloud's points lie in {places} places and a fit needs {MIN_POINTS}; give the surface of a person"
+                f"the cloud has {places} distinct points, a fit needs {MIN_CLOUD_POINTS}; give the surface of a person"
             )
         return points, normals
 
     def coarse_cost(self, points: np.ndarray, viewpoint: np.ndarray | None = None) -> float:
-        """How well, in metres, any upright body may explain a cloud (N, 3) in metres; lower is better, and fast.
+        """Return roughly how far, in metres, the best upright body is from a cloud (N, 3) in metres.
 
-        Compares frames in which a cloud may be meant before one is fitted in.
+        Much faster than a fit; compares the frames that a cloud may be in.
         """
-        points = downsample(points, None, COARSE_POINTS)[0]
+        points = downsample(points, None, MAX_COARSE_POINTS)[0]
         unknown = np.zeros_like(points)
         cloud = (
             Cloud.of(points, unknown) if viewpoint is None else SingleViewCloud.seen_from(points, unknown, viewpoint)
         )
-        return self._finder.bank.coarse_cost(cloud)
+        return self.hypotheses.pose_bank.coarse_cost(cloud)
 
     def _fit_from_joints(
         self,
@@ -178,69 +175,69 @@ class BodyFitter:
         rng: np.random.Generator,
         progress: Progress,
     ) -> BodyFit:
-        """Start from the body that the joints describe, on the part of the cloud around its limbs."""
-        targets = joint_targets(self.model, initial)
-        body = body_from_joints(self.model, self._finder.refiner, targets)
+        """Fit from the body that the joints describe, to the part of the cloud around its limbs."""
+        targets = make_joint_targets(self.model, initial)
+        body = body_from_joints(self.model, self.gauss_newton, targets)
         if self.settings.clip_factor > 0:
             joints = self.model.joints(self.model.vertices(body))
             near = crop_to_limbs(
                 points, dict(zip(self.model.joint_names, joints, strict=True)), self.settings.clip_factor
             )
-            if np.count_nonzero(near) < MIN_POINTS:
+            if np.count_nonzero(near) < MIN_CLOUD_POINTS:
                 raise InputError(
                     f"only {np.count_nonzero(near)} of {len(points)} points lie around the initial joints; check that"
-                    " cloud and joints are in one frame, in metres"
+                    " cloud and joints are in the same frame, in metres"
                 )
             points, normals = points[near], None if normals is None else normals[near]
-        cloud = self.cloud(points, normals, viewpoint)
+        cloud = self.prepare_cloud(points, normals, viewpoint)
         grid = CloudGrid.build(cloud.points, cloud.normals)
-        targets = targets.scaled(self.settings.joint_strength)
-        found = self._finder.search_near(body, grid, targets, rng, sub_progress(progress, 0.1, 0.8))
-        body = self._finder.refine(found, cloud, targets, self.settings.refine_iterations)
+        targets = targets.scale(self.settings.joint_weight)
+        found = self.hypotheses.search_near(body, grid, targets, rng, sub_progress(progress, 0.1, 0.8))
+        body = self.hypotheses.refine(found, cloud, targets, self.settings.gauss_newton_steps)
         progress(1.0)
-        return self.result(body, cloud)
+        return self.assess(body, cloud)
 
-    def _follows_surface(self, cloud: Cloud) -> bool:
-        """Whether a cloud is dense and whole enough for hands and vertices of their own."""
-        return self.settings.surface_finish and cloud.viewpoint is None and len(cloud.points) >= DENSE_CLOUD
+    def _is_dense(self, cloud: Cloud) -> bool:
+        """Return whether a cloud is dense and whole enough to refine hands and vertices."""
+        return self.settings.nonrigid and cloud.viewpoint is None and len(cloud.points) >= MIN_DENSE_POINTS
 
     def _refine_nonrigid(self, fit: BodyFit, cloud: Cloud) -> BodyFit:
-        """The fit with vertices that follow a dense whole cloud closer than the model can."""
-        loose = self._finder.refiner.run(fit.state, cloud, JointTargets.none(self.model), LOOSE)
-        vertices = self._surface_finish.run(self.model.vertices(loose), cloud)
+        """Return the fit with vertices refined beyond the model on a dense whole cloud."""
+        loose = self.gauss_newton.run(fit.state, cloud, JointTargets.none(self.model), LOOSE_STITCHING)
+        vertices = self._nonrigid.run(self.model.vertices(loose), cloud)
         distance = two_way_distance(vertices, self.model.faces, cloud)
         return replace(fit, vertices=vertices, two_way_distance=distance)
 
-    def result(self, state: BodyState, cloud: Cloud) -> BodyFit:
-        """What is known of a body that was fitted to a cloud."""
+    def assess(self, state: BodyState, cloud: Cloud) -> BodyFit:
+        """Return the fit of a body to a cloud, with its energy and confidences."""
         vertices = self.model.vertices(state)
-        judgement = assess_fit(self.model, vertices, cloud)
+        quality = assess_fit(self.model, vertices, cloud)
         return BodyFit(
             state,
             vertices,
             self.model.joints(vertices),
-            self._finder.particle_search.energy(state, ExactCloud(cloud.points, cloud.normals, cloud.nearest)),
-            judgement.part_confidence,
-            judgement.confidence,
-            judgement.reliable,
-            judgement.distance,
+            self.hypotheses.particle_search.energy(state, ExactCloud(cloud.points, cloud.normals, cloud.nearest)),
+            quality.part_confidence,
+            quality.confidence,
+            quality.reliable,
+            quality.distance,
         )
 
 
 def check_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return float64 arrays without the points that are not finite; normals most of which are missing become None.
+    """Return float64 arrays without the points that are not finite, and no normals when most of them are missing.
 
     Raises:
         InputError: when shapes are wrong or too few points are left.
     """
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"a cloud has shape (points, 3), this one has {points.shape}")
+        raise InputError(f"a cloud has shape (N, 3), this one has {points.shape}")
     finite = np.isfinite(points).all(axis=1)
     if normals is not None:
         normals = np.asarray(normals, dtype=np.float64)
         if normals.shape != points.shape:
-            raise InputError(f"{len(points)} points need as many normals, got an array of shape {normals.shape}")
+            raise InputError(f"{len(points)} points need as many normals, got normals of shape {normals.shape}")
         length = np.linalg.norm(normals, axis=1, keepdims=True)
         usable = np.isfinite(length[:, 0]) & (length[:, 0] > 0)
         if 2 * np.count_nonzero(usable) < len(points):
@@ -249,10 +246,22 @@ def check_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndar
             finite &= usable
             normals = (normals / np.where(length > 0, length, 1))[finite]
     points = points[finite]
-    if len(points) < MIN_POINTS:
-        raise InputError(f"the cloud has {len(points)} finite points, a fit needs at least {MIN_POINTS} on one person")
+    if len(points) < MIN_CLOUD_POINTS:
+        raise InputError(f"the cloud has {len(points)} finite points, a fit needs {MIN_CLOUD_POINTS} on one person")
     return points, normals
 
 
+@lru_cache(maxsize=3)
+def _warm_up(model: StitchedPuppet) -> None:
+    """Run every step of a fit once on a body of the model; the cache keeps it from running twice."""
+    fitter = BodyFitter(model, FitterSettings())
+    with one_blas_thread():
+        state = model.rest_state()
+        cloud = fitter.prepare_cloud(model.vertices(state), None, None)
+        viewpoint = cloud.points.mean(axis=0) + WARM_UP_VIEWPOINT_M
+        fitter.hypotheses.warm_up(cloud, SingleViewCloud.seen_from(cloud.points, cloud.normals, viewpoint))
+        fitter.assess(state, cloud)
+
+
 def _no_progress(done: float) -> None:
-    """Take a fraction and do nothing."""
+    """Ignore the fraction done."""

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding a body of unknown pose: a search, and hypotheses of what it may have got wrong.
+"""Finds a body of unknown pose: a search, and hypotheses of what it may have got wrong.
 
-The energy hardly tells a body from the same one turned around, and a limb in the air or on another limb costs little.
-The distance both ways, body to cloud and cloud to body, tells: every hypothesis is fitted and the closest body kept.
+The energy of a body and that of the same body facing the other way are nearly equal, and a limb in the air or on
+another limb costs little. The two-way distance between body and cloud decides: every hypothesis is refined and the
+closest body kept.
 """
 
 from __future__ import annotations
@@ -16,103 +17,128 @@ from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.initialisation import flip_heading, sample_bodies
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
-from flowing_puppet_ros.body.fit.quality import RELIABLY_UNCOVERED, FitQuality, assess_fit
+from flowing_puppet_ros.body.fit.quality import MAX_UNCOVERED, FitQuality, assess_fit
 from flowing_puppet_ros.body.fit.single_view_search import SingleViewSearch
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.limb_search import SINGLE_LIMBS, LimbSearch, limb_groups
-from flowing_puppet_ros.body.search.part_points import part_points
+from flowing_puppet_ros.body.search.part_points import build_part_points
 from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer, WalkNoise
 from flowing_puppet_ros.body.search.schedule import four_stages, local_stages
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.parallel import parallel_map, usable_threads
 from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.threads import parallel_map, usable_threads
 
 Progress = Callable[[float], None]
-# Steps of the finish of a hypothesis, and how many limbs that were searched anew are finished in a round.
-HYPOTHESIS_STEPS, LIMBS_FINISHED = 12, 3
-# Confidence of a part below which its limb may hang hidden.
-LIMB_OFF = 0.6
-# A limb hypothesis must be this much closer than the body that it came from, and none helps a body so many metres off.
-CLOSER, HOPELESS = 0.98, 0.06
-# Shares of the usual particles and of the usual rounds in a quick search, and in one that only loads what it uses.
-QUICK, WARM = 0.5, 0.1
-# Where this share of the cloud is uncovered the whole body is probably wrong: only a leap is worth another round.
-MOSTLY_OFF, LEAP = 0.25, 0.9
+# Gauss-Newton steps of a hypothesis.
+MAX_HYPOTHESIS_STEPS = 12
+# Limbs of a repair round that are refined, of those that were searched again.
+MAX_REFINED_LIMBS = 3
+# Confidence of a part below which its limb may be hidden.
+MIN_LIMB_CONFIDENCE = 0.6
+# Cost of a body from which on no limb hypothesis helps.
+MAX_REPAIRABLE_COST_M = 0.06
+# Cost of the best limb hypothesis, in costs of the body that it came from, for another repair round; the second where
+# so much of the cloud is uncovered that the whole body is probably wrong.
+MAX_COST_RATIO, MAX_COST_RATIO_IF_WRONG, MIN_WRONG_UNCOVERED = 0.98, 0.9, 0.25
+# Shares of the particles and rounds in a quick search, and in one for the warm-up.
+QUICK_SHARE, WARM_UP_SHARE = 0.5, 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class FitterSettings(Settings):
-    """Settings of `BodyFitter`; the defaults are the fast ones, the thesis's are 80 particles and 120 iterations."""
+    """Settings of `BodyFitter`; the defaults are fast, the thesis has 80 particles and 120 iterations."""
 
-    particles: int = setting(40, "particles a part", low=4, high=1000)
-    iterations: int = setting(50, "rounds of the search when nothing is known of the pose", low=1, high=10000)
-    local_particles: int = setting(20, "particles a part when the pose is roughly known", low=4, high=1000)
-    local_iterations: int = setting(16, "rounds of the search when the pose is roughly known", low=0, high=10000)
-    lm_steps: int = setting(4, "Levenberg-Marquardt steps a new particle", low=0, high=50)
-    refine_iterations: int = setting(15, "Gauss-Newton steps of the finish", low=0, high=200)
-    cloud_points: int = setting(10000, "points that a cloud is thinned to", low=200, high=200000)
-    joint_strength: float = setting(0.02, "pull of an initial joint against the whole cloud's", low=0.0, high=100.0)
-    clip_factor: float = setting(2.0, "limb radii around the initial joints' axes that a cloud is clipped to, 0: none",
-                                 low=0.0, high=20.0)  # fmt: skip
-    restarts: int = setting(1, "searches from new starts while no body comes close to the cloud", low=0, high=20)
-    restart_distance: float = setting(0.02, "two-way distance at which a body is close", unit="m", low=0.0, high=1.0)
-    limb_rounds: int = setting(3, "rounds in which limbs that seem misplaced are searched anew", low=0, high=20)
-    surface_finish: bool = setting(True, "let the surface leave the model's where a whole cloud is dense")
-    threads: int = setting(2, "threads, at most the cores there are; the result does not depend on it",
-                           low=1, high=64)  # fmt: skip
-    seed: int = setting(0, "seed of all that is random", low=0)
+    particles: int = setting(40, "particles per part", low=4, high=1000)
+    iterations: int = setting(50, "iterations of the search when the pose is unknown", low=1, high=10000)
+    local_particles: int = setting(
+        20, "particles per part when the pose is roughly known", low=4, high=1000, advanced=True
+    )
+    local_iterations: int = setting(
+        16, "iterations of the search when the pose is roughly known", low=0, high=10000, advanced=True
+    )
+    levenberg_steps: int = setting(4, "Levenberg-Marquardt steps per new particle", low=0, high=50, advanced=True)
+    gauss_newton_steps: int = setting(15, "Gauss-Newton steps of the final refinement", low=0, high=200, advanced=True)
+    max_points: int = setting(10000, "points that a cloud is downsampled to", low=200, high=200000, advanced=True)
+    joint_weight: float = setting(
+        0.02, "weight of an initial joint relative to the whole cloud", low=0.0, high=100.0, advanced=True
+    )
+    clip_factor: float = setting(
+        2.0,
+        "limb radii around the initial joints' bones to which a cloud is cropped; 0: not cropped",
+        low=0.0,
+        high=20.0,
+        advanced=True,
+    )
+    restarts: int = setting(
+        1, "searches from new starts while no body is close to the cloud", low=0, high=20, advanced=True
+    )
+    restart_distance: float = setting(
+        0.02, "two-way distance below which a body is close to the cloud", unit="m", low=0.0, high=1.0, advanced=True
+    )
+    max_limb_repairs: int = setting(
+        3, "maximum rounds in which limbs that seem misplaced are searched again", low=0, high=20, advanced=True
+    )
+    nonrigid: bool = setting(True, "refine the surface beyond the model where a whole cloud is dense", advanced=True)
+    threads: int = setting(2, "threads, at most one per core; the result does not depend on it", low=1, high=64)
+    seed: int = setting(0, "seed of all random draws", low=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyCandidate:
-    """A body and what the cloud says of it."""
+    """A body with its quality on the cloud."""
 
     state: BodyState
     quality: FitQuality
 
     @property
     def cost(self) -> float:
-        """What candidates are compared by, metres."""
+        """Cost by which candidates are compared, metres."""
         return self.quality.cost
 
 
 class BodyHypotheses:
-    """The search, its hypotheses and the finish, for one model."""
+    """The search, its hypotheses and their refinement, for one model."""
 
     def __init__(self, model: StitchedPuppet, settings: FitterSettings) -> None:
         self._model = model
         self._settings = settings
         self._threads = usable_threads(settings.threads)
-        points = part_points(model)
-        self.particle_search = BodyParticleSearch(model, points, SearchWeights(lm_steps=settings.lm_steps))
-        self.refiner = GaussNewton(model)
+        points = build_part_points(model)
+        self.particle_search = BodyParticleSearch(model, points, SearchWeights(lm_steps=settings.levenberg_steps))
+        self.gauss_newton = GaussNewton(model)
         self._proposer = Proposer(model, points)
-        self.limbs = LimbSearch(model, self.particle_search, self._proposer)
-        self.bank = PoseBank(model, points)
-        self._view_search = SingleViewSearch(model, self.bank, self._proposer, self.refiner, self._threads)
+        self.limb_search = LimbSearch(model, self.particle_search, self._proposer)
+        self.pose_bank = PoseBank(model, points)
+        self._single_view_search = SingleViewSearch(
+            model, self.pose_bank, self._proposer, self.gauss_newton, self._threads
+        )
 
     def search(self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False) -> BodyState:
-        """The body of a cloud of which nothing but the upright is known.
+        """Find the body of a cloud in metres, z up, when only its up direction is known.
 
-        `quick` tries a small search first and is content when its body lies close, whatever its limbs do.
+        Cases:
+            single view: the search from the pose bank, by itself; what follows is for whole clouds.
+            quick: half of the particles and rounds first; enough if the body is close, whatever its limbs do.
+            restarts: 1 + `restarts` searches, each in both headings, until a body is close.
+            repair: suspect limbs of each candidate are searched again before it is compared.
         """
         if isinstance(cloud, SingleViewCloud):
-            return self._view_search.run(cloud, rng, self._settings.refine_iterations, progress)
+            return self._single_view_search.run(cloud, rng, self._settings.gauss_newton_steps, progress)
         grid = CloudGrid.build(cloud.points, cloud.normals)
-        none, steps = JointTargets.none(self._model), self._settings.refine_iterations
+        none, steps = JointTargets.none(self._model), self._settings.gauss_newton_steps
         if quick:
-            best = self._both_headings(cloud, grid, rng, sub_progress(progress, 0.0, 0.3), QUICK)[0]
+            best = self._search_both_headings(cloud, grid, rng, sub_progress(progress, 0.0, 0.3), QUICK_SHARE)[0]
             if self._is_close(best):
                 return self.refine(best.state, cloud, none, steps)
         tries = 1 + self._settings.restarts
         tried: list[BodyCandidate] = []
-        for turn in range(tries):
-            for candidate in self._both_headings(
-                cloud, grid, rng, sub_progress(progress, turn / tries, (turn + 0.7) / tries)
+        for number in range(tries):
+            for candidate in self._search_both_headings(
+                cloud, grid, rng, sub_progress(progress, number / tries, (number + 0.7) / tries)
             ):
                 tried.append(self.repair_limbs(candidate, cloud, grid, rng))
                 best = min(tried, key=lambda candidate: candidate.cost)
@@ -124,10 +150,10 @@ class BodyHypotheses:
         return candidate.cost < self._settings.restart_distance
 
     def warm_up(self, cloud: Cloud, view: SingleViewCloud) -> None:
-        """Use all compiled code once, on any cloud from all sides and any from one side."""
+        """Run all compiled code once, on a whole cloud and on a single view."""
         grid = CloudGrid.build(cloud.points, cloud.normals)
-        self._both_headings(cloud, grid, np.random.default_rng(0), lambda _: None, WARM)
-        state = self.bank.best(CoarseCloud.of(view), 1)[0]
+        self._search_both_headings(cloud, grid, np.random.default_rng(0), lambda _: None, WARM_UP_SHARE)
+        state = self.pose_bank.find_best(CoarseCloud.of(view), 1)[0]
         self.refine(state, view, JointTargets.none(self._model), 1)
 
     def search_near(
@@ -145,22 +171,22 @@ class BodyHypotheses:
         ).state
 
     def refine(self, body: BodyState, cloud: Cloud, targets: JointTargets, steps: int) -> BodyState:
-        """The body after `steps` of the Gauss-Newton over all parts."""
-        terms = [cloud.free_space] if isinstance(cloud, SingleViewCloud) else []
-        return self.refiner.run(body, cloud, targets, RefineWeights(iterations=steps), terms)
+        """Return the body after `steps` Gauss-Newton steps over all parts."""
+        terms = [cloud.free_space_term] if isinstance(cloud, SingleViewCloud) else []
+        return self.gauss_newton.run(body, cloud, targets, RefineWeights(iterations=steps), terms)
 
-    def candidate(self, body: BodyState, cloud: Cloud) -> BodyCandidate:
-        """A hypothesis after a short finish, judged."""
-        steps = min(HYPOTHESIS_STEPS, self._settings.refine_iterations)
+    def evaluate(self, body: BodyState, cloud: Cloud) -> BodyCandidate:
+        """Refine a hypothesis briefly and assess it."""
+        steps = min(MAX_HYPOTHESIS_STEPS, self._settings.gauss_newton_steps)
         state = self.refine(body, cloud, JointTargets.none(self._model), steps)
         return BodyCandidate(state, assess_fit(self._model, self._model.vertices(state), cloud))
 
-    def _both_headings(
+    def _search_both_headings(
         self, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator, progress: Progress, share: float = 1.0
     ) -> list[BodyCandidate]:
-        """Search with unknown yaw: the body found and the best one that faces the other way, the closer one first.
+        """Search with unknown yaw; return that body and the best one with the opposite heading, the closer one first.
 
-        `share` is of the usual particles and rounds.
+        `share` is the share of the settings' particles and iterations to use.
         """
         none = JointTargets.none(self._model)
         particles, iterations = (
@@ -173,50 +199,51 @@ class BodyHypotheses:
         found = self.particle_search.optimise(
             start, grid, none, stages, iterations, rng, sub_progress(progress, 0.0, 0.8), threads=self._threads
         )
-        body = self.candidate(found.state, cloud)
-        turned = self.search_near(
+        body = self.evaluate(found.state, cloud)
+        flipped = self.search_near(
             flip_heading(self._model, body.state), grid, none, rng, sub_progress(progress, 0.8, 1.0)
         )
-        return sorted([body, self.candidate(turned, cloud)], key=lambda candidate: candidate.cost)
+        return sorted([body, self.evaluate(flipped, cloud)], key=lambda candidate: candidate.cost)
 
     def repair_limbs(
         self, body: BodyCandidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator
     ) -> BodyCandidate:
-        """The body with limbs moved to where they lie closer, while one seems to be in a wrong place."""
-        for _ in range(self._settings.limb_rounds):
-            if not body.quality.limb_suspect or body.cost > HOPELESS:
+        """Search suspect limbs of a body again, round after round, while that brings it closer to the cloud."""
+        for _ in range(self._settings.max_limb_repairs):
+            if not body.quality.limb_suspect or body.cost > MAX_REPAIRABLE_COST_M:
                 break
-            states = [body.state, *self._limbs_moved(body, cloud, grid, rng)]
-            candidates = parallel_map(lambda state: self.candidate(state, cloud), states, self._threads)
+            states = [body.state, *self._propose_limbs(body, cloud, grid, rng)]
+            candidates = parallel_map(lambda state: self.evaluate(state, cloud), states, self._threads)
             closest = min(candidates, key=lambda candidate: candidate.cost)
-            wanted = LEAP if body.quality.uncovered > MOSTLY_OFF else CLOSER
+            wrong = body.quality.uncovered > MIN_WRONG_UNCOVERED
             body, before = min(body, closest, key=lambda candidate: candidate.cost), body
-            if closest.cost > wanted * before.cost:
+            if closest.cost > (MAX_COST_RATIO_IF_WRONG if wrong else MAX_COST_RATIO) * before.cost:
                 break
         return body
 
-    def _limbs_moved(
+    def _propose_limbs(
         self, body: BodyCandidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator
     ) -> list[BodyState]:
-        """The closest of the bodies with limbs searched anew, and those with a limb that is off as it usually hangs.
+        """Return the closest bodies with limbs searched again, and those with a doubtful limb at its mean pose.
 
-        Several limbs at once are searched when much of the cloud is uncovered.
+        Several limbs are searched at once when much of the cloud is uncovered.
         """
         groups = limb_groups(self._model.tree)
         limbs = groups[:SINGLE_LIMBS]
-        if body.quality.uncovered <= RELIABLY_UNCOVERED:
+        if body.quality.uncovered <= MAX_UNCOVERED:
             groups = limbs
         found = parallel_map(
-            lambda pair: self.limbs.run(body.state, pair[0], cloud, grid, pair[1]),
+            lambda pair: self.limb_search.run(body.state, pair[0], cloud, grid, pair[1]),
             list(zip(groups, rng.spawn(len(groups)), strict=True)),
             self._threads,
         )
         bodies = [state for state in found if state is not None]
         bodies.sort(key=lambda state: two_way_distance(self._model.vertices(state), self._model.faces, cloud))
-        off = [limb for limb in limbs if body.quality.part_confidence[list(limb)].min() < LIMB_OFF]
-        return bodies[:LIMBS_FINISHED] + [self.limbs.mean_limb(body.state, limb) for limb in off]
+        doubtful = [limb for limb in limbs if body.quality.part_confidence[list(limb)].min() < MIN_LIMB_CONFIDENCE]
+        at_mean = [self.limb_search.pose_limb_at_mean(body.state, limb) for limb in doubtful]
+        return bodies[:MAX_REFINED_LIMBS] + at_mean
 
 
 def sub_progress(progress: Progress, low: float, high: float) -> Progress:
-    """Progress of one stretch of the work."""
+    """Return the progress of a part of the work, from `low` to `high` of the whole."""
     return lambda done: progress(low + (high - low) * done)

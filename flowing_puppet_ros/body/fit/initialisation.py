@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a fit starts: bodies sampled with unknown yaw, bodies placed on given joints, and the body turned around."""
+"""Starts of a fit: bodies sampled with unknown yaw, bodies placed on given joints, and bodies with opposite heading."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-# For every part the joint at its far end, by which its direction is known.
+# The joint at the far end of every part, which gives its direction.
 FAR_JOINT = {
     "shoulder": "shoulder",
     "upper_arm": "elbow",
@@ -23,7 +23,8 @@ FAR_JOINT = {
     "lower_leg": "ankle",
     "foot": "toe",
 }
-TRUNK = (
+# Joints that the torso determines, by which it is aligned.
+TRUNK_JOINTS = (
     "neck",
     "belly",
     "pelvis",
@@ -35,60 +36,62 @@ TRUNK = (
     "nose",
     "head_top",
 )
-START_STRENGTH = 0.1
-# Metres, root of the summed squares: joints of a person seen from the side are this far off their common line.
-OFF_LINE = 0.05
+MIN_JOINTS = 4  # known to the model and finite
+START_WEIGHT = 0.1  # factor of the targets' weights
+# Second singular value of centred joints, below which they lie on a line.
+MIN_OFF_LINE_M = 0.05
+# Without a cloud, targets and priors must place the whole body.
 JOINTS_ONLY = RefineWeights(
     stitch=1.0, pose=1e-5, shape=3e-5, pairwise=1e-5, sigma_start=0.4, sigma_end=0.08, iterations=15
 )
 
 
-def joint_targets(model: StitchedPuppet, initial: Mapping[str, tuple[float, float, float, float]]) -> JointTargets:
+def make_joint_targets(model: StitchedPuppet, initial: Mapping[str, tuple[float, float, float, float]]) -> JointTargets:
     """Turn named joints (x, y, z in metres, confidence 0 to 1) into targets weighted by confidence.
 
     Unknown names and joints with NaN are left out.
 
     Raises:
-        InputError: when fewer than four joints remain or they all lie on a line, so that no body is placed.
+        InputError: when fewer than four joints remain or all lie on a line, which does not determine a body.
     """
     points, weight = np.zeros((len(model.joint_names), 3)), np.zeros(len(model.joint_names))
     for name, values in initial.items():
         if name in model.joint_names and np.all(np.isfinite(values)) and values[3] > 0:
             points[model.joint_names.index(name)] = values[:3]
             weight[model.joint_names.index(name)] = min(float(values[3]), 1.0)
-    if np.count_nonzero(weight) < 4:
+    if np.count_nonzero(weight) < MIN_JOINTS:
         raise InputError(
-            f"only {np.count_nonzero(weight)} of the {len(initial)} initial joints are known to the body model and"
-            " finite, and a start needs 4; give more joints or none"
+            f"only {np.count_nonzero(weight)} of the {len(initial)} initial joints are finite joints of the body model,"
+            f" and a start needs {MIN_JOINTS}; give more joints or none"
         )
     if not _span_a_plane(points[weight > 0]):
-        raise InputError("the initial joints lie on a line, so that the body's front is unknown; give more or none")
+        raise InputError("the initial joints lie on a line, so the body's heading is unknown; give more joints or none")
     return JointTargets(points, weight)
 
 
 def body_from_joints(model: StitchedPuppet, refiner: GaussNewton, targets: JointTargets) -> BodyState:
-    """Place all parts so that the model's joints come to lie on the targets.
+    """Place all parts so that the model's joints lie on the targets.
 
-    The trunk is aligned by Procrustes, every other part is turned the shortest way towards its far joint, and a
-    Gauss-Newton without a cloud settles lengths, twists and bends. Parts without targets follow their parents.
+    The trunk is aligned by Procrustes, every other part takes the shortest rotation towards its far joint, and
+    Gauss-Newton without a cloud adjusts lengths, twists and bends. Parts without targets follow their parents.
     """
     rest = model.rest_state()
     template = model.joints(model.vertices(rest))
-    start = _trunk(model, rest, template, targets)
+    start = _align_trunk(model, rest, template, targets)
     for part in range(1, len(model.tree)):
         _attach(model, start, part, rest, template, targets)
-    return refiner.run(start, None, targets.scaled(START_STRENGTH), JOINTS_ONLY)
+    return refiner.run(start, None, targets.scale(START_WEIGHT), JOINTS_ONLY)
 
 
 def _span_a_plane(points: np.ndarray) -> bool:
-    """Whether points (K, 3) in metres lie wide enough off a common line to tell which way a body faces."""
-    return len(points) >= 3 and float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]) > OFF_LINE
+    """Return whether points (K, 3) in metres are far enough from a common line to give a body's heading."""
+    return len(points) >= 3 and float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]) > MIN_OFF_LINE_M
 
 
-def _trunk(model: StitchedPuppet, rest: BodyState, template: np.ndarray, targets: JointTargets) -> BodyState:
-    """The body `rest` with joints `template` (J, 3) moved rigidly so that its trunk's joints lie on the targets."""
+def _align_trunk(model: StitchedPuppet, rest: BodyState, template: np.ndarray, targets: JointTargets) -> BodyState:
+    """Return `rest`, with joints `template` (J, 3), moved rigidly so that its trunk's joints lie on the targets."""
     known = targets.weight > 0
-    trunk = known & np.array([name in TRUNK for name in model.joint_names])
+    trunk = known & np.array([name in TRUNK_JOINTS for name in model.joint_names])
     used = trunk if _span_a_plane(targets.points[trunk]) else known
     rotation, center = so3.procrustes(template[used], targets.points[used], targets.weight[used])
     return BodyState(rest.center @ rotation.T + center, rotation @ rest.rotation, rest.pose.copy(), rest.shape.copy())
@@ -97,7 +100,7 @@ def _trunk(model: StitchedPuppet, rest: BodyState, template: np.ndarray, targets
 def _attach(
     model: StitchedPuppet, state: BodyState, part: int, rest: BodyState, template: np.ndarray, targets: JointTargets
 ) -> None:
-    """Hang a part on its parent, in place, and turn it towards the target of its far joint."""
+    """Attach a part to its parent, in place, and rotate it towards the target of its far joint."""
     parent, name = model.tree.parents[part], model.tree.names[part]
     interface = model.interfaces[part - 1]
     above = model.part_mesh(
@@ -111,13 +114,13 @@ def _attach(
     joint = model.joint_names.index(far) if far in model.joint_names else -1
     if joint >= 0 and targets.weight[joint] > 0:
         own_far = (template[joint] - rest.center[part]) @ rest.rotation[part]
-        rotation = _shortest_turn(rotation @ (own_far - own_near), targets.points[joint] - near) @ rotation
+        rotation = _shortest_rotation(rotation @ (own_far - own_near), targets.points[joint] - near) @ rotation
     state.rotation[part] = rotation
     state.center[part] = near - rotation @ own_near
 
 
-def _shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) by the smallest angle that takes the direction of a to that of b."""
+def _shortest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) by the smallest angle that takes the direction of a (3,) to that of b (3,)."""
     a, b = a / max(np.linalg.norm(a), 1e-12), b / max(np.linalg.norm(b), 1e-12)
     axis = np.cross(a, b)
     sine, cosine = float(np.linalg.norm(axis)), float(a @ b)
@@ -127,7 +130,7 @@ def _shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def sample_bodies(model: StitchedPuppet, center: np.ndarray, count: int, rng: np.random.Generator) -> list[BodyState]:
-    """Draw upright bodies of mean shape with the torso at `center` (3,) and uniformly random yaw.
+    """Sample upright bodies of mean shape with the torso at `center` (3,) and uniformly random yaw.
 
     The yaws are spread evenly with one random offset, so that no quarter of the circle is left out.
     """
@@ -135,16 +138,16 @@ def sample_bodies(model: StitchedPuppet, center: np.ndarray, count: int, rng: np
     yaws = 2 * np.pi * (rng.random() + rng.permutation(count)) / count
     for yaw in yaws:
         body = model.sample(rng, shape_scale=0.0)
-        turn = so3.exp(np.array([0.0, 0.0, yaw]))
-        moved = (body.center - body.center[0]) @ turn.T + center
-        bodies.append(BodyState(moved, turn @ body.rotation, body.pose, body.shape))
+        rotation = so3.exp(np.array([0.0, 0.0, yaw]))
+        centers = (body.center - body.center[0]) @ rotation.T + center
+        bodies.append(BodyState(centers, rotation @ body.rotation, body.pose, body.shape))
     return bodies
 
 
 def flip_heading(model: StitchedPuppet, state: BodyState) -> BodyState:
-    """The hypothesis that the body faces the other way: its left limbs take the places of its right ones.
+    """Return the body with the opposite heading, its left limbs in place of the right ones and vice versa.
 
-    Every part is turned by half a circle about the vertical through its own axis; deformations are forgotten.
+    Every part is rotated by half a turn about the vertical through its centre; deformations are reset.
     """
     mirror = list(model.tree.mirror)
     half = np.diag([-1.0, -1.0, 1.0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far a fitted body may be believed: what of it lies on the cloud, and what of the cloud lies on it."""
+"""How far a fitted body can be trusted: how much of it lies on the cloud, and how much of the cloud lies on it."""
 
 from __future__ import annotations
 
@@ -7,35 +7,36 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, geman_mcclure, two_way_distance
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
-WIDTH = 0.04  # metres: a vertex or point that far from the other surface counts a quarter
-UNCOVERED = 0.04  # metres
-# A body with more of the cloud uncovered, or a part less on the cloud, has a limb in a wrong place, or may have.
-MUCH_UNCOVERED, LITTLE_ON_CLOUD = 0.005, 0.3
-MIN_SEEN = 0.1
-RELIABLE, RELIABLY_UNCOVERED = 0.6, 0.05
-# Metres between the centres of two neighbours that lie in each other: a little more than what the search forbids (Eq.
-# 51), less than in an elbow that is bent as far as it goes (0.064 in a telephone call).
-SELF_INTERSECTING = 0.055
-# What a folded limb costs in metres of distance: limbs vanish into limbs where they would otherwise be in the air.
-SELF_INTERSECTION_COST = 0.003
+KERNEL_WIDTH_M = 0.04  # distance to the other surface at which a vertex or point counts a quarter
+MAX_COVERED_DISTANCE_M = 0.04  # between a covered cloud point and the body
+# With more of the cloud uncovered, or a part less on the cloud, a limb may be in a wrong place.
+MAX_LIMB_UNCOVERED, MIN_PART_CONFIDENCE = 0.005, 0.3
+MIN_SEEN_SHARE = 0.1  # of a part's vertices
+# Bounds of a reliable body.
+MIN_CONFIDENCE, MAX_UNCOVERED = 0.6, 0.05
+# Distance between the centres of neighbouring parts below which they intersect: a little more than the search forbids
+# (Eq. 51), less than in an elbow that is bent as far as it goes (0.064 m with a phone at the ear).
+MIN_DISJOINT_DISTANCE_M = 0.055
+# Cost of a self-intersection: limbs are folded into limbs where they would otherwise be in the air.
+SELF_INTERSECTION_COST_M = 0.003
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FitQuality:
-    """A body against a cloud.
+    """The quality of a body on a cloud.
 
     Attributes:
         part_confidence: (16,) 0 to 1, how much of each part's seen surface lies on the cloud; 0 for unseen parts.
         seen: (16,) whether at least a tenth of the part's surface is seen.
         explained: 0 to 1, how much of the cloud lies on the body.
         uncovered: share of the cloud's points that are farther than 4 cm from the body.
-        folded: joints at which the parts on both sides lie in each other (centres less than 5.5 cm apart).
-        distance: mean over both ways of the distances between body and cloud, metres.
+        self_intersections: joints whose two parts intersect (centres less than 5.5 cm apart).
+        distance: mean distance between body and cloud over both directions, metres.
     """
 
     part_confidence: np.ndarray
@@ -47,59 +48,60 @@ class FitQuality:
 
     @property
     def cost(self) -> float:
-        """What hypotheses are compared by, metres."""
-        return self.distance + SELF_INTERSECTION_COST * self.self_intersections
+        """Cost by which hypotheses are compared, metres."""
+        return self.distance + SELF_INTERSECTION_COST_M * self.self_intersections
 
     @property
     def limb_suspect(self) -> bool:
         """Whether a limb may be in a wrong place."""
-        least = self.part_confidence[self.seen].min(initial=1.0)
-        return self.uncovered > MUCH_UNCOVERED or self.self_intersections > 0 or bool(least < LITTLE_ON_CLOUD)
+        lowest = self.part_confidence[self.seen].min(initial=1.0)
+        uncovered = self.uncovered > MAX_LIMB_UNCOVERED
+        return uncovered or self.self_intersections > 0 or bool(lowest < MIN_PART_CONFIDENCE)
 
     @property
     def confidence(self) -> float:
-        """0 to 1: the geometric mean of parts on the cloud and cloud on the body.
+        """Geometric mean of the parts on the cloud and the cloud on the body, 0 to 1.
 
-        A seen part that hardly lies on the cloud lessens it by up to a half, every fold halves it.
+        A seen part that hardly lies on the cloud lowers it by up to a half; every self-intersection divides it further.
         """
         if not self.seen.any():
             return 0.0
         seen = self.part_confidence[self.seen]
-        weakest = min(1.0, float(seen.min()) / LITTLE_ON_CLOUD)
+        weakest = min(1.0, float(seen.min()) / MIN_PART_CONFIDENCE)
         return float(np.sqrt(seen.mean() * self.explained)) * (1 + weakest) / 2 / (1 + self.self_intersections)
 
     @property
     def reliable(self) -> bool:
         """Whether the confidence is at least 0.6 and at most a twentieth of the cloud is uncovered.
 
-        Of 168 fits of whole clouds (Anny, TOSCA, SHREC'19; good searches and bad ones) this lets none of 10 wrong ones
-        pass and stops 9 of the 158 right ones, all of them poor.
+        Of 168 fits of whole clouds (Anny, TOSCA, SHREC'19; good and bad searches) it rejects all 10 wrong ones and 9 of
+        the 158 right ones, all of them poor.
         """
-        return self.confidence >= RELIABLE and self.uncovered <= RELIABLY_UNCOVERED
+        return self.confidence >= MIN_CONFIDENCE and self.uncovered <= MAX_UNCOVERED
 
 
 def assess_fit(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> FitQuality:
-    """Compare a body with vertices (V, 3), metres, with a cloud.
+    """Assess a body with `vertices` (V, 3) in metres on a cloud.
 
-    A vertex or a cloud point counts by the Geman-McClure weight of its distance to the other surface at 4 cm; a vertex
-    counts nothing where the normals disagree.
+    Vertices and cloud points count with the `geman_mcclure` weight of their distance to the other surface, of width
+    4 cm; vertices not at all where the normals disagree.
     """
     normals = vertex_normals(vertices, model.faces)
     distance, index = cloud.nearest.query(vertices)
-    weight = (WIDTH**2 / (WIDTH**2 + distance**2)) ** 2
+    weight = geman_mcclure(distance**2, KERNEL_WIDTH_M**2)
     weight *= (normals * cloud.normals[index]).sum(axis=1) > 0
     seen = cloud.sees(vertices, normals)
     owner, parts = model.part_of_vertex, len(model.tree)
     count, size = np.bincount(owner[seen], minlength=parts), np.bincount(owner, minlength=parts)
     share = np.bincount(owner[seen], weight[seen], minlength=parts) / np.maximum(count, 1)
-    back = NearestPoints(vertices).query(cloud.points)[0]
+    to_body = NearestPoints(vertices).query(cloud.points)[0]
     centers = np.stack([vertices[owner == part].mean(axis=0) for part in range(parts)])
-    apart = [np.linalg.norm(centers[parent] - centers[child]) for parent, child in model.tree.edges]
+    distances = [np.linalg.norm(centers[parent] - centers[child]) for parent, child in model.tree.edges]
     return FitQuality(
         share,
-        count >= MIN_SEEN * size,
-        float(((WIDTH**2 / (WIDTH**2 + back**2)) ** 2).mean()),
-        float((back > UNCOVERED).mean()),
-        int(np.sum(np.array(apart) < SELF_INTERSECTING)),
+        count >= MIN_SEEN_SHARE * size,
+        float(geman_mcclure(to_body**2, KERNEL_WIDTH_M**2).mean()),
+        float((to_body > MAX_COVERED_DISTANCE_M).mean()),
+        int(np.sum(np.array(distances) < MIN_DISJOINT_DISTANCE_M)),
         two_way_distance(vertices, model.faces, cloud),
     )

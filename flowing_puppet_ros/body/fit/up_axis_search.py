@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fits of clouds whose up axis is not known: directions are compared coarsely and the best are fitted in."""
+"""Fits clouds whose up axis is not known: compares the directions coarsely and fits in the best ones."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, check_cloud
 from flowing_puppet_ros.body.fit.hypotheses import Progress, sub_progress
 from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, rotation_to_z_up
 
-MOST_FITS = 3
+MAX_FITS = 3  # directions that are fitted in
 
 
 def fit_in_best_frame(
@@ -26,15 +26,15 @@ def fit_in_best_frame(
 ) -> tuple[ScanFrame, BodyFit]:
     """Fit a cloud of one person in the frame that explains it best.
 
-    The directions are ordered by `BodyFitter.promise`; at most three are fitted in, until a fit is reliable.
+    The directions are ordered by `BodyFitter.coarse_cost`; at most three are fitted in, until a fit is reliable.
 
     Args:
-        fitter: does the fits.
+        fitter: fitter of the model.
         points: (N, 3) in the scan's frame and unit.
         normals: (N, 3) in the scan's frame, or None.
-        scale: metres a unit.
-        ups: directions (3,) of the scan's frame that may point up.
-        sensor: (3,) where the sensor stood, in the scan's frame and unit, for a cloud from one side.
+        scale: metres per unit.
+        ups: candidate directions (3,) in the scan's frame.
+        sensor: (3,) position of the sensor in the scan's frame and unit, for a single view.
         progress: called with the fraction done.
 
     Returns:
@@ -46,15 +46,15 @@ def fit_in_best_frame(
     points, normals = check_cloud(points, normals)
     frames = [ScanFrame(scale, rotation_to_z_up(up)) for up in ups]
     if len(frames) > 1:
-        promise = [fitter.coarse_cost(frame.to_body(points), _moved(frame, sensor)) for frame in frames]
-        frames = [frames[index] for index in np.argsort(promise, kind="stable")[:MOST_FITS]]
+        costs = [fitter.coarse_cost(frame.to_body(points), _to_body(frame, sensor)) for frame in frames]
+        frames = [frames[index] for index in np.argsort(costs, kind="stable")[:MAX_FITS]]
     fits: list[tuple[ScanFrame, BodyFit]] = []
-    for turn, frame in enumerate(frames):
+    for number, frame in enumerate(frames):
         fit = fitter.fit(
             frame.to_body(points),
             None if normals is None else normals @ frame.rotation.T,
-            viewpoint=_moved(frame, sensor),
-            progress=sub_progress(progress, turn / len(frames), (turn + 1) / len(frames)),
+            viewpoint=_to_body(frame, sensor),
+            progress=sub_progress(progress, number / len(frames), (number + 1) / len(frames)),
         )
         fits.append((frame, fit))
         if fit.reliable:
@@ -63,5 +63,5 @@ def fit_in_best_frame(
     return min(fits, key=lambda pair: pair[1].two_way_distance)
 
 
-def _moved(frame: ScanFrame, sensor: np.ndarray | None) -> np.ndarray | None:
+def _to_body(frame: ScanFrame, sensor: np.ndarray | None) -> np.ndarray | None:
     return None if sensor is None else frame.to_body(sensor)

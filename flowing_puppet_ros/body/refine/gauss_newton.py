@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The finish: Gauss-Newton over all parts at once, with one shape for the whole body and matches both ways.
+"""The refinement: Gauss-Newton over all parts at once, with one shape for the whole body and two-way correspondences.
 
-Where the search treats parts one by one, here the unknowns are the rotation, place and deformation of all sixteen parts
-and a single vector of intrinsic shape. Matches are renewed at every step and weighted by a Geman-McClure kernel that
-narrows from step to step, so that far limbs are first drawn in and the surface is then fitted closely.
+The search treats the parts one by one; here the unknowns are the rotation, translation and deformation of all sixteen
+parts and a single vector of intrinsic shape. Correspondences are renewed at every step and weighted by a Geman-McClure
+kernel that narrows from step to step, so that distant limbs are attracted first and then the surface is fitted closely.
 """
 
 from __future__ import annotations
@@ -14,20 +14,20 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import solve
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic
-from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, PosedPoints
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic, geman_mcclure
+from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, PosedPoints, System
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-MAX_COEFFICIENT = 3.5
-MAX_TURN = 0.5
-# Joints are believed this many times more widely than closest points are.
-JOINT_WIDTH = 2.5
-# Cloud points that look for a vertex in every step; more make the steps slower and not better.
-MATCHED = 3000
+MAX_COEFFICIENT = 3.5  # standard deviations
+MAX_ROTATION_STEP_RAD = 0.5  # of each part
+# Width of the robust kernel of joint targets, in widths of that of closest points.
+JOINT_WIDTH_FACTOR = 2.5
+# Cloud points that are matched to a vertex in every step; more make the steps slower and not better.
+MAX_MATCHED_POINTS = 3000
 
-# What else draws the body's vertices (V, 3), given the width in metres of the robust kernel at this step.
+# A further term on the body's vertices (V, 3), given the width of the robust kernel in metres at this step.
 SurfaceTerm = Callable[[np.ndarray, float], VertexQuadratic]
 
 
@@ -35,19 +35,19 @@ SurfaceTerm = Callable[[np.ndarray, float], VertexQuadratic]
 class RefineWeights:
     """Strength of each term against the mean squared distance between surfaces (square metres).
 
-    The priors are much weaker than the spread of the training bodies alone would have them: the surface misses what no
-    learned body has by a centimetre, and priors of that weight draw limbs and people to the mean (bodies that the model
-    does not know: 2.4 cm instead of 1.5 cm between scans). They only decide where the surface leaves a choice.
+    The priors are much weaker than the spread of the training bodies suggests. The model cannot express about 1 cm of
+    real surface, so priors at their learned weight would pull limbs and people towards the mean (2.4 cm instead of
+    1.5 cm between scans of bodies that the model does not know). They only decide where the surface leaves a choice.
 
     Attributes:
-        stitch: mean squared gap of an interface.
-        pose: squared pose coefficient.
-        shape: squared distance of the shape coefficients to `shape_center`.
-        pairwise: half squared Mahalanobis distance of an edge to its Gaussian (Eq. 49).
+        stitch: weight of the mean squared gap of an interface.
+        pose: weight of a squared pose coefficient.
+        shape: weight of the squared distance of the shape coefficients to `shape_center`.
+        pairwise: weight of half the squared Mahalanobis distance of an edge to its Gaussian (Eq. 49).
         sigma_start: first width of the robust kernel, metres.
-        sigma_end: last width.
-        iterations: steps.
-        shape_center: (S,) shape that is expected, standard deviations, such as that of earlier frames; None for 0.
+        sigma_end: last width of the robust kernel, metres.
+        iterations: number of steps.
+        shape_center: (S,) expected shape in standard deviations, such as that of earlier frames; None for 0.
     """
 
     stitch: float = 0.1
@@ -60,12 +60,12 @@ class RefineWeights:
     shape_center: np.ndarray | None = None
 
 
-# Parts that hardly hold together follow a dense surface more closely; a start for the finish that closes the gaps.
-LOOSE = RefineWeights(stitch=0.01, sigma_start=0.05, sigma_end=0.05, iterations=6)
+# Loosely stitched parts follow a dense surface more closely; the non-rigid refinement then closes the gaps.
+LOOSE_STITCHING = RefineWeights(stitch=0.01, sigma_start=0.05, sigma_end=0.05, iterations=6)
 
 
 class GaussNewton:
-    """Gauss-Newton for one model."""
+    """Gauss-Newton over all parts of one model."""
 
     def __init__(self, model: StitchedPuppet) -> None:
         self._model = model
@@ -82,9 +82,9 @@ class GaussNewton:
         weights: RefineWeights,
         terms: Sequence[SurfaceTerm] = (),
     ) -> BodyState:
-        """Refine a body; without a cloud and `terms` only believed joints, stitching and priors count.
+        """Refine a body; without a cloud and `terms` only joint targets, stitching and priors count.
 
-        All parts of the result have the same shape coefficients; it starts from their mean.
+        All parts of the result have the same shape coefficients, at first the mean of the body's.
         """
         state = BodyState(
             state.center.copy(),
@@ -92,14 +92,14 @@ class GaussNewton:
             state.pose.copy(),
             np.tile(state.shape.mean(axis=0), (len(state.shape), 1)),
         )
-        drawn = list(terms)
+        all_terms = list(terms)
         if cloud is not None:
-            matches = TwoWayCorrespondence(cloud, MATCHED)
-            drawn.append(lambda vertices, sigma: matches.attract(vertices, self._model.faces, sigma))
+            matches = TwoWayCorrespondence(cloud, MAX_MATCHED_POINTS)
+            all_terms.append(lambda vertices, sigma: matches.attract(vertices, self._model.faces, sigma))
         ratio = weights.sigma_end / weights.sigma_start
         for step in range(weights.iterations):
             sigma = weights.sigma_start * ratio ** (step / max(weights.iterations - 1, 1))
-            state = self._step(state, drawn, targets, weights, sigma)
+            state = self._step(state, all_terms, targets, weights, sigma)
         return state
 
     def _step(
@@ -111,43 +111,38 @@ class GaussNewton:
         sigma: float,
     ) -> BodyState:
         equations = self._equations
-        placed = equations.placed(state)
-        hessian, gradient = np.zeros((equations.size, equations.size)), np.zeros(equations.size)
+        posed = equations.pose_points(state)
+        hessian, gradient = system = np.zeros((equations.size, equations.size)), np.zeros(equations.size)
         for term in terms:
-            drawn = term(placed.vertices, sigma)
-            equations.add_surface(drawn.matrix, drawn.vector, placed, state.rotation, hessian, gradient)
-        self._add_joints(targets, JOINT_WIDTH * sigma, placed, state.rotation, hessian, gradient)
-        equations.add_stitching(weights.stitch, placed, state.rotation, hessian, gradient)
-        equations.add_joint_prior(weights.pairwise, state, hessian, gradient)
-        self._add_priors(state, weights, hessian, gradient)
+            equations.add_surface(term(posed.vertices, sigma), posed, state.rotation, system)
+        self._add_joints(targets, JOINT_WIDTH_FACTOR * sigma, posed, state.rotation, system)
+        equations.add_stitching(weights.stitch, posed, state.rotation, system)
+        equations.add_joint_prior(weights.pairwise, state, system)
+        self._add_priors(state, weights, system)
         hessian[np.diag_indices(equations.size)] += 1e-9 + 1e-3 * hessian.diagonal()
         return self._retract(state, solve(hessian, -gradient, lower=True, assume_a="pos", overwrite_a=True))
 
     def _add_joints(
-        self,
-        targets: JointTargets,
-        width: float,
-        placed: PosedPoints,
-        turns: np.ndarray,
-        hessian: np.ndarray,
-        gradient: np.ndarray,
+        self, targets: JointTargets, width: float, posed: PosedPoints, rotation: np.ndarray, system: System
     ) -> None:
+        hessian, gradient = system
         chosen = np.flatnonzero(targets.weight > 0)
         if not len(chosen):
             return
-        gap = self._regressor[chosen] @ placed.vertices - targets.points[chosen]
-        trust = (width**2 / (width**2 + (gap**2).sum(axis=1))) ** 2
+        gap = self._regressor[chosen] @ posed.vertices - targets.points[chosen]
+        trust = geman_mcclure((gap**2).sum(axis=1), width**2)
         rows = np.zeros((len(chosen), 3, len(gradient)))
-        for part, jacobian in enumerate(self._equations.jacobians(placed)):
+        for part, jacobian in enumerate(self._equations.compute_jacobians(posed)):
             vertex = self._model.part_vertices[part]
             share = self._regressor[np.ix_(chosen, vertex)] * self._equations.share[vertex]
-            rows[:, :, self._equations.unknowns(part)] += turns[part] @ np.tensordot(share, jacobian, 1)
+            rows[:, :, self._equations.unknowns(part)] += rotation[part] @ np.tensordot(share, jacobian, 1)
         flat = rows.reshape(-1, len(gradient))
         weight = np.repeat(trust * targets.weight[chosen], 3)
         hessian += (flat * weight[:, None]).T @ flat
         gradient += flat.T @ (weight * gap.reshape(-1))
 
-    def _add_priors(self, state: BodyState, weights: RefineWeights, hessian: np.ndarray, gradient: np.ndarray) -> None:
+    def _add_priors(self, state: BodyState, weights: RefineWeights, system: System) -> None:
+        hessian, gradient = system
         rows, parts, numbers = self._equations.coefficients
         hessian[rows, rows] += weights.pose
         gradient[rows] += weights.pose * state.pose[parts, numbers]
@@ -160,10 +155,10 @@ class GaussNewton:
         first, (rows, parts, numbers) = self._equations.first, self._equations.coefficients
         pose = state.pose.copy()
         rigid = step[first[:-1, None] + np.arange(6)]
-        turn, shift = rigid[:, :3], rigid[:, 3:]
+        turn, translation = rigid[:, :3], rigid[:, 3:]
         angle = np.linalg.norm(turn, axis=1, keepdims=True)
-        turn = turn * np.minimum(1.0, MAX_TURN / np.maximum(angle, 1e-12))
-        center = state.center + np.squeeze(state.rotation @ shift[:, :, None], axis=2)
+        turn = turn * np.minimum(1.0, MAX_ROTATION_STEP_RAD / np.maximum(angle, 1e-12))
+        center = state.center + np.squeeze(state.rotation @ translation[:, :, None], axis=2)
         pose[parts, numbers] += step[rows]
         shape = np.clip(state.shape + step[first[-1] :], -MAX_COEFFICIENT, MAX_COEFFICIENT)
         pose = np.clip(pose, -MAX_COEFFICIENT, MAX_COEFFICIENT)

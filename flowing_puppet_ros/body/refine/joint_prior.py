@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How two neighbouring parts are usually turned and deformed, as a quadratic for Gauss-Newton (thesis Eq. 49)."""
+"""The prior over relative rotation and deformation of two neighbouring parts (Eq. 49), as a quadratic."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def inverse_left_jacobian(r: np.ndarray) -> np.ndarray:
-    """Derivative (3, 3) of log(exp(x) exp(r)) with respect to x at 0, for a Rodrigues vector r (3,).
+    """Return the derivative (3, 3) of log(exp(x) exp(r)) with respect to x at 0, for a rotation vector r (3,).
 
     The derivative of log(exp(r) exp(x)) is its transpose (Barfoot, State Estimation for Robotics, section 7.1.5).
     """
@@ -24,10 +24,10 @@ def inverse_left_jacobian(r: np.ndarray) -> np.ndarray:
 def joint_quadratic(
     relative: np.ndarray, deviation: np.ndarray, precision: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Hessian and gradient of half the squared Mahalanobis distance of an edge to its Gaussian.
+    """Return Hessian and gradient of half the squared Mahalanobis distance of an edge to its Gaussian (Eq. 49).
 
     Args:
-        relative: (3,) Rodrigues vector of the child's rotation in the parent's frame.
+        relative: (3,) rotation vector of the child in the parent's frame.
         deviation: (K,) of that vector, the parent's pose and the child's pose from the mean.
         precision: (K, K), contiguous.
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The normal equations of the finish: what surface, stitching and priors say of all parts, in compiled loops.
+"""The normal equations of the refinement: the terms of surface, stitching and priors over all parts, in compiled loops.
 
-The unknowns are, part after part, an increment of turn and of place, both along the part's own axes, and of its pose
-coefficients; then one of the shape coefficients that all parts share. Only the lower triangle of the matrix is filled.
+The unknowns are, part after part, increments of rotation and translation, both in the part's own frame, and of its pose
+coefficients; then those of the shape coefficients that all parts share. Only the lower triangle of the Hessian is
+filled.
 """
 
 from __future__ import annotations
@@ -13,19 +14,29 @@ from itertools import pairwise
 import numpy as np
 from numba import njit
 
+from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.refine.joint_prior import joint_quadratic
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 PRIOR_RIDGE = 0.05
-"""Added to the spread of a joint's rotation (radians) and coefficients: a bounded precision."""
+"""Standard deviation added to a joint's rotation (radians) and coefficients, which bounds the precision."""
+
+# The points and unknowns of all parts, for compiled loops: basis (M, 3, D + S), numbers of pose coefficients (N,),
+# first points (N + 1,), vertices of the points (M,), shares of the vertices (V,), first unknowns (N + 1,).
+LayoutArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+# Hessian (U, U), of which the lower triangle is filled, and gradient (U,).
+System = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedPoints:
-    """A body's points: (M, 3) of all parts one after the other in their own frames and in the world, metres.
+    """A body's points in metres.
 
-    `vertices` (V, 3) are the template's, the mean of the copies in different parts.
+    Attributes:
+        local: (M, 3) points of all parts, one part after the other, in the parts' own frames.
+        world: (M, 3) the same points in the common frame.
+        vertices: (V, 3) of the body in the common frame, means of the copies in different parts.
     """
 
     local: np.ndarray
@@ -34,13 +45,13 @@ class PosedPoints:
 
 
 class NormalEquations:
-    """Of one model.
+    """The normal equations of one model.
 
     Attributes:
         first: (N + 1,) the first unknown of every part; the last entry is that of the shape.
-        size: number of unknowns.
-        basis: (M, 3, D + S) pose and then shape basis of the parts' points, zero beyond a part's own.
+        size: U, the number of unknowns.
         share: (V,) one over the number of parts that a vertex belongs to.
+        coefficients: for every pose coefficient its unknown, its part, and its number there.
     """
 
     def __init__(self, model: StitchedPuppet) -> None:
@@ -50,15 +61,16 @@ class NormalEquations:
         self._rows = np.concatenate(model.part_vertices).astype(np.int64)
         self.share = 1.0 / np.bincount(self._rows, minlength=len(model.part_of_vertex))
         self._mean = np.concatenate([model.mean_shape[i] + model.mean_pose[i] for i in range(len(poses))])
-        self.basis = np.zeros((len(self._rows), 3, poses.max() + model.shape_count))
+        self._basis = np.zeros((len(self._rows), 3, poses.max() + model.shape_count))
         for part, count in enumerate(poses):
-            own = self.basis[self._starts[part] : self._starts[part + 1]]
+            own = self._basis[self._starts[part] : self._starts[part + 1]]
             own[:, :, :count], own[:, :, count : count + model.shape_count] = (
                 model.pose_basis[part], model.shape_basis[part],
             )  # fmt: skip
         self._poses = poses
         self.first = np.concatenate([[0], np.cumsum(6 + poses)])
         self.size = int(self.first[-1]) + model.shape_count
+        self._layout: LayoutArrays = (self._basis, poses, self._starts, self._rows, self.share, self.first)
         edges = model.tree.edges
         self._edges = np.array(edges, np.int64).reshape(-1, 2)
         ends = np.cumsum([0, *(len(interface.weight) for interface in model.interfaces)])
@@ -68,14 +80,13 @@ class NormalEquations:
         weight = np.concatenate([interface.weight / interface.weight.sum() for interface in model.interfaces])
         self._stitches = (ends, pairs, weight)
         width = 3 + 2 * poses.max()
-        self._precision, self._expected = np.zeros((len(edges), width, width)), np.zeros((len(edges), width))
+        mean, precision = np.zeros((len(edges), width)), np.zeros((len(edges), width, width))
         for edge, gaussian in enumerate(model.pairwise):
             count = len(gaussian.mean)
-            spread = gaussian.covariance + PRIOR_RIDGE**2 * np.eye(count)
-            self._precision[edge, :count, :count] = np.linalg.inv(spread)
-            self._expected[edge, :count] = gaussian.mean
-
-        # Of every pose coefficient: its unknown, its part, and its number there.
+            covariance = gaussian.covariance + PRIOR_RIDGE**2 * np.eye(count)
+            precision[edge, :count, :count] = np.linalg.inv(covariance)
+            mean[edge, :count] = gaussian.mean
+        self._joint_priors = (mean, precision)
         self.coefficients = (
             np.concatenate([np.arange(start + 6, start + 6 + n) for start, n in zip(self.first, poses, strict=False)]),
             np.repeat(np.arange(len(poses)), poses),
@@ -83,67 +94,45 @@ class NormalEquations:
         )
 
     def unknowns(self, part: int) -> np.ndarray:
-        """The unknowns that move a part: its own and the shape."""
+        """Return the indices of the unknowns that move a part: its own and the shape."""
         own = np.arange(self.first[part], self.first[part + 1])
         return np.concatenate([own, np.arange(self.first[-1], self.size)])
 
-    def jacobians(self, placed: PosedPoints) -> list[np.ndarray]:
-        """Per part the derivatives (N_i, 3, unknowns) of its points in its own frame."""
+    def compute_jacobians(self, posed: PosedPoints) -> list[np.ndarray]:
+        """Return for each part the derivatives (N_i, 3, unknowns) of its points in its own frame."""
         shapes, made = self.size - int(self.first[-1]), []
         for part, (start, end) in enumerate(pairwise(self._starts)):
             jacobian = np.empty((end - start, 3, 6 + self._poses[part] + shapes))
-            _fill_jacobians(jacobian, placed.local[start:end], self.basis[start:end])
+            _fill_jacobians(jacobian, posed.local[start:end], self._basis[start:end])
             made.append(jacobian)
         return made
 
-    def placed(self, state: BodyState) -> PosedPoints:
-        """Where the points of a body are; its shape is that of the first part."""
+    def pose_points(self, state: BodyState) -> PosedPoints:
+        """Return the points of a body, whose shape is that of its first part."""
         body = (state.center, state.rotation, state.pose, state.shape[0])
-        return PosedPoints(
-            *_pose_points(*body, self._mean, self.basis, self._poses, self._starts, self._rows, self.share)
-        )
+        return PosedPoints(*_pose_points(body, self._mean, self._layout))
 
-    def add_surface(
-        self,
-        matrix: np.ndarray,
-        vector: np.ndarray,
-        placed: PosedPoints,
-        turns: np.ndarray,
-        hessian: np.ndarray,
-        gradient: np.ndarray,
-    ) -> None:
-        """Add a quadratic of every vertex, see `correspondence.Quadratic`; `turns` (N, 3, 3) are the parts' rotations.
+    def add_surface(self, term: VertexQuadratic, posed: PosedPoints, rotation: np.ndarray, system: System) -> None:
+        """Add a quadratic of every vertex for parts with `rotation` (N, 3, 3); a zero matrix costs nothing."""
+        _add_surface((term.matrix, term.vector), posed.local, rotation, self._layout, system)
 
-        A vertex without one costs nothing.
-        """
-        _add_surface(
-            matrix, vector, placed.local, turns, self.basis, self._poses, self._starts, self._rows, self.share,
-            self.first, hessian, gradient,
-        )  # fmt: skip
-
-    def add_stitching(
-        self, strength: float, placed: PosedPoints, turns: np.ndarray, hessian: np.ndarray, gradient: np.ndarray
-    ) -> None:
+    def add_stitching(self, strength: float, posed: PosedPoints, rotation: np.ndarray, system: System) -> None:
         """Add `strength` times the mean squared gap of every interface (Eq. 48)."""
-        _add_stitching(
-            strength, placed.local, placed.world, turns, self.basis, self._poses, self._edges, self._stitches,
-            self.first, hessian, gradient,
-        )  # fmt: skip
+        points = (posed.local, posed.world)
+        _add_stitching(strength, points, rotation, self._edges, self._stitches, self._layout, system)
 
-    def add_joint_prior(self, strength: float, state: BodyState, hessian: np.ndarray, gradient: np.ndarray) -> None:
+    def add_joint_prior(self, strength: float, state: BodyState, system: System) -> None:
         """Add half the squared Mahalanobis distance of every edge to its Gaussian (Eq. 49), times `strength`."""
         parents, children = self._edges[:, 0], self._edges[:, 1]
         relative = so3.log(state.rotation[parents].transpose(0, 2, 1) @ state.rotation[children])
-        _add_joint_prior(
-            strength, relative, state.pose, self._expected, self._precision, self._poses, self._edges, self.first,
-            hessian, gradient,
-        )  # fmt: skip
+        _add_joint_prior(strength, (relative, state.pose), self._joint_priors, self._edges, self._layout, system)
 
 
 @njit(cache=True, nogil=True)
-def _pose_points(  # type: ignore[no-untyped-def]
-    center, turns, pose, shape, mean, basis, poses, starts, rows, share
-):
+def _pose_points(body, mean, layout):  # type: ignore[no-untyped-def]
+    """Return `PosedPoints` of a body (centres, rotations, pose and shape coefficients) with template points `mean`."""
+    center, rotation, pose, shape = body
+    basis, poses, starts, rows, share, _ = layout
     local, world = np.empty_like(mean), np.empty_like(mean)
     vertices = np.zeros((len(share), 3))
     amounts = np.zeros(basis.shape[2])
@@ -160,7 +149,9 @@ def _pose_points(  # type: ignore[no-untyped-def]
             row = rows[k]
             for i in range(3):
                 world[k, i] = center[part, i] + (
-                    turns[part, i, 0] * local[k, 0] + turns[part, i, 1] * local[k, 1] + turns[part, i, 2] * local[k, 2]
+                    rotation[part, i, 0] * local[k, 0]
+                    + rotation[part, i, 1] * local[k, 1]
+                    + rotation[part, i, 2] * local[k, 2]
                 )
                 vertices[row, i] += share[row] * world[k, i]
     return local, world, vertices
@@ -168,7 +159,7 @@ def _pose_points(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, inline="always")
 def _fill_jacobian(jacobian, local, basis, k, columns):  # type: ignore[no-untyped-def]
-    """Write the derivative (3, 6 + columns) of a point in its part's frame by turn, place and coefficients."""
+    """Write the derivative (3, 6 + columns) of a point in its part's frame by rotation, translation, coefficients."""
     x, y, z = local[k, 0], local[k, 1], local[k, 2]
     jacobian[:, :6] = 0.0
     jacobian[0, 1], jacobian[0, 2] = z, -y
@@ -187,35 +178,37 @@ def _fill_jacobians(jacobians, local, basis):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _add_surface(  # type: ignore[no-untyped-def]
-    matrix, vector, local, turns, basis, poses, starts, rows, share, first, hessian, gradient
-):
-    shapes = len(gradient) - first[-1]
-    most = 6 + basis.shape[2]
-    jacobian, weighted = np.empty((3, most)), np.empty((3, most))
-    block, slope = np.empty((most, most)), np.empty(most)
+def _add_surface(quadratic, local, rotations, layout, system):  # type: ignore[no-untyped-def]
+    matrix, vector = quadratic
+    basis, poses, starts, rows, share, first = layout
+    shapes = len(system[1]) - first[-1]
+    max_width = 6 + basis.shape[2]
+    jacobian, weighted = np.empty((3, max_width)), np.empty((3, max_width))
+    block, slope = np.empty((max_width, max_width)), np.empty(max_width)
     half, own, pull = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     for part in range(len(poses)):
-        turn = turns[part]
+        rotation = rotations[part]
         width = 6 + poses[part] + shapes
         block[:], slope[:] = 0.0, 0.0
         for k in range(starts[part], starts[part + 1]):
             row = rows[k]
             if matrix[row, 0, 0] + matrix[row, 1, 1] + matrix[row, 2, 2] == 0.0:
                 continue
-            # Products of matrices this small take longer to call than to write out.
+            # Written out, because calls for products of matrices this small take longer than the products.
             for i in range(3):
                 for j in range(3):
                     half[i, j] = (
-                        matrix[row, i, 0] * turn[0, j] + matrix[row, i, 1] * turn[1, j] + matrix[row, i, 2] * turn[2, j]
+                        matrix[row, i, 0] * rotation[0, j]
+                        + matrix[row, i, 1] * rotation[1, j]
+                        + matrix[row, i, 2] * rotation[2, j]
                     )
             for j in range(3):
                 pull[j] = share[row] * (
-                    vector[row, 0] * turn[0, j] + vector[row, 1] * turn[1, j] + vector[row, 2] * turn[2, j]
+                    vector[row, 0] * rotation[0, j] + vector[row, 1] * rotation[1, j] + vector[row, 2] * rotation[2, j]
                 )
                 for i in range(3):
                     own[i, j] = share[row] * (
-                        turn[0, i] * half[0, j] + turn[1, i] * half[1, j] + turn[2, i] * half[2, j]
+                        rotation[0, i] * half[0, j] + rotation[1, i] * half[1, j] + rotation[2, i] * half[2, j]
                     )
             _fill_jacobian(jacobian, local, basis, k, width - 6)
             for i in range(3):
@@ -230,23 +223,26 @@ def _add_surface(  # type: ignore[no-untyped-def]
                 slope[column] += a * pull[0] + b * pull[1] + c * pull[2]
                 for other in range(column + 1):
                     block[column, other] += a * weighted[0, other] + b * weighted[1, other] + c * weighted[2, other]
-        _scatter(block, slope, width, first[part], width - shapes, 0, 0, first[-1], hessian, gradient)
+        _scatter(block, slope, width, (first[part], width - shapes, 0, 0, first[-1]), system)
 
 
 @njit(cache=True, nogil=True)
-def _scatter(  # type: ignore[no-untyped-def]
-    block, slope, width, start, count, second_start, second_count, shape_start, hessian, gradient
-):
-    """Add a lower triangle over one or two parts' unknowns and the shape where it belongs."""
+def _scatter(block, slope, width, spans, system):  # type: ignore[no-untyped-def]
+    """Add a lower triangle over the unknowns of one or two parts and the shape to the system.
+
+    `spans` are the first part's first unknown and their number, the second part's, and the shape's first unknown.
+    """
+    hessian, gradient = system
     for column in range(width):
-        to = _place(column, start, count, second_start, second_count, shape_start)
-        gradient[to] += slope[column]
+        row = _find_unknown(column, spans)
+        gradient[row] += slope[column]
         for other in range(column + 1):
-            hessian[to, _place(other, start, count, second_start, second_count, shape_start)] += block[column, other]
+            hessian[row, _find_unknown(other, spans)] += block[column, other]
 
 
 @njit(cache=True, inline="always")
-def _place(column, start, count, second_start, second_count, shape_start):  # type: ignore[no-untyped-def]
+def _find_unknown(column, spans):  # type: ignore[no-untyped-def]
+    start, count, second_start, second_count, shape_start = spans
     if column < count:
         return start + column
     if column < count + second_count:
@@ -255,15 +251,14 @@ def _place(column, start, count, second_start, second_count, shape_start):  # ty
 
 
 @njit(cache=True, nogil=True)
-def _add_stitching(  # type: ignore[no-untyped-def]
-    strength, local, world, turns, basis, poses, edges, stitches, first, hessian, gradient
-):
-    ends, pairs, weights = stitches
-    shapes = len(gradient) - first[-1]
-    most = 6 + basis.shape[2]
-    above, below = np.empty((3, most)), np.empty((3, most))
-    line = np.empty(2 * most)
-    block, slope = np.empty((2 * most, 2 * most)), np.empty(2 * most)
+def _add_stitching(strength, points, rotations, edges, stitches, layout, system):  # type: ignore[no-untyped-def]
+    (local, world), (ends, pairs, weights) = points, stitches
+    basis, poses, _, _, _, first = layout
+    shapes = len(system[1]) - first[-1]
+    max_width = 6 + basis.shape[2]
+    above, below = np.empty((3, max_width)), np.empty((3, max_width))
+    line = np.empty(2 * max_width)
+    block, slope = np.empty((2 * max_width, 2 * max_width)), np.empty(2 * max_width)
     for edge in range(len(edges)):
         parent, child = edges[edge, 0], edges[edge, 1]
         up, down = 6 + poses[parent], 6 + poses[child]
@@ -277,16 +272,16 @@ def _add_stitching(  # type: ignore[no-untyped-def]
             for i in range(3):
                 for column in range(up + shapes):
                     value = (
-                        turns[parent, i, 0] * above[0, column]
-                        + turns[parent, i, 1] * above[1, column]
-                        + turns[parent, i, 2] * above[2, column]
+                        rotations[parent, i, 0] * above[0, column]
+                        + rotations[parent, i, 1] * above[1, column]
+                        + rotations[parent, i, 2] * above[2, column]
                     )
                     line[column if column < up else column + down] = value
                 for column in range(down + shapes):
                     value = (
-                        turns[child, i, 0] * below[0, column]
-                        + turns[child, i, 1] * below[1, column]
-                        + turns[child, i, 2] * below[2, column]
+                        rotations[child, i, 0] * below[0, column]
+                        + rotations[child, i, 1] * below[1, column]
+                        + rotations[child, i, 2] * below[2, column]
                     )
                     if column < down:
                         line[up + column] = -value
@@ -298,15 +293,16 @@ def _add_stitching(  # type: ignore[no-untyped-def]
                     scaled = weight * line[column]
                     for other in range(column + 1):
                         block[column, other] += scaled * line[other]
-        _scatter(block, slope, width, first[parent], up, first[child], down, first[-1], hessian, gradient)
+        _scatter(block, slope, width, (first[parent], up, first[child], down, first[-1]), system)
 
 
 @njit(cache=True, nogil=True)
-def _add_joint_prior(  # type: ignore[no-untyped-def]
-    strength, relative, pose, expected, precision, poses, edges, first, hessian, gradient
-):
-    most = 6 + precision.shape[1]
-    to = np.empty(most, np.int64)
+def _add_joint_prior(strength, body, priors, edges, layout, system):  # type: ignore[no-untyped-def]
+    """Add the priors (means and precisions of the edges) of a body (relative rotations, pose coefficients)."""
+    (relative, pose), (mean, precision) = body, priors
+    _, poses, _, _, _, first = layout
+    hessian, gradient = system
+    rows = np.empty(6 + precision.shape[1], np.int64)
     for edge in range(len(edges)):
         parent, child = edges[edge, 0], edges[edge, 1]
         up, down = poses[parent], poses[child]
@@ -315,16 +311,16 @@ def _add_joint_prior(  # type: ignore[no-untyped-def]
         deviation[:3] = relative[edge]
         deviation[3 : 3 + up] = pose[parent, :up]
         deviation[3 + up :] = pose[child, :down]
-        deviation -= expected[edge, :count]
+        deviation -= mean[edge, :count]
         block, slope = joint_quadratic(relative[edge], deviation, np.ascontiguousarray(precision[edge, :count, :count]))
         for k in range(3):
-            to[k], to[3 + k] = first[parent] + k, first[child] + k
+            rows[k], rows[3 + k] = first[parent] + k, first[child] + k
         for k in range(up):
-            to[6 + k] = first[parent] + 6 + k
+            rows[6 + k] = first[parent] + 6 + k
         for k in range(down):
-            to[6 + up + k] = first[child] + 6 + k
+            rows[6 + up + k] = first[child] + 6 + k
         for k in range(count + 3):
-            gradient[to[k]] += strength * slope[k]
+            gradient[rows[k]] += strength * slope[k]
             for other in range(count + 3):
-                if to[other] <= to[k]:
-                    hessian[to[k], to[other]] += strength * block[k, other]
+                if rows[other] <= rows[k]:
+                    hessian[rows[k], rows[other]] += strength * block[k, other]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes and clouds in and out of files: .ply .obj .off .stl .pcd .xyz .npy .npz."""
+"""Reads meshes and clouds from .ply .obj .off .stl .pcd .xyz .npy .npz, and writes .ply."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from flowing_puppet_ros.body.scans.ply import read_ply
 from flowing_puppet_ros.errors import InputError
 
 SUFFIXES = (".ply", ".obj", ".off", ".stl", ".pcd", ".xyz", ".npy", ".npz")
-POINT_KEYS = ("vertices", "points", "xyz")
+POINT_KEYS = ("vertices", "points", "xyz")  # names of the points in .npz, by precedence
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,15 +35,15 @@ class Scan:
 
     @property
     def area(self) -> float | None:
-        """Surface of a mesh in squared units, None for a cloud."""
+        """Surface area of a mesh in squared units, None for a cloud."""
         return None if self.faces is None else float(self._face_areas().sum())
 
     def _face_areas(self) -> np.ndarray:
         a, b, c = (self.points[self.faces[:, k]] for k in range(3))  # type: ignore[index]
         return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
-    def surface(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray | None]:
-        """Points spread evenly over a mesh with the normals of their faces, or the cloud as it is."""
+    def sample_surface(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray | None]:
+        """Sample points (`count`, 3) evenly over a mesh, with their faces' normals; return a cloud as it is."""
         if self.faces is None:
             return self.points, self.normals
         share = np.cumsum(self._face_areas())
@@ -55,18 +55,18 @@ class Scan:
         return a + u * (b - a) + v * (c - a), cross / np.linalg.norm(cross, axis=1, keepdims=True)
 
     def vertex_normals(self) -> np.ndarray | None:
-        """Unit normals (N, 3) at the points, None where a cloud has none."""
+        """Return the unit normals (N, 3) at the points, None for a cloud without normals."""
         return self.normals if self.faces is None else vertex_normals(self.points, self.faces)
 
 
 def read_scan(path: Path) -> Scan:
-    """Read a mesh or cloud; points that are not finite are dropped from clouds.
+    """Read a mesh or cloud; points of clouds that are not finite are dropped.
 
     Raises:
         InputError: when the file is missing, of another kind, damaged, or holds no points.
     """
     if not path.is_file():
-        raise InputError(f"{path} does not exist or is no file; give a mesh or cloud ({' '.join(SUFFIXES)})")
+        raise InputError(f"{path} does not exist or is not a file; give a mesh or cloud ({' '.join(SUFFIXES)})")
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
         raise InputError(
@@ -80,22 +80,24 @@ def read_scan(path: Path) -> Scan:
     elif suffix == ".ply":
         vertices, normals, faces = read_ply(path)
         scan = (
-            Scan(vertices, faces) if len(faces) else Scan(vertices, None, None if normals is None else _unit(normals))
+            Scan(vertices, faces)
+            if len(faces)
+            else Scan(vertices, None, None if normals is None else _normalise(normals))
         )
     elif suffix == ".xyz":
         scan = _read_text(path)
     else:
         scan = _read_open3d(path)
-    return _checked(scan, path)
+    return _validate(scan, path)
 
 
-def _checked(scan: Scan, path: Path) -> Scan:
+def _validate(scan: Scan, path: Path) -> Scan:
     if not len(scan.points):
-        raise InputError(f"{path} holds no points or is damaged; write it again and check that it is complete")
+        raise InputError(f"{path} holds no points or is damaged; export it again and check that it is complete")
     finite = np.isfinite(scan.points).all(axis=1)
     if scan.faces is None:
         if not finite.any():
-            raise InputError(f"{path} holds {len(scan.points)} points and none of them is finite")
+            raise InputError(f"{path} holds {len(scan.points)} points, none of which is finite; export it again")
         return Scan(scan.points[finite], None, None if scan.normals is None else scan.normals[finite])
     if not finite.all():
         raise InputError(f"{path} has a vertex {int(np.argmin(finite))} that is not finite; repair the mesh")
@@ -105,11 +107,11 @@ def _checked(scan: Scan, path: Path) -> Scan:
         )
     if not scan.area:
         raise InputError(f"{path} has {len(scan.faces)} faces without any area; repair the mesh")
-    return Scan(scan.points, _outward(scan.points, scan.faces))
+    return Scan(scan.points, _orient_outward(scan.points, scan.faces))
 
 
-def _outward(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Turn all faces over when the volume they enclose is negative."""
+def _orient_outward(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Flip all faces when the volume that they enclose is negative."""
     a, b, c = (points[faces[:, k]] - points.mean(axis=0) for k in range(3))
     return faces if (np.cross(a, b) * c).sum() >= 0 else faces[:, ::-1].copy()
 
@@ -124,7 +126,7 @@ def _read_open3d(path: Path) -> Scan:
             return Scan(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
     cloud = o3d.io.read_point_cloud(path)
     return Scan(
-        np.asarray(cloud.points).copy(), None, _unit(np.asarray(cloud.normals)) if cloud.has_normals() else None
+        np.asarray(cloud.points).copy(), None, _normalise(np.asarray(cloud.normals)) if cloud.has_normals() else None
     )
 
 
@@ -134,7 +136,7 @@ def _read_text(path: Path) -> Scan:
             warnings.simplefilter("ignore", UserWarning)
             table = np.loadtxt(path, ndmin=2)
     except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no table of x y z [nx ny nz] lines: {error}") from error
+        raise InputError(f"{path} is not a table of x y z [nx ny nz] lines: {error}") from error
     return _from_table(table, path)
 
 
@@ -143,7 +145,7 @@ def _read_numpy(path: Path) -> Scan:
         loaded = np.load(path, allow_pickle=False)
         arrays = {key: loaded[key] for key in loaded.files} if path.suffix.lower() == ".npz" else {"points": loaded}
     except (ValueError, OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} cannot be read as a numpy file; write it again without pickled objects") from error
+        raise InputError(f"{path} cannot be read as a NumPy file; save it again without pickled objects") from error
     key = next((key for key in POINT_KEYS if key in arrays), None)
     if key is None:
         tables = [name for name, array in arrays.items() if array.ndim == 2 and array.shape[1] in (3, 4, 6)]
@@ -154,30 +156,30 @@ def _read_numpy(path: Path) -> Scan:
     if "faces" in arrays and arrays["faces"].ndim == 2 and arrays["faces"].shape[1] == 3 and len(arrays["faces"]):
         return Scan(scan.points, arrays["faces"].astype(np.int64))
     normals = arrays.get("normals", np.empty(0))
-    return Scan(scan.points, None, _unit(normals) if normals.shape == scan.points.shape else scan.normals)
+    return Scan(scan.points, None, _normalise(normals) if normals.shape == scan.points.shape else scan.normals)
 
 
 def _from_table(table: np.ndarray, path: Path) -> Scan:
-    """Points from columns 0 to 2 and, where there are six columns, normals from the others."""
+    """Take points from columns 0 to 2 and, where there are six columns, normals from the others."""
     if not table.size:
         return Scan(np.empty((0, 3)))
     if table.dtype.kind not in "fiu" or table.ndim != 2 or table.shape[1] < 3:
         raise InputError(f"{path} holds an array of {table.dtype} and shape {table.shape}, not numbers of shape (N, 3)")
     table = table.astype(np.float64)
-    return Scan(table[:, :3].copy(), None, _unit(table[:, 3:6]) if table.shape[1] == 6 else None)
+    return Scan(table[:, :3].copy(), None, _normalise(table[:, 3:6]) if table.shape[1] == 6 else None)
 
 
-def _unit(normals: np.ndarray) -> np.ndarray | None:
-    """Normals of length one, or None when any is missing."""
+def _normalise(normals: np.ndarray) -> np.ndarray | None:
+    """Return the normals (N, 3) at unit length, or None when one is missing."""
     normals = np.asarray(normals, dtype=np.float64)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return normals / length if len(normals) and np.all(np.isfinite(length) & (length > 0)) else None
 
 
-def storable(points: np.ndarray) -> np.ndarray:
-    """Points (N, 3) as float32; as float64 where float32 would move them by more than 1e-5 of their extent.
+def to_smallest_float(points: np.ndarray) -> np.ndarray:
+    """Return points (N, 3) as float32, or as float64 where float32 would move them by more than 1e-5 of their extent.
 
-    So far from the origin are, for example, people in the frame of a map.
+    The latter happens far from the origin, for example to people in the frame of a map.
     """
     points = np.asarray(points, dtype=np.float64)
     if not points.size:
@@ -191,11 +193,11 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray, colours: np.n
 
     Args:
         path: file to write.
-        vertices: (V, 3).
+        vertices: (V, 3) in any frame and unit.
         faces: (F, 3).
-        colours: (V, 3) 0 to 255, or None.
+        colours: (V, 3) RGB, 0 to 255, or None.
     """
-    vertices = storable(vertices)
+    vertices = to_smallest_float(vertices)
     kind = f"<f{vertices.itemsize}"
     fields: list[tuple[str, str]] = [("x", kind), ("y", kind), ("z", kind)]
     if colours is not None:

@@ -11,38 +11,37 @@ from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.scans.scan import Scan
 
-CANDIDATES = 24
-SAMPLED_CANDIDATES = 8
-SAMPLES = 20000
-# How far, in the mesh's largest extents, a normal turned by one radian seems to put a face: on people about 1 cm, which
-# keeps the sides of fingers and the lips of a fold apart.
-TURN_SHARE = 0.005
+CENTRE_CANDIDATES, SAMPLE_CANDIDATES = 24, 8  # nearest face centres and nearest samples of which faces are tried
+SURFACE_SAMPLES = 20000  # points spread over a mesh beside its face centres
+# Distance, as a share of the mesh's largest extent, that a normal rotated by one radian adds to a face: about 1 cm on
+# people, which keeps the sides of fingers and the lips of a fold apart.
+NORMAL_LENGTH_SHARE = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class OnSurface:
-    """Points on a mesh: face (N,) and barycentric coordinates (N, 3) of each."""
+class SurfacePoints:
+    """Points on a mesh: `face` (N,) and `barycentric` coordinates (N, 3) of each."""
 
     face: np.ndarray
     barycentric: np.ndarray
 
-    def points(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-        """The points (N, 3) on a mesh of the same faces."""
+    def interpolate(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """Return the points (N, 3) on a mesh with vertices (V, 3) and the same faces (F, 3)."""
         return (self.barycentric[:, :, None] * vertices[faces[self.face]]).sum(axis=1)
 
 
-def closest_on_mesh(
+def find_closest_on_mesh(
     points: np.ndarray, normals: np.ndarray | None, vertices: np.ndarray, faces: np.ndarray
-) -> OnSurface:
-    """Find for every point the closest point of a mesh, among faces that do not look the other way.
+) -> SurfacePoints:
+    """Find for every point the closest point of a mesh, on a face whose normal does not contradict the point's.
 
-    Exact among the 24 faces whose centres are nearest and those of the 8 nearest samples; a face whose normal
-    contradicts the point's is taken only when none of them agrees, and of two that agree the more parallel one seems
-    closer, see `TURN_SHARE`.
+    Exact among the 24 faces whose centres are nearest and those of the 8 nearest samples. A face whose normal
+    contradicts the point's is taken only when none of them agrees; of those that agree, a more parallel one counts as
+    closer by `NORMAL_LENGTH_SHARE`.
 
     Args:
-        points: (N, 3).
-        normals: (N, 3) normals of any length or None to take any face.
+        points: (N, 3) in the mesh's frame and unit.
+        normals: (N, 3) of any length, or None to take any face.
         vertices: (V, 3).
         faces: (F, 3).
     """
@@ -50,23 +49,23 @@ def closest_on_mesh(
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(cross, axis=1)
     # Large faces get more samples, so that their centres alone do not decide which faces are near.
-    extra = np.floor(SAMPLES * areas / areas.sum()).astype(np.int64)
+    extra = np.floor(SURFACE_SAMPLES * areas / areas.sum()).astype(np.int64)
     owner = np.concatenate([np.arange(len(faces)), np.repeat(np.arange(len(faces)), extra)])
     mix = np.random.default_rng(0).dirichlet(np.ones(3), int(extra.sum()))
     centres = corners.mean(axis=1)
     samples = np.concatenate([centres, (mix[:, :, None] * corners[owner[len(faces) :]]).sum(axis=1)])
-    near = owner[cKDTree(samples).query(points, k=min(SAMPLED_CANDIDATES, len(samples)))[1].reshape(len(points), -1)]
-    centred = cKDTree(centres).query(points, k=min(CANDIDATES, len(faces)))[1].reshape(len(points), -1)
+    near = owner[cKDTree(samples).query(points, k=min(SAMPLE_CANDIDATES, len(samples)))[1].reshape(len(points), -1)]
+    centred = cKDTree(centres).query(points, k=min(CENTRE_CANDIDATES, len(faces)))[1].reshape(len(points), -1)
     near = np.concatenate([centred, near], axis=1)
     directions = np.zeros_like(points) if normals is None else normals
     length = np.linalg.norm(directions, axis=1, keepdims=True)
     directions = directions / np.where(length > 0, length, 1.0)
-    turn = TURN_SHARE * float(np.ptp(corners.reshape(-1, 3), axis=0).max())
-    face, barycentric = _closest(
+    normal_length = NORMAL_LENGTH_SHARE * float(np.ptp(corners.reshape(-1, 3), axis=0).max())
+    face, barycentric = _find_closest(
         np.ascontiguousarray(points, dtype=np.float64), np.ascontiguousarray(directions, dtype=np.float64), near,
-        corners, cross / np.where(areas > 0, areas, 1.0)[:, None], turn**2,
+        corners, cross / np.where(areas > 0, areas, 1.0)[:, None], normal_length**2,
     )  # fmt: skip
-    return OnSurface(face, barycentric)
+    return SurfacePoints(face, barycentric)
 
 
 def correspond(
@@ -74,7 +73,7 @@ def correspond(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Map every point of one scan to another through two fits of one model (thesis, "Experiments").
 
-    Scan A's point goes to the closest place on fit A, to the same place on fit B, and on to the surface of scan B.
+    A point of scan A is mapped to the closest place on fit A, to the same place on fit B, and on to scan B's surface.
 
     Args:
         fit_a: (V, 3) fitted vertices in scan A's frame.
@@ -84,34 +83,36 @@ def correspond(
         scan_b: M points.
 
     Returns:
-        (N, 3) points on scan B, and (N,) distance from scan B's surface to fit B there.
+        Points (N, 3) on scan B, and the distances (N,) between scan B's surface and fit B there.
     """
-    place = closest_on_mesh(scan_a.points, scan_a.vertex_normals(), fit_a, faces)
-    bridge = place.points(fit_b, faces)
+    place = find_closest_on_mesh(scan_a.points, scan_a.vertex_normals(), fit_a, faces)
+    bridge = place.interpolate(fit_b, faces)
     if scan_b.faces is None:
         found = scan_b.points[cKDTree(scan_b.points).query(bridge)[1]]
     else:
         corners = fit_b[faces[place.face]]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        found = closest_on_mesh(bridge, normals, scan_b.points, scan_b.faces).points(scan_b.points, scan_b.faces)
+        found = find_closest_on_mesh(bridge, normals, scan_b.points, scan_b.faces).interpolate(
+            scan_b.points, scan_b.faces
+        )
     return found, np.linalg.norm(found - bridge, axis=1)
 
 
 @njit(cache=True)
-def _closest(
+def _find_closest(
     points: np.ndarray,
     normals: np.ndarray,
     candidates: np.ndarray,
     corners: np.ndarray,
-    facing: np.ndarray,
-    squared_turn: float,
+    face_normals: np.ndarray,
+    squared_normal_length: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     face = np.empty(len(points), dtype=np.int64)
     barycentric = np.empty((len(points), 3))
     for row in range(len(points)):
         best, best_agrees = np.inf, False
         for candidate in candidates[row]:
-            cosine = np.dot(normals[row], facing[candidate])
+            cosine = np.dot(normals[row], face_normals[candidate])
             agrees = cosine >= 0
             if best_agrees and not agrees:
                 continue
@@ -119,7 +120,7 @@ def _closest(
             gap = (
                 place[0] * corners[candidate, 0] + place[1] * corners[candidate, 1] + place[2] * corners[candidate, 2]
             ) - points[row]
-            distance = np.dot(gap, gap) + 2 * squared_turn * (1 - cosine)
+            distance = np.dot(gap, gap) + 2 * squared_normal_length * (1 - cosine)
             if distance < best or (agrees and not best_agrees):
                 best, best_agrees = distance, agrees
                 face[row], barycentric[row] = candidate, place
@@ -128,7 +129,7 @@ def _closest(
 
 @njit(cache=True)
 def _closest_on_triangle(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates of the closest point: inside the face, or on the nearest of its edges."""
+    """Return the barycentric coordinates (3,) of the closest point: inside the face, or on the nearest of its edges."""
     ab, ac, ap = triangle[1] - triangle[0], triangle[2] - triangle[0], point - triangle[0]
     aa, bb, cc = np.dot(ab, ab), np.dot(ab, ac), np.dot(ac, ac)
     pa, pc = np.dot(ap, ab), np.dot(ap, ac)

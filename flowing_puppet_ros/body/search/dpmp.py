@@ -18,10 +18,10 @@ from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, DataCost
 from flowing_puppet_ros.inference.diverse import select_diverse
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product, message_foundation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.parallel import parallel_map
+from flowing_puppet_ros.threads import parallel_map
 
-EXCLUDED = 1e6  # cost of a particle that is not to be used
-NO_GRIDS: Mapping[int, CloudGrid] = {}
+EXCLUDED_COST = 1e6  # of a particle that must not be used
+NO_GRIDS: Mapping[int, CloudGrid] = {}  # every part is compared with the whole cloud
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,11 +30,11 @@ class SearchWeights:
 
     Attributes:
         stitch: factor of squared gaps in metres; the thesis's alphas alone let parts drift apart.
-        mismatch: cost of a part all of whose normals contradict the cloud's (eta of Eq. 52, per fraction).
+        mismatch: cost of a part with all normals contradicting the cloud's (eta of Eq. 52, per fraction of normals).
         temperature: of the diverse selection.
         neighbours: probability that a new particle is proposed by a neighbour.
-        lm_steps: Levenberg-Marquardt steps a new particle.
-        lm_points: surface points a part that they use.
+        lm_steps: Levenberg-Marquardt steps per new particle.
+        lm_points: surface points per part that those steps use.
     """
 
     stitch: float = 4.0
@@ -47,12 +47,12 @@ class SearchWeights:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
-    """Result of a search.
+    """The result of a search.
 
     Attributes:
         state: the best body.
-        cost: of Eq. 50 with the weights of the last stage.
-        judged: the last particles of every part.
+        cost: Eq. 50 with the weights of the last stage.
+        scored: the last particles of every part.
     """
 
     state: BodyState
@@ -62,7 +62,7 @@ class SearchResult:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SearchContext:
-    """What all iterations of one search share: the cloud of every part, believed joints, and threads."""
+    """What all iterations of one search share: the cloud of every part, joint targets, and the number of threads."""
 
     grids: list[CloudGrid]
     targets: JointTargets
@@ -87,115 +87,118 @@ class BodyParticleSearch:
         iterations: int,
         rng: np.random.Generator,
         progress: Callable[[float], None] | None = None,
-        own: Mapping[int, CloudGrid] = NO_GRIDS,
-        keep: int | None = None,
+        part_grids: Mapping[int, CloudGrid] = NO_GRIDS,
+        max_particles: int | None = None,
         threads: int = 1,
     ) -> SearchResult:
-        """Improve particles and return the best body.
+        """Improve particles by D-PMP and return the best body.
 
         Args:
-            start: per part the first particles; a part with a single one stays as it is.
+            start: the first particles of each part; a part with a single one stays as it is.
             grid: the cloud.
-            targets: believed joints.
-            stages: schedule; the last one ends at 1.
+            targets: joint targets.
+            stages: schedule; the last stage ends at 1.
             iterations: rounds of proposing and selecting.
             rng: source of all randomness.
-            progress: called with the fraction done.
-            own: clouds of the parts that do not see `grid`.
-            keep: particles a part that go on after all of the start were improved; None for as many as there are.
-            threads: how many; the result does not depend on it.
+            progress: called with the fraction done, 0 to 1.
+            part_grids: clouds of the parts that are not compared with `grid`.
+            max_particles: particles per part to keep once all of the start were improved; None keeps their number.
+            threads: number of threads; the result does not depend on it.
         """
-        turn = _SearchContext([own.get(part, grid) for part in range(len(start))], targets, threads)
-        judged = [
-            ScoredParticles.judge(points, particles, grid, targets)
-            for points, particles, grid in zip(self._points, start, turn.grids, strict=True)
+        context = _SearchContext([part_grids.get(part, grid) for part in range(len(start))], targets, threads)
+        scored = [
+            ScoredParticles.score(points, particles, grid, targets)
+            for points, particles, grid in zip(self._points, start, context.grids, strict=True)
         ]
         searched = [part for part, particles in enumerate(start) if len(particles) > 1]
-        counts = [len(particles) if keep is None else min(keep, len(particles)) for particles in start]
-        if keep is not None:
-            judged = self._improve_and_select(judged, {part: start[part] for part in searched}, counts, stages[0], turn)
-        best = self._solve(judged, stages[0])[0].assignment
+        counts = [len(group) if max_particles is None else min(max_particles, len(group)) for group in start]
+        if max_particles is not None:
+            proposed = {part: start[part] for part in searched}
+            scored = self._improve_and_select(scored, proposed, counts, stages[0], context)
+        best = self._solve(scored, stages[0])[0].assignment
         for iteration in range(iterations):
             stage = next(stage for stage in stages if iteration < stage.until * iterations or stage is stages[-1])
-            proposed = {part: self._propose(part, judged, best, stage, rng) for part in searched}
-            judged = self._improve_and_select(judged, proposed, counts, stage, turn)
-            best = np.zeros(len(judged), dtype=np.int64)
+            proposed = {part: self._propose(part, scored, best, stage, rng) for part in searched}
+            scored = self._improve_and_select(scored, proposed, counts, stage, context)
+            best = np.zeros(len(scored), dtype=np.int64)
             if progress is not None:
                 progress((iteration + 1) / iterations)
-        result, _ = self._solve(judged, stages[-1])
-        return SearchResult(self._body(judged, result), result.cost, judged)
+        result, _ = self._solve(scored, stages[-1])
+        return SearchResult(self._assemble_body(scored, result), result.cost, scored)
 
-    def modes(self, found: SearchResult, part: int) -> list[BodyState]:
-        """The best body with each of the particles that a search left of a part."""
-        nodes, edges = self._costs(found.scored, four_stages(self._model.tree)[-1])
+    def extract_modes(self, found: SearchResult, part: int) -> list[BodyState]:
+        """Return the best body with each of the particles of `part` that a search kept."""
+        nodes, edges = self._compute_costs(found.scored, four_stages(self._model.tree)[-1])
         bodies = []
         for particle in range(len(nodes[part])):
-            only = np.full(len(nodes[part]), EXCLUDED)
+            only = np.full(len(nodes[part]), EXCLUDED_COST)
             only[particle] = nodes[part][particle]
             costs = [*nodes[:part], only, *nodes[part + 1 :]]
-            bodies.append(self._body(found.scored, max_product(self._model.tree, costs, edges)))
+            bodies.append(self._assemble_body(found.scored, max_product(self._model.tree, costs, edges)))
         return bodies
 
-    def _body(self, judged: list[ScoredParticles], result: MaxProduct) -> BodyState:
-        return particles_to_state(self._model, [group.particles for group in judged], result.assignment)
+    def _assemble_body(self, scored: list[ScoredParticles], result: MaxProduct) -> BodyState:
+        return particles_to_state(self._model, [group.particles for group in scored], result.assignment)
 
     def _improve_and_select(
         self,
-        judged: list[ScoredParticles],
+        scored: list[ScoredParticles],
         proposed: dict[int, Particles],
         counts: list[int],
         stage: Stage,
-        turn: _SearchContext,
+        context: _SearchContext,
     ) -> list[ScoredParticles]:
-        """Improve proposed particles, add them to the present ones, and keep `counts` of each part, the best first."""
+        """Improve the proposed particles, add them to the present ones, and keep `counts` of each part."""
         improved = parallel_map(
-            lambda pair: self._improved(*pair, turn.grids[pair[0]], turn.targets), proposed.items(), turn.threads
+            lambda pair: self._improve(*pair, context.grids[pair[0]], context.targets),
+            proposed.items(),
+            context.threads,
         )
-        judged = list(judged)
+        scored = list(scored)
         for part, new in zip(proposed, improved, strict=True):
-            judged[part] = judged[part].extend(new)
-        result, edges = self._solve(judged, stage)
+            scored[part] = scored[part].extend(new)
+        result, edges = self._solve(scored, stage)
         for part in proposed:
-            judged[part] = judged[part].take(self._select(part, counts[part], result, edges, stage.greedy))
-        return judged
+            scored[part] = scored[part].take(self._select(part, counts[part], result, edges, stage.greedy))
+        return scored
 
     def energy(self, state: BodyState, cloud: DataCost) -> float:
-        """Eq. 50 of one body, with every weight as in the last stage of the search."""
+        """Return the energy of one body (Eq. 50), with every weight as in the last stage of the search."""
         none = JointTargets.none(self._model)
-        judged = [
-            ScoredParticles.judge(points, group, cloud, none)
+        scored = [
+            ScoredParticles.score(points, group, cloud, none)
             for points, group in zip(self._points, states_to_particles(self._model, [state]), strict=True)
         ]
-        return self._solve(judged, four_stages(self._model.tree)[-1])[0].cost
+        return self._solve(scored, four_stages(self._model.tree)[-1])[0].cost
 
     def _propose(
-        self, part: int, judged: list[ScoredParticles], best: np.ndarray, stage: Stage, rng: np.random.Generator
+        self, part: int, scored: list[ScoredParticles], best: np.ndarray, stage: Stage, rng: np.random.Generator
     ) -> Particles:
         if stage.greedy:
-            copies = judged[part].particles.take(np.full(len(judged[part].particles), best[part]))
+            copies = scored[part].particles.take(np.full(len(scored[part].particles), best[part]))
             return self._proposer.random_walk(copies, stage.noise, rng, deformation_only=0.5)
-        return self._proposer.propose(part, judged, stage.noise, self._weights.neighbours, rng)
+        return self._proposer.propose(part, scored, stage.noise, self._weights.neighbours, rng)
 
-    def _improved(self, part: int, new: Particles, grid: CloudGrid, targets: JointTargets) -> ScoredParticles:
-        moved = levenberg_marquardt(
+    def _improve(self, part: int, new: Particles, grid: CloudGrid, targets: JointTargets) -> ScoredParticles:
+        improved = levenberg_marquardt(
             self._points[part], new, grid, targets, self._weights.lm_steps, self._weights.lm_points
         )
-        return ScoredParticles.judge(self._points[part], moved, grid, targets)
+        return ScoredParticles.score(self._points[part], improved, grid, targets)
 
-    def _solve(self, judged: list[ScoredParticles], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
+    def _solve(self, scored: list[ScoredParticles], stage: Stage) -> tuple[MaxProduct, list[np.ndarray]]:
         """Run max-product with the weights of a stage."""
-        nodes, edges = self._costs(judged, stage)
+        nodes, edges = self._compute_costs(scored, stage)
         return max_product(self._model.tree, nodes, edges), edges
 
-    def _costs(self, judged: list[ScoredParticles], stage: Stage) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        """Costs of every part's particles and of every edge's pairs with the weights of a stage (Eqs. 50-52)."""
+    def _compute_costs(self, scored: list[ScoredParticles], stage: Stage) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Return the costs of each part's particles and of each edge's pairs, weighted as in a stage (Eqs. 50-52)."""
         nodes = [
-            beta * (group.distance + self._weights.mismatch * group.mismatch) + group.pull
-            for beta, group in zip(stage.data, judged, strict=True)
+            beta * (group.distance + self._weights.mismatch * group.mismatch) + group.joint_cost
+            for beta, group in zip(stage.data, scored, strict=True)
         ]
         edges = []
         for edge, (parent, child) in enumerate(self._model.tree.edges):
-            a, b = judged[parent], judged[child]
+            a, b = scored[parent], scored[child]
             centers = a.particles.center, b.particles.center
             weight = self._model.interfaces[edge].weight
             cost = stitching_costs(weight, a.interfaces[edge], b.interfaces[edge], centers, self._weights.stitch)
@@ -203,10 +206,10 @@ class BodyParticleSearch:
         return nodes, edges
 
     def _select(self, part: int, count: int, result: MaxProduct, edges: list[np.ndarray], greedy: bool) -> np.ndarray:
-        """Choose the particles to keep, the one of the best body first."""
-        kept = int(result.assignment[part])
+        """Return the indices of the particles to keep, that of the best body first."""
+        best = int(result.assignment[part])
         if greedy:
             order = np.argsort(result.marginals[part], kind="stable")
-            return np.concatenate([[kept], order[order != kept][: count - 1]])
+            return np.concatenate([[best], order[order != best][: count - 1]])
         foundation = message_foundation(self._model.tree, edges, result, part)
-        return select_diverse(foundation, count, kept, self._weights.temperature)
+        return select_diverse(foundation, count, best, self._weights.temperature)

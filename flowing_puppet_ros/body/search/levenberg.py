@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Levenberg-Marquardt moves: every new particle is drawn to its closest cloud points (thesis Eqs. 55-64).
+"""Levenberg-Marquardt moves that fit every new particle to its closest cloud points (thesis Eqs. 55-64).
 
 The unknowns are rotation, translation and pose deformation. Residuals are taken in the part's own frame, which leaves
 the sum of squares as it is: with y = R^T (v - o) for cloud point v and p for the model point in that frame the
 residual is p - y, its derivative with respect to a rotation increment on the right of R is -[p]x, with respect to the
 translation (in the part's frame) the identity, and with respect to the deformation the constant basis.
 
-Other than the thesis, which damps with lambda I and takes every residual alike: the damping is scaled by the diagonal
-of J J^T (Marquardt 1963), so that radians, metres and coefficients are damped alike; points whose normals contradict
-the cloud's count less, believed joints pull too, and a weak prior keeps the deformation bounded.
+The thesis damps with lambda I and weighs every residual alike. Here the damping is scaled by the diagonal of J J^T
+(Marquardt 1963), so that radians, metres and coefficients are damped alike; points whose normals contradict the
+cloud's count less, joint targets count too, and a weak prior keeps the deformation bounded.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.part_points import PartPoints
 from flowing_puppet_ros.body.search.particles import Particles
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, look_up
-from flowing_puppet_ros.model.sp import DEVIATIONS
+from flowing_puppet_ros.model.sp import MAX_DEVIATIONS
 
-DAMPING = 0.1
-DAMPING_FACTOR = 10.0
-MAX_TURN = 0.6
-POSE_PRIOR = 5e-5
-CONTRADICTING_WEIGHT = 0.3
+INITIAL_DAMPING = 0.1  # relative to the diagonal of J J^T
+DAMPING_FACTOR = 10.0  # by which it falls after a step that helps and grows after one that does not
+MAX_ROTATION_STEP_RAD = 0.6  # longer steps are shortened as a whole
+POSE_PRIOR_WEIGHT = 5e-5  # of the squared pose coefficients, in square metres
+CONTRADICTING_WEIGHT = 0.3  # factor of points whose normals contradict the cloud's
 # Points, normals, nearest indices, origin and cell of a CloudGrid.
 CloudArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float]
 # Basis (K, D, 3), normals and weights of the surface points and then the joints, the joints' targets, and the weighted
@@ -38,18 +38,18 @@ Triple = tuple[float, float, float]
 def levenberg_marquardt(
     points: PartPoints, particles: Particles, grid: CloudGrid, targets: JointTargets, steps: int, count: int
 ) -> Particles:
-    """Run `steps` LM steps on every particle of one part, with the closest points renewed at each step.
+    """Run `steps` LM steps (Eqs. 55-64) on every particle of one part; closest points are renewed at each step.
 
     Args:
         points: the part's points.
-        particles: where to start.
+        particles: the start.
         grid: the cloud; a closest point whose normal contradicts the model's counts less.
-        targets: believed joints, which pull with their weights.
-        steps: tried steps a particle.
-        count: how many surface points to use.
+        targets: joint targets.
+        steps: steps to try for each particle.
+        count: number of surface points to use.
 
     Returns:
-        Particles of the same shape coefficients whose sum of squares is not larger.
+        Particles with the same shape coefficients and a sum of squares that is not larger.
     """
     center, rotation, pose = particles.center.copy(), particles.rotation.copy(), particles.pose.copy()
     mean, part = prepare_part(points, particles, targets, min(count, len(points.surface)))
@@ -61,9 +61,11 @@ def levenberg_marquardt(
 def prepare_part(
     points: PartPoints, particles: Particles, targets: JointTargets, count: int
 ) -> tuple[np.ndarray, PartArrays]:
-    """Undeformed points (P, count + M, 3) of every particle, surface before joints, and what all particles share."""
+    """Return the undeformed points (P, count + M, 3) of every particle, surface before joints, and what all share."""
     surface, joints = points.surface, points.joints
-    mean = np.concatenate([surface.shaped(particles.shape)[:, :count], joints.shaped(particles.shape)], axis=1)
+    mean = np.concatenate(
+        [surface.apply_shape(particles.shape)[:, :count], joints.apply_shape(particles.shape)], axis=1
+    )
     basis = np.concatenate([surface.pose_basis[:count], joints.pose_basis]).transpose(0, 2, 1).copy()
     weight = np.concatenate([np.full(count, 1.0 / count), targets.weight[points.joint_index]])
     first = np.tensordot(weight, basis, 1)
@@ -87,16 +89,16 @@ def _optimise_all(
     new_hessian, new_gradient = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
     step, factor = np.zeros(unknowns), np.zeros((unknowns, unknowns))
     for p in range(len(center)):
-        damping = DAMPING
+        damping = INITIAL_DAMPING
         cost = assemble(center[p], rotation[p], pose[p], mean[p], part, cloud, hessian, gradient)
         for _ in range(steps):
             _solve(hessian, gradient, damping, factor, step)
-            turn = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
-            if turn > MAX_TURN:
-                step *= MAX_TURN / turn
+            angle = np.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+            if angle > MAX_ROTATION_STEP_RAD:
+                step *= MAX_ROTATION_STEP_RAD / angle
             new_center = center[p] + rotation[p] @ step[3:6]
-            new_rotation = rotation[p] @ _rotation(step[:3])
-            new_pose = np.minimum(np.maximum(pose[p] + step[6:], -DEVIATIONS), DEVIATIONS)
+            new_rotation = rotation[p] @ _exp(step[:3])
+            new_pose = np.minimum(np.maximum(pose[p] + step[6:], -MAX_DEVIATIONS), MAX_DEVIATIONS)
             new_cost = assemble(new_center, new_rotation, new_pose, mean[p], part, cloud, new_hessian, new_gradient)
             if new_cost < cost:
                 center[p], rotation[p], pose[p], cost = new_center, new_rotation, new_pose, new_cost
@@ -118,10 +120,10 @@ def assemble(
     hessian: np.ndarray,
     gradient: np.ndarray,
 ) -> float:
-    """Fill the normal equations (the lower triangle) and return half the weighted sum of squares.
+    """Fill the normal equations (the lower triangle) and return half the weighted sum of squares (Eq. 55).
 
-    The unknowns are increments of turn and place in the part's own frame, then the deformation. What all particles
-    share is in the sums that come with the part; points that contradict the cloud take their share of it back.
+    The unknowns are increments of rotation and translation in the part's own frame, then the deformation. What all
+    particles share comes as sums with the part, from which points that contradict the cloud are subtracted in part.
     """
     basis, normals, weight, target, first, second = part
     points, point_normals, nearest, origin, cell = cloud
@@ -147,7 +149,7 @@ def assemble(
             a, b, c = a - points[found, 0], b - points[found, 1], c - points[found, 2]
             if _contradicts(rotation, normals[k], point_normals[found]):
                 importance *= CONTRADICTING_WEIGHT
-                _take_back(weight[k] - importance, basis[k], hessian)
+                _subtract_deformation(weight[k] - importance, basis[k], hessian)
         else:
             goal = target[k - len(normals)]
             a, b, c = a - goal[0], b - goal[1], c - goal[2]
@@ -158,25 +160,25 @@ def assemble(
         _add_rigid(importance, (x, y, z), (u, v, w), hessian, gradient)
         _add_deformed(importance, (x, y, z), (u, v, w), basis[k], hessian, gradient)
     for d in range(deformations):
-        cost += 0.5 * POSE_PRIOR * pose[d] ** 2
-        hessian[6 + d, 6 + d] += POSE_PRIOR
-        gradient[6 + d] += POSE_PRIOR * pose[d]
+        cost += 0.5 * POSE_PRIOR_WEIGHT * pose[d] ** 2
+        hessian[6 + d, 6 + d] += POSE_PRIOR_WEIGHT
+        gradient[6 + d] += POSE_PRIOR_WEIGHT * pose[d]
     return cost
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _contradicts(rotation: np.ndarray, normal: np.ndarray, found: np.ndarray) -> bool:
-    """Whether the part's normal, once turned, looks away from the cloud's."""
+    """Return whether the part's rotated normal is more than 90 degrees from the cloud's."""
     cosine = 0.0
     for axis in range(3):
-        turned = rotation[axis, 0] * normal[0] + rotation[axis, 1] * normal[1] + rotation[axis, 2] * normal[2]
-        cosine += found[axis] * turned
+        rotated = rotation[axis, 0] * normal[0] + rotation[axis, 1] * normal[1] + rotation[axis, 2] * normal[2]
+        cosine += found[axis] * rotated
     return cosine < 0.0
 
 
 @njit(cache=True, nogil=True)
-def _take_back(weight: float, basis: np.ndarray, hessian: np.ndarray) -> None:
-    """Lessen what the sums over all points hold of one point's deformation."""
+def _subtract_deformation(weight: float, basis: np.ndarray, hessian: np.ndarray) -> None:
+    """Subtract `weight` times one point's deformation from the sums over all points."""
     for d in range(len(basis)):
         for axis in range(3):
             hessian[6 + d, 3 + axis] -= weight * basis[d, axis]
@@ -187,7 +189,7 @@ def _take_back(weight: float, basis: np.ndarray, hessian: np.ndarray) -> None:
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_rigid(weight: float, point: Triple, residual: Triple, hessian: np.ndarray, gradient: np.ndarray) -> None:
-    """Add a point's J^T W J and J^T W r of turn and place, J = (-[p]x, I)."""
+    """Add a point's J^T W J and J^T W r of rotation and place (Eqs. 56-61), J = (-[p]x, I)."""
     x, y, z = point
     u, v, w = residual
     gradient[0] += weight * (y * w - z * v)
@@ -217,7 +219,7 @@ def _add_rigid(weight: float, point: Triple, residual: Triple, hessian: np.ndarr
 def _add_deformed(
     weight: float, point: Triple, residual: Triple, basis: np.ndarray, hessian: np.ndarray, gradient: np.ndarray
 ) -> None:
-    """Add a point's part of the normal equations that is not the same for all particles: deformation with turn."""
+    """Add a point's deformation (Eqs. 62 and 63): its gradient, and its products with the rotation."""
     x, y, z = point
     u, v, w = residual
     for d in range(len(basis)):
@@ -230,7 +232,7 @@ def _add_deformed(
 
 @njit(cache=True, nogil=True)
 def _solve(hessian: np.ndarray, gradient: np.ndarray, damping: float, factor: np.ndarray, step: np.ndarray) -> None:
-    """Write into `step` what solves (H + damping diag H) step = -g, by Cholesky; of H the lower triangle is read."""
+    """Solve (H + damping diag H) step = -g (Eq. 64) for `step` by Cholesky; only the lower triangle of H is read."""
     unknowns = len(gradient)
     for row in range(unknowns):
         total = -gradient[row]
@@ -253,8 +255,8 @@ def _solve(hessian: np.ndarray, gradient: np.ndarray, damping: float, factor: np
 
 
 @njit(cache=True, nogil=True)
-def _rotation(vector: np.ndarray) -> np.ndarray:
-    """Rodrigues' formula for one vector."""
+def _exp(vector: np.ndarray) -> np.ndarray:
+    """Return the rotation (3, 3) of one rotation vector (3,) by Rodrigues' formula."""
     angle = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
     cross = np.zeros((3, 3))
     cross[0, 1], cross[0, 2] = -vector[2], vector[1]

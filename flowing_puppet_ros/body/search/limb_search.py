@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hypotheses of limbs: an arm or a leg is searched anew in what the rest of the body leaves of the cloud.
+"""Searches an arm or a leg again, in the part of the cloud that the rest of the body does not explain.
 
-The energy asks whether the body lies on the cloud, not whether the cloud is covered, so that two limbs may share the
-cloud of one. A limb that only sees the points which nothing else explains cannot; and of the many places that
-particles find for it the one is taken that covers them best. Where nothing is left, a limb hangs as it usually does.
+The energy asks whether the body lies on the cloud, not whether the cloud is covered, so two limbs may share the cloud
+of one. A limb that only sees unexplained points cannot, and of the many poses that its particles find, the one that
+covers these points best is taken. Where nothing is left, the limb goes to the mean of its Gaussians.
 """
 
 from __future__ import annotations
@@ -22,29 +22,32 @@ from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.model.tree import PartTree
 
-SINGLE_LIMBS = 4
-ARM = ("shoulder", "upper_arm", "lower_arm", "hand")
-LEG = ("upper_leg", "lower_leg", "foot")
-# Metres from the rest of the body at which a cloud point is left to the limb.
-EXPLAINED = 0.03
+SINGLE_LIMBS = 4  # groups of `limb_groups` that are one limb, the first ones
+# Parts of a limb from the trunk outwards, without the side.
+ARM_PARTS = ("shoulder", "upper_arm", "lower_arm", "hand")
+LEG_PARTS = ("upper_leg", "lower_leg", "foot")
+# Distance to the rest of the body up to which a cloud point is explained by it.
+MAX_EXPLAINED_DISTANCE_M = 0.03
 # Share of the cloud that must be left for a limb: a person's arm has about 9 %, a leg 17 %.
-LEAST_LEFT = 0.01
-FAR = 0.1  # metres: what is farther counts as this far
-# How many ways to hang each part are tried, how many particles go on, and for how many rounds.
+MIN_UNEXPLAINED_SHARE = 0.01
+MAX_GAP_M = 0.1  # larger distances count as this one
+# Poses in which each part is attached to its parent, particles of them that are kept, and rounds of the search.
 ATTACHMENTS, PARTICLES, ITERATIONS = 120, 30, 14
 
 
 def limb_groups(tree: PartTree) -> tuple[tuple[int, ...], ...]:
-    """Parts from the trunk outwards: of each of the `SINGLE_LIMBS` legs and arms, both legs, both arms, all limbs."""
+    """Return the parts of each leg and arm, of both legs, both arms and all limbs, each from the trunk outwards."""
     left_leg, right_leg, left_arm, right_arm = (
-        tuple(tree.index(f"{side}_{name}") for name in names) for names in (LEG, ARM) for side in ("left", "right")
+        tuple(tree.index(f"{side}_{name}") for name in names)
+        for names in (LEG_PARTS, ARM_PARTS)
+        for side in ("left", "right")
     )
     legs, arms = left_leg + right_leg, left_arm + right_arm
     return left_leg, right_leg, left_arm, right_arm, legs, arms, legs + arms
 
 
 class LimbSearch:
-    """Searches limbs of one model."""
+    """The search for limbs of one model."""
 
     def __init__(self, model: StitchedPuppet, search: BodyParticleSearch, proposer: Proposer) -> None:
         self._model = model
@@ -54,12 +57,12 @@ class LimbSearch:
     def run(
         self, body: BodyState, limbs: tuple[int, ...], cloud: Cloud, grid: CloudGrid, rng: np.random.Generator
     ) -> BodyState | None:
-        """Search limbs anew in what the rest of the body leaves of the cloud.
+        """Search limbs again in the part of the cloud that the rest of the body does not explain.
 
         Args:
-            body: the limbs as they are is among the first particles; its other parts stay.
-            limbs: parts, each after the one that it hangs on.
-            cloud: what to fit.
+            body: its limbs are among the first particles; its other parts stay.
+            limbs: parts, each after its parent.
+            cloud: the cloud to fit.
             grid: of the whole cloud.
             rng: source of all randomness.
 
@@ -68,26 +71,28 @@ class LimbSearch:
         """
         own = np.isin(self._model.part_of_vertex, limbs)
         rest = cKDTree(self._model.vertices(body)[~own])
-        left = ~np.isfinite(rest.query(cloud.points, distance_upper_bound=EXPLAINED)[0])
-        if np.count_nonzero(left) < LEAST_LEFT * len(left):
+        left = ~np.isfinite(rest.query(cloud.points, distance_upper_bound=MAX_EXPLAINED_DISTANCE_M)[0])
+        if np.count_nonzero(left) < MIN_UNEXPLAINED_SHARE * len(left):
             return None
         points = cloud.points[left]
         grids = dict.fromkeys(limbs, CloudGrid.build(points, cloud.normals[left]))
         start, none, stages = (
-            self._attached(body, limbs, rng),
+            self._attach_limbs(body, limbs, rng),
             JointTargets.none(self._model),
             limb_stages(self._model.tree),
         )
-        found = self._search.optimise(start, grid, none, stages, ITERATIONS, rng, own=grids, keep=PARTICLES)
+        found = self._search.optimise(
+            start, grid, none, stages, ITERATIONS, rng, part_grids=grids, max_particles=PARTICLES
+        )
         ends = [part for part in limbs if not self._model.tree.children(part)]
-        bodies = [found.state, *(mode for end in ends for mode in self._search.modes(found, end))]
-        return min(bodies, key=lambda state: _gap(self._model.vertices(state)[own], points, cloud))
+        bodies = [found.state, *(mode for end in ends for mode in self._search.extract_modes(found, end))]
+        return min(bodies, key=lambda state: _limb_gap(self._model.vertices(state)[own], points, cloud))
 
-    def mean_limb(self, body: BodyState, limbs: tuple[int, ...]) -> BodyState:
-        """The body with limbs at the mean of their Gaussians (Eq. 49): where they hang when the cloud hides them."""
+    def pose_limb_at_mean(self, body: BodyState, limb: tuple[int, ...]) -> BodyState:
+        """Return the body with a limb at the mean of its Gaussians (Eq. 49), for a limb that the cloud hides."""
         model = self._model
         state = BodyState(body.center.copy(), body.rotation.copy(), body.pose.copy(), body.shape)
-        for part in limbs:
+        for part in limb:
             parent, interface, mean = (
                 model.tree.parents[part],
                 model.interfaces[part - 1],
@@ -104,8 +109,8 @@ class LimbSearch:
             state.center[part] = above[interface.parent_index].mean(axis=0) - rotation @ local.mean(axis=0)
         return state
 
-    def _attached(self, body: BodyState, limbs: tuple[int, ...], rng: np.random.Generator) -> list[Particles]:
-        """The body's parts, and the limbs' also hanging on it in many ways."""
+    def _attach_limbs(self, body: BodyState, limbs: tuple[int, ...], rng: np.random.Generator) -> list[Particles]:
+        """Return the body's parts as particles, those of the limbs also attached to their parents in many poses."""
         start = states_to_particles(self._model, [body])
         for part in limbs:
             above = start[self._model.tree.parents[part]]
@@ -116,8 +121,8 @@ class LimbSearch:
         return start
 
 
-def _gap(limb: np.ndarray, points: np.ndarray, cloud: Cloud) -> float:
-    """Mean distance from a limb's vertices (V, 3) to the cloud and back from the points (M, 3) that it should cover."""
-    there = cloud.nearest.query(limb)[0]
-    back = cKDTree(limb).query(points, distance_upper_bound=FAR)[0]
-    return float(np.minimum(there, FAR).mean() + np.minimum(back, FAR).mean())
+def _limb_gap(limb: np.ndarray, points: np.ndarray, cloud: Cloud) -> float:
+    """Return the mean distance of a limb's vertices (V, 3) to the cloud plus that of the points (M, 3) to the limb."""
+    to_cloud = cloud.nearest.query(limb)[0]
+    to_limb = cKDTree(limb).query(points, distance_upper_bound=MAX_GAP_M)[0]
+    return float(np.minimum(to_cloud, MAX_GAP_M).mean() + np.minimum(to_limb, MAX_GAP_M).mean())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The few points of the Stitched Puppet's parts by which the search judges particles."""
+"""The few points of the Stitched Puppet's parts by which the search scores particles."""
 
 from __future__ import annotations
 
@@ -11,13 +11,15 @@ from flowing_puppet_ros.body.cloud.mesh_geometry import farthest_points, vertex_
 from flowing_puppet_ros.body.search.particles import Particles
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
+MIN_OWN_SHARE = 0.4  # of a joint's regressor weight, for a part that determines the joint alone
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSet:
     """Points of one part that move linearly with its coefficients.
 
     Attributes:
-        mean: (K, 3) local frame, metres.
+        mean: (K, 3) metres in the part's frame.
         pose_basis: (K, 3, D).
         shape_basis: (K, 3, S).
     """
@@ -28,7 +30,7 @@ class PointSet:
 
     @classmethod
     def of_part(cls, model: StitchedPuppet, part: int, rows: np.ndarray) -> PointSet:
-        """Take the vertices `rows` (local indices) of a part (Eqs. 45 and 46)."""
+        """Take the vertices `rows` (K,), local indices of a part (Eqs. 45 and 46)."""
         mean = model.mean_shape[part][rows] + model.mean_pose[part][rows]
         return cls(
             np.ascontiguousarray(mean, dtype=np.float64),
@@ -47,30 +49,30 @@ class PointSet:
     def __len__(self) -> int:
         return len(self.mean)
 
-    def local(self, pose: np.ndarray, shape: np.ndarray) -> np.ndarray:
-        """Points (P, K, 3) in the part's frame for coefficients (P, D) and (P, S)."""
-        return self.shaped(shape) + (pose @ self.pose_basis.reshape(-1, pose.shape[1]).T).reshape(len(pose), -1, 3)
+    def deform(self, pose: np.ndarray, shape: np.ndarray) -> np.ndarray:
+        """Return points (P, K, 3) in the part's frame for coefficients (P, D) and (P, S), metres."""
+        return self.apply_shape(shape) + (pose @ self.pose_basis.reshape(-1, pose.shape[1]).T).reshape(len(pose), -1, 3)
 
-    def shaped(self, shape: np.ndarray) -> np.ndarray:
-        """Points (P, K, 3) in the part's frame with intrinsic shape (P, S) and no pose deformation."""
+    def apply_shape(self, shape: np.ndarray) -> np.ndarray:
+        """Return points (P, K, 3) in the part's frame with intrinsic shape (P, S) and no pose deformation."""
         return self.mean + (shape @ self.shape_basis.reshape(-1, shape.shape[1]).T).reshape(len(shape), -1, 3)
 
-    def world(self, particles: Particles) -> np.ndarray:
-        """Points (P, K, 3) in the common frame (Eq. 47)."""
-        local = self.local(particles.pose, particles.shape)
+    def to_world(self, particles: Particles) -> np.ndarray:
+        """Return points (P, K, 3) of particles in the common frame (Eq. 47), metres."""
+        local = self.deform(particles.pose, particles.shape)
         return local @ particles.rotation.transpose(0, 2, 1) + particles.center[:, None, :]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartPoints:
-    """What the search knows of one part's surface.
+    """The points of one part that the search uses.
 
     Attributes:
-        surface: points spread evenly over the part; the first ones alone are spread evenly too.
+        surface: points spread evenly over the part, as any number of the first ones is.
         normals: (K, 3) outward normals of `surface` in the part's frame.
-        interfaces: per edge at this part the interface points, in the edge's order.
-        joints: the joints this part can place by itself, see `joint_index`.
-        joint_index: (M,) indices into the model's joints.
+        interfaces: for each edge at this part the interface points, in the edge's order.
+        joints: joints whose position this part determines alone.
+        joint_index: (M,) indices of `joints` among the model's.
     """
 
     surface: PointSet
@@ -80,13 +82,13 @@ class PartPoints:
     joint_index: np.ndarray
 
 
-def part_points(model: StitchedPuppet, surface_points: int = 120) -> tuple[PartPoints, ...]:
-    """Choose the points of every part of a model; `surface_points` is their number a part."""
+def build_part_points(model: StitchedPuppet, surface_points: int = 120) -> tuple[PartPoints, ...]:
+    """Choose the points of every part of a model, `surface_points` on the surface of each."""
     normals = vertex_normals(model.vertices(model.rest_state()), model.faces)
-    return tuple(_part_points(model, part, surface_points, normals) for part in range(len(model.tree)))
+    return tuple(_build_part(model, part, surface_points, normals) for part in range(len(model.tree)))
 
 
-def _part_points(model: StitchedPuppet, part: int, count: int, normals: np.ndarray) -> PartPoints:
+def _build_part(model: StitchedPuppet, part: int, count: int, normals: np.ndarray) -> PartPoints:
     rows = farthest_points(model.mean_shape[part] + model.mean_pose[part], count)
     interfaces = {}
     for edge, (parent, child) in enumerate(model.tree.edges):
@@ -94,7 +96,7 @@ def _part_points(model: StitchedPuppet, part: int, count: int, normals: np.ndarr
             interface = model.interfaces[edge]
             rows_at = interface.parent_index if part == parent else interface.child_index
             interfaces[edge] = PointSet.of_part(model, part, rows_at)
-    joints, joint_index = _own_joints(model, part)
+    joints, joint_index = _find_own_joints(model, part)
     return PartPoints(
         PointSet.of_part(model, part, rows),
         np.ascontiguousarray(normals[model.part_vertices[part][rows]]),
@@ -104,8 +106,8 @@ def _part_points(model: StitchedPuppet, part: int, count: int, normals: np.ndarr
     )
 
 
-def _own_joints(model: StitchedPuppet, part: int) -> tuple[PointSet, np.ndarray]:
-    """Joints of which at least two fifths of the regressor's weight lies in the part.
+def _find_own_joints(model: StitchedPuppet, part: int) -> tuple[PointSet, np.ndarray]:
+    """Find the joints of which at least `MIN_OWN_SHARE` of the regressor's weight lies in the part.
 
     The part's share of the regressor is scaled up to weight one; a constant offset in the part's frame makes the
     joint of the template exact.
@@ -117,7 +119,7 @@ def _own_joints(model: StitchedPuppet, part: int) -> tuple[PointSet, np.ndarray]
         inside = local_row[vertices] >= 0
         np.add.at(weight[joint], local_row[vertices][inside], weights[inside])
     share = weight.sum(axis=1)
-    chosen = np.flatnonzero(share >= 0.4)
+    chosen = np.flatnonzero(share >= MIN_OWN_SHARE)
     weight = weight[chosen] / share[chosen, None]
     everything = PointSet.of_part(model, part, np.arange(weight.shape[1]))
     rest = model.rest_state()

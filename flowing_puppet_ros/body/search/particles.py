@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Particles: hypotheses of the Stitched Puppet's parts, and the bodies made of them."""
+"""Particles: hypotheses of the Stitched Puppet's parts, and the bodies assembled from them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from flowing_puppet_ros.model.sp import POSE_WIDTH, BodyState, StitchedPuppet
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Particles:
-    """Hypotheses of one part: thesis Eq. 44 with the rotation as a matrix.
+    """Hypotheses of one part (Eq. 44, with the rotation as a matrix).
 
     Attributes:
         center: (P, 3) metres.
@@ -45,7 +45,7 @@ class Particles:
 
 
 def particles_to_state(model: StitchedPuppet, groups: list[Particles], pick: np.ndarray) -> BodyState:
-    """The body made of particle `pick[i]` of every part i."""
+    """Assemble the body of particle `pick[i]` of every part i."""
     pose = np.zeros((len(groups), POSE_WIDTH))
     for part, group in enumerate(groups):
         pose[part, : group.pose.shape[1]] = group.pose[pick[part]]
@@ -58,7 +58,7 @@ def particles_to_state(model: StitchedPuppet, groups: list[Particles], pick: np.
 
 
 def states_to_particles(model: StitchedPuppet, states: list[BodyState]) -> list[Particles]:
-    """Per part one particle a body."""
+    """Return the particles of each part, one for every body."""
     return [
         Particles(
             np.stack([state.center[part] for state in states]),

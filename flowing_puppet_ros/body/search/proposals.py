@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where new particles come from: sampled bodies, random walks and neighbours (thesis, "Resampling and refinement")."""
+"""Proposals of new particles: random walks, neighbours and parents (thesis, "Resampling and refinement")."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from flowing_puppet_ros.body.search.part_points import PartPoints
 from flowing_puppet_ros.body.search.particles import Particles
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.gaussian import Gaussian
-from flowing_puppet_ros.model.sp import DEVIATIONS, StitchedPuppet
+from flowing_puppet_ros.model.sp import MAX_DEVIATIONS, StitchedPuppet
 
 
 @dataclass(frozen=True, slots=True)
 class WalkNoise:
-    """Standard deviations of a random walk: metres, radians, and coefficients of pose and shape."""
+    """Standard deviations of a random walk: centre in metres, rotation in radians, pose and shape coefficients."""
 
     center: float
     rotation: float
@@ -27,7 +27,7 @@ class WalkNoise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Conditional:
-    """A Gaussian of some variables given others, factored once and sampled often (Eqs. 13 and 14)."""
+    """A Gaussian of some variables given others (Eqs. 13 and 14), factored once and sampled often."""
 
     offset: np.ndarray
     gain: np.ndarray
@@ -42,13 +42,13 @@ class Conditional:
         return cls(zero.mean, gain, axes * np.sqrt(np.maximum(values, 0.0)))
 
     def sample(self, rng: np.random.Generator, values: np.ndarray) -> np.ndarray:
-        """Draw one sample (n, kept) for every row of (n, given) `values`."""
+        """Draw one sample (n, kept) for every row of `values` (n, given)."""
         noise = rng.standard_normal((len(values), len(self.offset)))
         return self.offset + values @ self.gain.T + noise @ self.factor.T
 
 
 class Proposer:
-    """Makes new particles for the parts of one model."""
+    """Proposals of new particles for the parts of one model."""
 
     def __init__(self, model: StitchedPuppet, points: tuple[PartPoints, ...]) -> None:
         self._model = model
@@ -71,77 +71,79 @@ class Proposer:
     def propose(
         self,
         part: int,
-        judged: list[ScoredParticles],
+        scored: list[ScoredParticles],
         noise: WalkNoise,
         neighbour_share: float,
         rng: np.random.Generator,
     ) -> Particles:
-        """Make one new particle for every present one of `part`.
+        """Propose one new particle for every present one of `part`.
 
-        With probability `neighbour_share` it comes from a random particle of a random neighbour, otherwise by a random
-        walk from the present one, half the time in the pose deformation only.
+        With probability `neighbour_share` it comes from a random particle of a random neighbour, otherwise from a
+        random walk that starts at the present one, half the time in the pose deformation only.
         """
-        present = judged[part].particles
+        present = scored[part].particles
         count = len(present)
-        asked = rng.random(count) < neighbour_share
-        asked_part = rng.choice(self._neighbours[part], count)
-        groups = [self.random_walk(present.take(np.flatnonzero(~asked)), noise, rng, deformation_only=0.5)]
+        from_neighbour = rng.random(count) < neighbour_share
+        neighbour = rng.choice(self._neighbours[part], count)
+        groups = [self.random_walk(present.take(np.flatnonzero(~from_neighbour)), noise, rng, deformation_only=0.5)]
         for other in self._neighbours[part]:
-            wanted = int(np.count_nonzero(asked & (asked_part == other)))
+            wanted = int(np.count_nonzero(from_neighbour & (neighbour == other)))
             if wanted:
-                source = judged[other].take(rng.integers(0, len(judged[other].particles), wanted))
-                groups.append(self._from_neighbour(part, int(other), source, rng))
+                source = scored[other].take(rng.integers(0, len(scored[other].particles), wanted))
+                groups.append(self._stitch_to_neighbour(part, int(other), source, rng))
         return Particles.join(groups)
 
     def random_walk(
         self, particles: Particles, noise: WalkNoise, rng: np.random.Generator, deformation_only: float = 0.0
     ) -> Particles:
-        """Disturb particles; with probability `deformation_only` just their pose deformation."""
+        """Perturb particles; with probability `deformation_only` only their pose deformation."""
         count, deformations = particles.pose.shape
         whole = (rng.random((count, 1)) >= deformation_only).astype(np.float64)
-        turn = rng.normal(0.0, noise.rotation, (count, 3)) * whole
+        rotation = rng.normal(0.0, noise.rotation, (count, 3)) * whole
         pose = particles.pose + rng.normal(0.0, noise.pose, (count, deformations))
         shape = particles.shape + rng.normal(0.0, noise.shape, particles.shape.shape) * whole
         return Particles(
             particles.center + rng.normal(0.0, noise.center, (count, 3)) * whole,
-            so3.exp(turn) @ particles.rotation,
-            np.clip(pose, -DEVIATIONS, DEVIATIONS),
-            np.clip(shape, -DEVIATIONS, DEVIATIONS),
+            so3.exp(rotation) @ particles.rotation,
+            np.clip(pose, -MAX_DEVIATIONS, MAX_DEVIATIONS),
+            np.clip(shape, -MAX_DEVIATIONS, MAX_DEVIATIONS),
         )
 
     def attach_to_parent(self, part: int, parent: Particles, shape: np.ndarray, rng: np.random.Generator) -> Particles:
-        """Hang a part on particles of its parent, turned anyhow within the joint's limits.
+        """Attach a part to particles of its parent, with uniformly random rotations within the joint's limits.
 
         Args:
-            part: which one.
+            part: the part to attach.
             parent: one particle for each new one.
             shape: (S,) intrinsic shape of the new ones.
             rng: source of all randomness.
         """
         edge, above = part - 1, self._model.tree.parents[part]
         relative = rng.uniform(self._model.limit_low[edge], self._model.limit_high[edge], (len(parent), 3))
-        drawn = self._deformation[part, above][1].sample(rng, np.concatenate([relative, parent.pose], axis=1))
-        pose, shapes = np.clip(drawn, -DEVIATIONS, DEVIATIONS), np.tile(shape, (len(parent), 1))
+        sampled = self._deformation[part, above][1].sample(rng, np.concatenate([relative, parent.pose], axis=1))
+        pose, shapes = np.clip(sampled, -MAX_DEVIATIONS, MAX_DEVIATIONS), np.tile(shape, (len(parent), 1))
         rotation = parent.rotation @ so3.exp(relative)
         weight = self._model.interfaces[edge].weight
-        target = np.average(self._points[above].interfaces[edge].world(parent), axis=1, weights=weight)
-        own = np.average(self._points[part].interfaces[edge].local(pose, shapes), axis=1, weights=weight)
+        target = np.average(self._points[above].interfaces[edge].to_world(parent), axis=1, weights=weight)
+        own = np.average(self._points[part].interfaces[edge].deform(pose, shapes), axis=1, weights=weight)
         return Particles(target - (rotation @ own[:, :, None])[:, :, 0], rotation, pose, shapes)
 
-    def _from_neighbour(self, part: int, other: int, source: ScoredParticles, rng: np.random.Generator) -> Particles:
-        """Stitch `part` to particles of its neighbour, with its deformation drawn given the neighbour's.
+    def _stitch_to_neighbour(
+        self, part: int, other: int, source: ScoredParticles, rng: np.random.Generator
+    ) -> Particles:
+        """Stitch `part` to particles of its neighbour, with its deformation sampled given the neighbour's.
 
-        Half of them are drawn given a relative rotation too, uniform within the joint's limits.
+        Half of them are sampled given a relative rotation as well, uniform within the joint's limits.
         """
         edge = max(part, other) - 1
-        free, turned = self._deformation[part, other]
+        free, rotated = self._deformation[part, other]
         given = source.particles
         pose = free.sample(rng, given.pose)
         relative = rng.uniform(self._model.limit_low[edge], self._model.limit_high[edge], (len(given), 3))
-        with_turn = turned.sample(rng, np.concatenate([relative, given.pose], axis=1))
-        pose = np.where(rng.random((len(given), 1)) < 0.5, pose, with_turn)
-        pose = np.clip(pose, -DEVIATIONS, DEVIATIONS)
-        local = self._points[part].interfaces[edge].local(pose, given.shape)
+        with_rotation = rotated.sample(rng, np.concatenate([relative, given.pose], axis=1))
+        pose = np.where(rng.random((len(given), 1)) < 0.5, pose, with_rotation)
+        pose = np.clip(pose, -MAX_DEVIATIONS, MAX_DEVIATIONS)
+        local = self._points[part].interfaces[edge].deform(pose, given.shape)
         weight = self._model.interfaces[edge].weight
         rotation, center = so3.procrustes(local, source.interfaces[edge], weight)
         return Particles(center, rotation, pose, given.shape)

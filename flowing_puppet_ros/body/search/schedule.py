@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The four stages of the search: weights that bring in the distal parts late (thesis, "Optimization")."""
+"""Stages of the search, with weights that bring in the distal parts late (thesis, "Optimization")."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ import numpy as np
 from flowing_puppet_ros.body.search.proposals import WalkNoise
 from flowing_puppet_ros.model.tree import PartTree
 
+# Random walks far from and near to the solution.
 WIDE = WalkNoise(center=0.04, rotation=0.25, pose=0.5, shape=0.3)
 NARROW = WalkNoise(center=0.01, rotation=0.06, pose=0.2, shape=0.15)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stage:
-    """One stage.
+    """One stage of a search.
 
     Attributes:
         until: fraction of the iterations at which the stage ends.
-        stitch: (E,) alpha per edge.
-        data: (N,) beta per part.
-        noise: random walk.
-        greedy: whether all new particles are drawn around the best body instead of diversely.
+        stitch: (E,) alpha of each edge.
+        data: (N,) beta of each part.
+        noise: of the random walks.
+        greedy: whether all new particles are random walks from the best body.
     """
 
     until: float
@@ -34,26 +35,26 @@ class Stage:
 
 
 def four_stages(tree: PartTree) -> tuple[Stage, ...]:
-    """The thesis's schedule for an unknown pose; the stages end at 35, 60, 85 and 100 % of the iterations.
+    """Return the thesis's schedule for an unknown pose; its stages end at 35, 60, 85 and 100 % of the iterations.
 
-    The "lower limbs" of its first stage are taken to be the lower legs: with the lower arms among them fits are alike.
+    The "lower limbs" of its first stage are taken to be the lower legs; with the lower arms the fits are much the same.
     """
     ends = np.array([name.endswith(("_hand", "_foot")) for name in tree.names])
     distal = ends | np.array([name.endswith("_lower_leg") for name in tree.names])
     hips = np.array([name.endswith("_upper_leg") for name in tree.names])
-    usual = np.where(hips, 0.5, 0.25)[1:]
+    early = np.where(hips, 0.5, 0.25)[1:]
     half = np.full(len(tree) - 1, 0.5)
     ones = np.ones(len(tree))
     return (
-        Stage(0.35, np.where(ends[1:], 0.001, usual), np.where(distal, 0.001, 1.0), WIDE, False),
-        Stage(0.60, usual, np.where(ends, 0.1, 1.0), WIDE, False),
+        Stage(0.35, np.where(ends[1:], 0.001, early), np.where(distal, 0.001, 1.0), WIDE, False),
+        Stage(0.60, early, np.where(ends, 0.1, 1.0), WIDE, False),
         Stage(0.85, half, ones, NARROW, False),
         Stage(1.00, half, ones, NARROW, True),
     )
 
 
 def local_stages(tree: PartTree) -> tuple[Stage, ...]:
-    """A schedule for a pose that is roughly known: all parts count from the start."""
+    """Return a schedule for a pose that is roughly known: all parts count from the start."""
     half = np.full(len(tree) - 1, 0.5)
     ones = np.ones(len(tree))
     middle = WalkNoise(center=0.02, rotation=0.12, pose=0.4, shape=0.2)
@@ -61,7 +62,7 @@ def local_stages(tree: PartTree) -> tuple[Stage, ...]:
 
 
 def limb_stages(tree: PartTree) -> tuple[Stage, ...]:
-    """A schedule for limbs whose place is unknown while the rest of the body stays; it ends with many modes."""
+    """Return a schedule for limbs of unknown pose on a body that stays; it ends with many modes."""
     half = np.full(len(tree) - 1, 0.5)
     ones = np.ones(len(tree))
     return (Stage(0.6, half, ones, WIDE, False), Stage(1.0, half, ones, NARROW, False))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Floors and walls of a scene: planes that are larger than a person, found by RANSAC (Fischler and Bolles 1981).
 
-Open3D's `segment_plane` is not used: it knows no limits of tilt or size, so that the back of a person who stands close
-to a low camera can win over the floor.
+Open3D's `segment_plane` has no limits of tilt or size, so the back of a person close to a low camera could win over the
+floor.
 """
 
 from __future__ import annotations
@@ -14,32 +14,32 @@ import numpy as np
 from numba import njit
 from scipy.ndimage import label
 
-TRIALS = (200, 3000)
-TRIALS_TIMES_POINTS = 2_000_000
-"""Small clouds may have a small floor and take more trials in the same time."""
-NEIGHBOURHOOD = 1.0
-"""Metres: the three points of a trial lie at most this far apart, so that small planes are hit too."""
-MAX_TILT = np.radians(15.0)
-BELOW_FLOOR = 0.03
+MIN_TRIALS, MAX_TRIALS, TRIALS_TIMES_POINTS = 200, 3000, 2_000_000
+"""RANSAC trials. Small clouds may have a small floor, and take more trials in the same time."""
+MAX_TRIAL_DISTANCE_M = 1.0
+"""Distance along each axis from the first point of a trial to the other two, so that small planes are hit too."""
+MAX_TILT_RAD = np.radians(15.0)
+"""Angle between a floor's normal and z."""
+MAX_BELOW_FLOOR_SHARE = 0.03
 """Share of points that may lie below a floor: reflections and noise."""
-FLOOR_SIZE = (1.0, 0.5)
-WALL_SIZE = (1.8, 1.2)
-"""Least longer and shorter side in metres; a wall's are more than a person has, a floor may be cropped narrowly."""
+MIN_FLOOR_SIZE_M = (1.0, 0.5)
+MIN_WALL_SIZE_M = (1.8, 1.2)
+"""Longer and shorter side; a wall is larger than a person, a floor may be cropped narrowly."""
 
-CELL, COVERED = 0.25, 0.6
-"""Metres, and the share of its sides' product that a plane's points must cover in cells of that size; slices through
-people and furniture cover less."""
+CELL_M, MIN_COVERED_SHARE = 0.25, 0.6
+"""Share of the product of its sides that a plane's points must cover, in cells of this size; slices through people and
+furniture cover less."""
 
-REFRESH, STILL_THERE = 10, 0.7
-"""Clouds after which planes are looked for anew, and the share of a plane's points that must still lie on it."""
+MAX_CACHED_CLOUDS, MIN_KEPT_SHARE = 10, 0.7
+"""Clouds after which planes are searched again, and the share of a plane's points that must still lie on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plane:
-    """normal . x = offset.
+    """A plane: normal . x = offset.
 
     Attributes:
-        normal: (3,) unit vector; of a floor upwards.
+        normal: (3,) unit vector; that of a floor points up.
         offset: metres.
     """
 
@@ -47,81 +47,83 @@ class Plane:
     offset: float
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """Signed distance (N,) of points (N, 3), metres, positive where the normal points."""
+        """Return the signed distances (N,) of points (N, 3) in metres, positive on the side of the normal."""
         return np.asarray(points @ self.normal - self.offset)
 
-    def moved(self, step: np.ndarray) -> Plane:
-        """The plane moved by `step` (3,) metres."""
+    def shift(self, step: np.ndarray) -> Plane:
+        """Return the plane moved by `step` (3,) metres."""
         return Plane(self.normal, self.offset + float(self.normal @ step))
 
 
 class PlaneCache:
-    """The floor and walls of the last cloud of a stream: looked for anew only now and then, or when they are gone."""
+    """The floor and walls of the last cloud of a stream, searched again only now and then or when they are gone."""
 
     def __init__(self) -> None:
-        """Know nothing."""
-        self._kept: list[tuple[Plane, float]] = []
+        """Start empty."""
+        self._planes: list[tuple[Plane, float]] = []
         self._has_floor = False
-        self._left = 0
+        self._clouds_left = 0
 
     def get(self, points: np.ndarray, clearance: float, origin: np.ndarray) -> tuple[Plane | None, list[Plane]] | None:
-        """Return floor and walls moved to where points (N, 3) in metres have them; None when to look for them.
+        """Return floor and walls fitted to points (N, 3) in metres; None when they must be searched again.
 
         Points and planes are relative to `origin` (3,), which may differ from cloud to cloud.
         """
-        self._left -= 1
-        moved = []
-        for kept, share in self._kept:
-            plane = kept.moved(-origin)
+        self._clouds_left -= 1
+        planes = []
+        for cached, share in self._planes:
+            plane = cached.shift(-origin)
             on = np.abs(plane.height(points)) < clearance
-            if self._left < 0 or on.mean() < STILL_THERE * share:
-                self._left = 0
+            if self._clouds_left < 0 or on.mean() < MIN_KEPT_SHARE * share:
+                self._clouds_left = 0
                 return None
-            moved.append(_fitted(plane, points[on])[0])
-        if self._left < 0:
+            planes.append(_fit_plane(plane, points[on])[0])
+        if self._clouds_left < 0:
             return None
-        floor = moved.pop(0) if self._has_floor else None
-        return floor, moved
+        floor = planes.pop(0) if self._has_floor else None
+        return floor, planes
 
     def put(
         self, points: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane], origin: np.ndarray
     ) -> None:
-        """Remember what was found, and how much of the cloud (N, 3) it is."""
+        """Keep the planes that were found, each with the share of the points (N, 3) that lie on it."""
         planes = [*([floor] if floor is not None else []), *walls]
         shares = [float((np.abs(plane.height(points)) < clearance).mean()) for plane in planes]
-        self._kept = [(plane.moved(origin), share) for plane, share in zip(planes, shares, strict=True)]
-        self._has_floor, self._left = floor is not None, REFRESH
+        self._planes = [(plane.shift(origin), share) for plane, share in zip(planes, shares, strict=True)]
+        self._has_floor, self._clouds_left = floor is not None, MAX_CACHED_CLOUDS
 
 
 def find_floor(points: np.ndarray, clearance: float, rng: np.random.Generator) -> Plane | None:
-    """Return the nearly level plane that most points lie on while next to none lie below it, or None.
+    """Return the nearly level plane that most points lie on and next to none lie below, or None.
 
     Args:
-        points: (N, 3) metres, z up, thinned evenly.
+        points: (N, 3) metres, z up, evenly downsampled.
         clearance: half thickness of the plane, metres.
-        rng: source of the trials.
+        rng: source of all randomness.
     """
-    normals, offsets = _trials(points, rng)
+    normals, offsets = _sample_planes(points, rng)
     normals, offsets = normals * np.sign(normals[:, 2:]), offsets * np.sign(normals[:, 2])
-    level = normals[:, 2] > np.cos(MAX_TILT)
+    level = normals[:, 2] > np.cos(MAX_TILT_RAD)
     height = points @ normals[level].T - offsets[level]
     count = (np.abs(height) < clearance).sum(axis=0)
-    count[(height < -2 * clearance).mean(axis=0) > BELOW_FLOOR] = 0
-    return _best(points, normals[level], offsets[level], count, clearance, FLOOR_SIZE)
+    count[(height < -2 * clearance).mean(axis=0) > MAX_BELOW_FLOOR_SHARE] = 0
+    return _fit_best(points, normals[level], offsets[level], count, clearance, MIN_FLOOR_SIZE_M)
 
 
 def find_wall(points: np.ndarray, thickness: float, rng: np.random.Generator) -> Plane | None:
     """Return the plane of any direction that most points (N, 3) lie on, or None when none is larger than a person."""
-    normals, offsets = _trials(points, rng)
+    normals, offsets = _sample_planes(points, rng)
     count = (np.abs(points @ normals.T - offsets) < thickness).sum(axis=0)
-    return _best(points, normals, offsets, count, thickness, WALL_SIZE)
+    return _fit_best(points, normals, offsets, count, thickness, MIN_WALL_SIZE_M)
 
 
-def _trials(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Normals (T, 3) and offsets (T,) of planes through three points each."""
-    first = points[rng.integers(0, len(points), int(np.clip(TRIALS_TIMES_POINTS // len(points), *TRIALS)))]
-    ranks = rng.integers(0, _near_count(points, first)[:, None], (len(first), 2))
-    second, third = points[_near_of_ranks(points, first, ranks).T]
+def _sample_planes(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normals (T, 3) and offsets (T,) of planes through three random points each."""
+    first = points[
+        rng.integers(0, len(points), int(np.clip(TRIALS_TIMES_POINTS // len(points), MIN_TRIALS, MAX_TRIALS)))
+    ]
+    ranks = rng.integers(0, _count_near(points, first)[:, None], (len(first), 2))
+    second, third = points[_find_near(points, first, ranks).T]
     cross = np.cross(second - first, third - first)
     length = np.linalg.norm(cross, axis=1)
     kept = length > 1e-6
@@ -130,27 +132,27 @@ def _trials(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, n
 
 
 @njit(cache=True, nogil=True)
-def _near_count(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
-    """How many (T,) of the points (N, 3) are near each place (T, 3); trials times points is bounded, so no index."""
+def _count_near(points: np.ndarray, centres: np.ndarray) -> np.ndarray:
+    """Count (T,) the points (N, 3) near each centre (T, 3); trials times points is bounded, so without an index."""
     count = np.zeros(len(centres), np.int64)
     for trial in range(len(centres)):
         x, y, z = centres[trial]
         near = 0
         for row in range(len(points)):
-            near += _apart(points, row, x, y, z) <= NEIGHBOURHOOD
+            near += _axis_distance(points, row, x, y, z) <= MAX_TRIAL_DISTANCE_M
         count[trial] = near
     return count
 
 
 @njit(cache=True, nogil=True)
-def _near_of_ranks(points: np.ndarray, centres: np.ndarray, ranks: np.ndarray) -> np.ndarray:
-    """Rows (T, K) of the points that are the ones of the ranks (T, K) among those near each place."""
+def _find_near(points: np.ndarray, centres: np.ndarray, ranks: np.ndarray) -> np.ndarray:
+    """Return the rows (T, K) of the points with the ranks (T, K) among those near each centre (T, 3)."""
     found = np.zeros(ranks.shape, np.int64)
     for trial in range(len(centres)):
         x, y, z = centres[trial]
         near, last = 0, ranks[trial].max()
         for row in range(len(points)):
-            if _apart(points, row, x, y, z) <= NEIGHBOURHOOD:
+            if _axis_distance(points, row, x, y, z) <= MAX_TRIAL_DISTANCE_M:
                 for k in range(ranks.shape[1]):
                     if ranks[trial, k] == near:
                         found[trial, k] = row
@@ -161,12 +163,12 @@ def _near_of_ranks(points: np.ndarray, centres: np.ndarray, ranks: np.ndarray) -
 
 
 @njit(cache=True, inline="always")
-def _apart(points: np.ndarray, row: int, x: float, y: float, z: float) -> float:
-    """The largest of a point's three distances along the axes."""
+def _axis_distance(points: np.ndarray, row: int, x: float, y: float, z: float) -> float:
+    """Return the largest of a point's three distances along the axes."""
     return max(max(abs(points[row, 0] - x), abs(points[row, 1] - y)), abs(points[row, 2] - z))
 
 
-def _best(
+def _fit_best(
     points: np.ndarray,
     normals: np.ndarray,
     offsets: np.ndarray,
@@ -174,26 +176,26 @@ def _best(
     thickness: float,
     size: tuple[float, float],
 ) -> Plane | None:
-    """The trial with most points, fitted to them by least squares, if they cover enough."""
+    """Return the trial with most points, fitted to them by least squares, or None unless it is large and covered."""
     if not len(count) or count.max() < 3:
         return None
     best = int(count.argmax())
     plane = Plane(normals[best], float(offsets[best]))
     for _ in range(2):
         on = points[np.abs(plane.height(points)) < thickness]
-        plane, middle, axes = _fitted(plane, on)
-    # One piece, or the front of a cupboard and a person beside it would be a wall.
+        plane, middle, axes = _fit_plane(plane, on)
+    # One piece, because the front of a cupboard and a person beside it are not a wall.
     along = _largest_piece((on - middle) @ axes[:, :2])
-    # Percentiles, or single points far off would stretch a person's back to a wall.
+    # Percentiles, because single distant points must not stretch a person's back to a wall.
     longer, shorter = np.ptp(np.percentile(along, (5, 95), axis=0), axis=0)
-    covered = CELL**2 * len(np.unique(np.floor(along / CELL), axis=0))
+    covered = CELL_M**2 * len(np.unique(np.floor(along / CELL_M), axis=0))
     wide = longer >= size[0] and shorter >= size[1]
-    return plane if wide and covered >= COVERED * longer * shorter else None
+    return plane if wide and covered >= MIN_COVERED_SHARE * longer * shorter else None
 
 
 def _largest_piece(along: np.ndarray) -> np.ndarray:
-    """The points (M, 2) in metres of the piece with most cells; cells that touch, also at corners, are one piece."""
-    cell = np.floor((along - along.min(axis=0)) / CELL).astype(np.int64)
+    """Return the points (M, 2) in metres of the piece with most cells, which touch, if only at corners."""
+    cell = np.floor((along - along.min(axis=0)) / CELL_M).astype(np.int64)
     filled = np.zeros(cell.max(axis=0) + 1, dtype=bool)
     filled[tuple(cell.T)] = True
     pieces, _ = label(filled, np.ones((3, 3)))
@@ -201,8 +203,8 @@ def _largest_piece(along: np.ndarray) -> np.ndarray:
     return np.asarray(along[pieces[tuple(cell.T)] == sizes.argmax()])
 
 
-def _fitted(plane: Plane, points: np.ndarray) -> tuple[Plane, np.ndarray, np.ndarray]:
-    """The plane of least squares through points (N, 3) that faces as `plane`, their middle, their axes by columns."""
+def _fit_plane(plane: Plane, points: np.ndarray) -> tuple[Plane, np.ndarray, np.ndarray]:
+    """Return the least-squares plane of points (N, 3), oriented as `plane`, their mean, and their axes as columns."""
     middle = points.mean(axis=0)
     axes = np.linalg.svd((points - middle).T @ (points - middle))[0]
     normal = axes[:, 2] * np.sign(axes[:, 2] @ plane.normal)

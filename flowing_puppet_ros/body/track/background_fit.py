@@ -5,62 +5,61 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from typing import NamedTuple
 
-import numpy as np
-
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.errors import InputError
 
-CATCH_UP_SPACING_NS, MAX_KEPT, FEW = 300_000_000, 8, 2
-"""Least time between the clouds kept while a fit is made, how many are, and so few that the body is nearly there."""
+CATCH_UP_SPACING_NS = 300_000_000
+"""Minimum time between the clouds that are kept while a fit is made."""
+MAX_KEPT = 8
+"""Maximum number of clouds that are kept."""
+NEARLY_DONE = 2
+"""So few clouds left that the body is nearly there."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Task:
-    """A person's points (N, 3), normals (N, 3) or None, stamp in nanoseconds, viewpoint (3,) or None, and a seed."""
+class SeededCloud(NamedTuple):
+    """A person's cloud, and the seed of a full fit to it."""
 
-    points: np.ndarray
-    normals: np.ndarray | None
-    stamp: int
-    viewpoint: np.ndarray | None
+    person: PersonCloud
     seed: int
 
 
-class _Stopped(Exception):
-    """Nobody wants the fit any more."""
+class _StoppedError(Exception):
+    """The fit is no longer wanted."""
 
 
 class _FitJob:
-    """One pursuit of one person."""
+    """One background fit of one person."""
 
-    def __init__(self, number: int, tracker: BodyTracker, task: Task) -> None:
+    def __init__(self, number: int, tracker: BodyTracker, first: SeededCloud) -> None:
         self.number = number
         self.tracker = tracker
-        self.first = task
-        self.coming: list[Task] = []
-        self.apart = CATCH_UP_SPACING_NS
+        self.first = first
+        self.backlog: list[SeededCloud] = []
+        self.spacing_ns = CATCH_UP_SPACING_NS
         self.lock = threading.Lock()
         self.stopped = False
         self.done = False
         self.problem: Exception | None = None
 
-    def add(self, task: Task) -> bool:
-        """Keep a few clouds for when the fit is made, and the newest; False when the run is through."""
+    def add(self, cloud: SeededCloud) -> bool:
+        """Keep a few clouds for when the fit is made, and the newest; False when the job is done."""
         with self.lock:
             if self.done:
                 return False
-            before = self.coming[-2] if len(self.coming) > 1 else self.first
-            if self.coming and self.coming[-1].stamp - before.stamp < self.apart:
-                self.coming.pop()
-            self.coming.append(task)
-            if len(self.coming) > MAX_KEPT:
-                # Evenly spread still, so that the longest fit leaves no more to follow.
-                self.coming, self.apart = [*self.coming[1::2], task], 2 * self.apart
+            before = self.backlog[-2] if len(self.backlog) > 1 else self.first
+            if self.backlog and self.backlog[-1].person.stamp - before.person.stamp < self.spacing_ns:
+                self.backlog.pop()
+            self.backlog.append(cloud)
+            if len(self.backlog) > MAX_KEPT:
+                # Still evenly spaced, so that the longest fit leaves no more to catch up with.
+                self.backlog, self.spacing_ns = [*self.backlog[1::2], cloud], 2 * self.spacing_ns
             return True
 
     def run(self) -> None:
-        """Make the fit and catch up; `done` when that is through, or a `problem` has ended it."""
+        """Make the fit and catch up; `done` when that is finished, or a `problem` has ended it."""
         try:
             self._run()
         except Exception as error:
@@ -68,80 +67,77 @@ class _FitJob:
                 self.problem, self.done = error, True
 
     def _run(self) -> None:
-        """Fit the first cloud that can be used, then follow through those that were kept to the newest.
+        """Fit the first cloud that can be used, then track through those that were kept, to the newest.
 
-        A person may have turned or sat down meanwhile, so nothing between is left out. Clouds come while others are
-        followed too; that ends when they are few, or no fewer than before, as where the tracker is the slower one.
+        The person may have turned or sat down meanwhile, so no kept cloud is skipped. New clouds arrive while we catch
+        up. Stop once few are left, or once the backlog no longer shrinks because the tracker is the slower one.
         """
-        fitted, before = self._took(self.first, search=True), MAX_KEPT + 1
+        fitted, before = self._try(self.first, refit=True), MAX_KEPT + 1
         while not self.stopped:
             with self.lock:
-                tasks, self.coming, self.apart = self.coming, [], CATCH_UP_SPACING_NS
-                self.done = not tasks
-            for task in tasks:
+                clouds, self.backlog, self.spacing_ns = self.backlog, [], CATCH_UP_SPACING_NS
+                self.done = not clouds
+            for cloud in clouds:
                 if not self.stopped:
-                    fitted = self._took(task, search=not fitted) or fitted
-            if not tasks or (fitted and (len(tasks) <= FEW or len(tasks) >= before)):
+                    fitted = self._try(cloud, refit=not fitted) or fitted
+            if not clouds or (fitted and (len(clouds) <= NEARLY_DONE or len(clouds) >= before)):
                 break
-            before = len(tasks)
+            before = len(clouds)
         self.done = True
 
-    def _took(self, task: Task, search: bool) -> bool:
-        """Whether this cloud could be used."""
+    def _try(self, cloud: SeededCloud, refit: bool) -> bool:
+        """Fit or track a cloud; return whether it could be used."""
         try:
-            self._take(task, search)
-        except _Stopped:
+            if refit:
+                self.tracker.track_or_refit(cloud.person, cloud.seed, self._check)
+            else:
+                self.tracker.track(cloud.person)
+        except _StoppedError:
             self.stopped = True
         except InputError:
             return False  # the next cloud may do
         return not self.stopped
 
-    def _take(self, task: Task, search: bool) -> None:
-        if search:
-            self.tracker.track_or_refit(task.points, task.normals, task.stamp, task.viewpoint, task.seed, self._check)
-        else:
-            self.tracker.track(task.points, task.normals, task.stamp, task.viewpoint)
-
     def _check(self, _: float) -> None:
         if self.stopped:
-            raise _Stopped
+            raise _StoppedError
 
 
 class BackgroundFit:
-    """At most one run at a time."""
+    """Runs at most one fit at a time."""
 
     def __init__(self) -> None:
         """Start with none."""
-        self._run: _FitJob | None = None
+        self._job: _FitJob | None = None
 
     @property
     def busy(self) -> bool:
-        """Whether a run goes on, or its result was not taken yet."""
-        return self._run is not None
+        """Whether a fit runs, or its result was not taken yet."""
+        return self._job is not None
 
-    def start(self, number: int, tracker: BodyTracker, task: Task, background: Executor | None) -> None:
-        """Fit the person `number` by `tracker`, which belongs to the run from now on, on `background` or in line."""
-        self._run = _FitJob(number, tracker, task)
-        if background is None:
-            self._run.run()
+    def start(self, number: int, tracker: BodyTracker, first: SeededCloud, executor: Executor | None) -> None:
+        """Fit the person `number` with `tracker`, which belongs to the job from now on, on `executor` or in line."""
+        self._job = _FitJob(number, tracker, first)
+        if executor is None:
+            self._job.run()
         else:
-            background.submit(self._run.run)
+            executor.submit(self._job.run)
 
-    def add(self, number: int, task: Task) -> bool:
-        """Hand the run its person's next cloud; False when it is not about this person."""
-        return self._run is not None and self._run.number == number and self._run.add(task)
+    def add(self, number: int, cloud: SeededCloud) -> bool:
+        """Hand the job its person's next cloud; return False when it is not about this person."""
+        return self._job is not None and self._job.number == number and self._job.add(cloud)
 
-    def finished(self) -> tuple[int, BodyTracker] | None:
-        """Return the person and the tracker of a run that is through, once; raises what went wrong in it."""
-        if self._run is None or not self._run.done:
+    def take_finished(self) -> tuple[int, BodyTracker] | None:
+        """Return the person and the tracker of a finished job, once; raise what went wrong in it."""
+        if self._job is None or not self._job.done:
             return None
-        run, self._run = self._run, None
-        if run.problem is not None:
-            raise run.problem
-        return run.number, run.tracker
+        job, self._job = self._job, None
+        if job.problem is not None:
+            raise job.problem
+        return job.number, job.tracker
 
     def stop(self) -> None:
-        """Give up the run; it ends at its next step."""
-        if self._run is not None:
-            self._run.stopped = True
-            self._run = None
+        """Give up the job; it ends at its next step."""
+        if self._job is not None:
+            self._job.stopped = True
+            self._job = None

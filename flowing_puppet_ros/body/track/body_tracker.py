@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One person through a stream of clouds: from the last bodies a few Gauss-Newton steps, a search only when lost.
+"""Track one person through a stream of clouds: a few Gauss-Newton steps per cloud, a full fit only when lost.
 
-Motion goes on at the last velocity, shape is learned over the frames, and the two-way distance between body and cloud
-tells when the track is lost.
+The motion is extrapolated at the last velocity, the shape is learned over the clouds, and the two-way distance between
+body and cloud tells when the track is lost.
 """
 
 from __future__ import annotations
@@ -10,40 +10,61 @@ from __future__ import annotations
 from collections import Counter
 from copy import copy
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
-from flowing_puppet_ros.blas import one_blas_thread
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, check_cloud
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.threads import one_blas_thread
 
-NARROW, WIDE = (0.10, 0.03), (0.25, 0.03)  # first and last kernel width of a usual step and of a lost body's, metres
+# First and last kernel width in metres: of a usual step, and of a step from which a lost body may come back.
+NARROW_WIDTHS_M, WIDE_WIDTHS_M = (0.10, 0.03), (0.25, 0.03)
 WIDE_STEPS = 20
-BELIEF = 1e-6  # weight in `RefineWeights.shape` that each frame adds to the shape of the frames before
-MOST_FRAMES = 30  # that are remembered of a shape, or a first mistake would stay
-HIDDEN = 0.4  # share of what is usually seen of a person below which somebody stands before them
-HALF_LIFE = 2.0  # seconds in which what is usual falls to half, where less is seen
-MOST_STRETCH = 2.0  # frames' steps that a motion may go on unseen
+SHAPE_WEIGHT_PER_FRAME = 1e-6  # that each frame adds to `RefineWeights.shape` for the shape of the frames before
+MAX_SHAPE_FRAMES = 30  # that count for the shape: with more, a first mistake would stay
+MIN_VISIBLE = 0.4  # visible fraction, relative to normal, below which the person counts as occluded
+VISIBLE_HALF_LIFE_S = 2.0  # in which the normal visible surface falls to half where less is seen
+MAX_STRETCH = 2.0  # frames by which a motion is extrapolated at most
 
 
 @dataclass(frozen=True)
 class BodyTrackerSettings(Settings):
     """Settings of `BodyTracker`."""
 
-    track_points: int = setting(5000, "points that a tracked cloud from all sides is thinned to", low=200, high=200000)
-    track_steps: int = setting(5, "Gauss-Newton steps a frame", low=1, high=100)
-    track_lost_ratio: float = setting(1.3, "two-way distance, against the best since the last search, of a lost track",
-                                      low=1.0, high=10.0)  # fmt: skip
-    track_lost_distance: float = setting(0.001, "distance that must be added to that", unit="m", low=0.0, high=1.0)
-    track_longest_gap: float = setting(0.5, "gap between clouds after which a motion does not go on", unit="s",
-                                       low=0.01, high=60.0)  # fmt: skip
+    max_points: int = setting(
+        5000,
+        "points that a tracked cloud from all sides is downsampled to",
+        low=200,
+        high=200000,
+        advanced=True,
+    )
+    gauss_newton_steps: int = setting(5, "Gauss-Newton steps per cloud", low=1, high=100, advanced=True)
+    lost_ratio: float = setting(
+        1.3,
+        "two-way distance, relative to the best since the last search, beyond which the track is lost",
+        low=1.0,
+        high=10.0,
+        advanced=True,
+    )
+    lost_distance: float = setting(0.001, "distance added to that bound", unit="m", low=0.0, high=1.0, advanced=True)
+    max_time_gap: float = setting(
+        0.5,
+        "time between clouds beyond which the motion is not extrapolated",
+        unit="s",
+        low=0.01,
+        high=60.0,
+        advanced=True,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,65 +73,78 @@ class _Observation:
 
     fit: BodyFit
     stamp: int
-    middle: np.ndarray
+    middle: F64
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _TrackState:
+    """What is known of the person after a cloud.
+
+    `best` two-way distance in metres since the last full fit, `frames` whose shape was learned, `visible` surface that
+    is normally seen (points times squared metres of distance), `lost`: the body is not where the person is.
+    """
+
+    before: _Observation | None = None
+    last: _Observation | None = None
+    best: float = np.inf
+    frames: int = 0
+    visible: float = 0.0
+    lost: bool = True
+
+
+class _Prepared(NamedTuple):
+    """A cloud that is ready to be tracked to; `oriented`: its normals were turned outwards by the predicted body."""
+
+    cloud: Cloud
+    stamp: int
+    occluded: bool
+    oriented: bool
 
 
 class BodyTracker:
-    """Follows one person; `counters` counts frames by how they were fitted: tracked, widened, searched."""
+    """Tracks one person; `counters` counts clouds by how they were fitted: tracked, widened, searched, hidden."""
 
     def __init__(self, fitter: BodyFitter, settings: BodyTrackerSettings) -> None:
         """Track with the model of `fitter`, which also makes the full fits."""
         self._fitter = fitter
         self._settings = settings
-        self._none = JointTargets.none(fitter.model)
+        self._no_joints = JointTargets.none(fitter.model)
         self.counters: Counter[str] = Counter()
         self._quick = False
         self.reset()
 
     def reset(self) -> None:
         """Forget the person."""
-        self._before: _Observation | None = None
-        self._last: _Observation | None = None
-        self._best = np.inf
-        self._frames = 0
-        self._turned = False
-        self._usual = 0.0
-        self._hidden = False
-        self.lost = True
+        self._state = _TrackState()
 
     @property
     def last(self) -> BodyFit | None:
         """The body in the last cloud, None before the first."""
-        return None if self._last is None else self._last.fit
+        return None if self._state.last is None else self._state.last.fit
+
+    @property
+    def lost(self) -> bool:
+        """Whether the last body is not where the person is."""
+        return self._state.lost
 
     def fork(self, quick: bool) -> BodyTracker:
-        """A tracker that knows the same person so far and goes its own way from here; `quick`: so are its searches."""
+        """Return a tracker that knows the same person and goes its own way from here; `quick`: in its full fits too."""
         made = copy(self)
         made._quick = quick
         made.counters = self.counters.copy()
         return made
 
     def accept(self) -> None:
-        """Take the last body for the best there is: a search has found none that is closer."""
-        if self._last is not None:
-            self._best, self.lost = self._last.fit.two_way_distance, False
+        """Take the last body for the best there is: a full fit has found none that is closer."""
+        if self._state.last is not None:
+            self._state = replace(self._state, best=self._state.last.fit.two_way_distance, lost=False)
 
-    def track_or_refit(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray | None,
-        stamp: int,
-        viewpoint: np.ndarray | None = None,
-        seed: int | None = None,
-        progress: Progress | None = None,
-    ) -> BodyFit:
-        """Fit the next cloud of the person; a full fit when there is no track or it is lost.
+    def track_or_refit(self, person: PersonCloud, seed: int | None = None, progress: Progress | None = None) -> BodyFit:
+        """Fit the next cloud of the person, by a full fit when there is no track or it is lost.
 
         Args:
-            points: (N, 3) metres, z up, in one frame through the stream.
-            normals: (N, 3) outward unit normals, or None to estimate them.
-            stamp: nanoseconds; one that is not later than the last starts a new track.
-            viewpoint: (3,) where the sensor stood when the cloud shows one side only.
+            person: its cloud, in one frame through the stream; a stamp that is not later than the last starts a new
+                track.
             seed: of a full fit; overrides the fitter's.
             progress: of a full fit, see `BodyFitter.fit`.
 
@@ -118,136 +152,148 @@ class BodyTracker:
             InputError: when the cloud cannot be the surface of a person; the track goes on with the next one.
         """
         with one_blas_thread():
-            cloud = self._next_cloud(points, normals, stamp, viewpoint)
-            fit = self._followed(cloud, stamp)
-            if fit is None or self.lost:
-                fit = self._searched(fit, cloud, seed, progress)
-                self.lost = False
-        return self._record(fit, cloud, stamp)
+            prepared = self._prepare(person)
+            fit, lost = self._track(prepared)
+            if fit is None or lost:
+                fit, lost = self._refit(fit, prepared, seed, progress), False
+        return self._record(fit, lost, prepared)
 
-    def track(
-        self, points: np.ndarray, normals: np.ndarray | None, stamp: int, viewpoint: np.ndarray | None = None
-    ) -> BodyFit | None:
-        """Fit the next cloud as `step` does, but never by a full fit: None when there is no body to start from.
+    def track(self, person: PersonCloud) -> BodyFit | None:
+        """Fit the next cloud like `track_or_refit`, but never by a full fit: None when there is no body to start from.
 
         `lost` tells whether the body is not where the person is.
         """
-        if self._last is None:
-            # Normals take long, and nobody would use them.
-            self._fitter.person_points(*check_cloud(points, normals), viewpoint)
+        if self._state.last is None:
+            # Normals take long, and nothing would use them.
+            self._fitter.prepare_points(*check_cloud(person.points, person.normals), person.viewpoint)
             return None
         with one_blas_thread():
-            cloud = self._next_cloud(points, normals, stamp, viewpoint)
-            fit = self._followed(cloud, stamp)
-        return None if fit is None else self._record(fit, cloud, stamp)
+            prepared = self._prepare(person)
+            fit, lost = self._track(prepared)
+        if fit is None:
+            self._state = replace(self._state, lost=lost)
+            return None
+        return self._record(fit, lost, prepared)
 
-    def _next_cloud(
-        self, points: np.ndarray, normals: np.ndarray | None, stamp: int, viewpoint: np.ndarray | None
-    ) -> Cloud:
-        points, normals = check_cloud(points, normals)
+    def _prepare(self, person: PersonCloud) -> _Prepared:
+        points, normals = check_cloud(person.points, person.normals)
+        stamp, viewpoint = person.stamp, person.viewpoint
         if viewpoint is None:
-            points, normals = downsample(points, normals, self._settings.track_points)
-        if self._last is not None and stamp <= self._last.stamp:
+            points, normals = downsample(points, normals, self._settings.max_points)
+        if self._state.last is not None and stamp <= self._state.last.stamp:
             self.reset()
-        self._hidden = viewpoint is not None and self._is_hidden(points, stamp, viewpoint)
-        self._turned = normals is None and viewpoint is None and self._last is not None
-        if self._turned and self._last is not None:
-            vertices = self._fitter.model.vertices(self._predicted(self._last, points.mean(axis=0), stamp))
+        occluded = viewpoint is not None and self._update_visible(points, stamp, viewpoint)
+        last = self._state.last
+        oriented = normals is None and viewpoint is None and last is not None
+        if oriented and last is not None:
+            vertices = self._fitter.model.vertices(self._predict(last, points.mean(axis=0), stamp))
             normals = estimate_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
-        return self._fitter.cloud(points, normals, viewpoint)
+        return _Prepared(self._fitter.prepare_cloud(points, normals, viewpoint), stamp, occluded, oriented)
 
-    def _followed(self, cloud: Cloud, stamp: int) -> BodyFit | None:
-        """The last body after a few steps on the new cloud, and whether it is lost.
+    def _track(self, prepared: _Prepared) -> tuple[BodyFit | None, bool]:
+        """Return the last body after a few steps on the new cloud, and whether it is lost.
 
-        The little that is seen of a person behind somebody would bend the body: it goes on as it is.
+        The little that is seen of an occluded person would bend the body: it moves on in the pose that it has.
         """
-        if self._hidden and self._last is not None:
+        last, cloud = self._state.last, prepared.cloud
+        if prepared.occluded and last is not None:
             self.counters["hidden"] += 1
-            self.lost = False
-            return self._fitter.result(self._carried(self._last, stamp), cloud)
-        middle = cloud.points.mean(axis=0)
-        fit = None if self._last is None else self._tracked(self._predicted(self._last, middle, stamp), cloud)
-        self.lost = fit is None or self._is_lost(fit)
+            return self._fitter.assess(self._translate(last, prepared.stamp), cloud), False
+        if last is None:
+            return None, True
+        fit = self._step(self._predict(last, cloud.points.mean(axis=0), prepared.stamp), cloud)
+        return fit, self._is_lost(fit)
+
+    def _record(self, fit: BodyFit, lost: bool, prepared: _Prepared) -> BodyFit:
+        state = self._state
+        seen = _Observation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
+        best = state.best if lost or prepared.occluded else min(state.best, fit.two_way_distance)
+        frames = state.frames + (not prepared.occluded)
+        self._state = replace(state, before=state.last, last=seen, best=best, frames=frames, lost=lost)
         return fit
 
-    def _record(self, fit: BodyFit, cloud: Cloud, stamp: int) -> BodyFit:
-        self._before, self._last = self._last, _Observation(fit, stamp, cloud.points.mean(axis=0))
-        if not self.lost and not self._hidden:
-            self._best = min(self._best, fit.two_way_distance)
-        self._frames += not self._hidden
-        return fit
-
-    def _tracked(self, start: BodyState, cloud: Cloud) -> BodyFit:
-        """A few steps from where the person should be; when they do not get there, more steps that look farther."""
-        fit = self._refined(start, cloud, NARROW, self._settings.track_steps)
+    def _step(self, start: BodyState, cloud: Cloud) -> BodyFit:
+        """Take a few steps from where the person should be; if they fail, more steps with a wider kernel."""
+        fit = self._refine(start, cloud, NARROW_WIDTHS_M, self._settings.gauss_newton_steps)
         if not self._is_lost(fit):
             self.counters["tracked"] += 1
             return fit
         self.counters["widened"] += 1
-        wide = self._refined(start, cloud, WIDE, WIDE_STEPS)
+        wide = self._refine(start, cloud, WIDE_WIDTHS_M, WIDE_STEPS)
         return min(fit, wide, key=lambda found: found.two_way_distance)
 
-    def _searched(self, tracked: BodyFit | None, cloud: Cloud, seed: int | None, progress: Progress | None) -> BodyFit:
-        """The full fit, unless the tracked body is closer to the cloud; its distance is the new measure of lost."""
+    def _refit(
+        self, tracked: BodyFit | None, prepared: _Prepared, seed: int | None, progress: Progress | None
+    ) -> BodyFit:
+        """Return the full fit, unless the tracked body is closer to the cloud; its distance is the new best."""
         self.counters["searched"] += 1
+        cloud = prepared.cloud
         # Normals that were turned by a body that is lost would mislead the search.
-        normals = None if self._turned else cloud.normals
-        # With the model's surface: one of its own would come and go with the searches.
+        normals = None if prepared.oriented else cloud.normals
+        # On the model's surface: vertices refined beyond it would come and go with the full fits.
         fit = self._fitter.fit(
-            cloud.points, normals, viewpoint=cloud.viewpoint, seed=seed, progress=progress, own_surface=False,
+            cloud.points,
+            normals,
+            viewpoint=cloud.viewpoint,
+            seed=seed,
+            progress=progress,
+            nonrigid=False,
             quick=self._quick,
-        )  # fmt: skip
+        )
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
             fit = tracked
         else:
             self.reset()
-        self._best = fit.two_way_distance
+        self._state = replace(self._state, best=fit.two_way_distance)
         return fit
 
-    def _predicted(self, last: _Observation, middle: np.ndarray, stamp: int) -> BodyState:
-        """The last body, moved on by its last motion in proportion to the time.
+    def _predict(self, last: _Observation, middle: F64, stamp: int) -> BodyState:
+        """Return the last body, moved on by its last motion in proportion to the time.
 
-        After a long gap, which a search leaves in a live stream too, it moves as the middle of the cloud did.
+        After a long gap, which a full fit leaves in a live stream too, it moves as the middle of the cloud did.
         """
-        state = last.fit.state
-        if stamp - last.stamp > 1e9 * self._settings.track_longest_gap:
+        state, before = last.fit.state, self._state.before
+        if stamp - last.stamp > 1e9 * self._settings.max_time_gap:
             return replace(state, center=state.center + middle - last.middle)
-        if self._before is None:
+        if before is None:
             return state
-        share, before = self._stretch(self._before, last, stamp), self._before.fit.state
-        turn = rotation.log(np.swapaxes(before.rotation, -1, -2) @ state.rotation)
+        share = _stretch(before, last, stamp)
+        turn = rotation.log(np.swapaxes(before.fit.state.rotation, -1, -2) @ state.rotation)
         return replace(
             state,
-            center=state.center + share * (state.center - before.center),
+            center=state.center + share * (state.center - before.fit.state.center),
             rotation=state.rotation @ rotation.exp(share * turn),
         )
 
-    def _carried(self, last: _Observation, stamp: int) -> BodyState:
-        """The last body, moved on as its torso moved, in the pose that it has."""
-        state = last.fit.state
-        if self._before is None:
+    def _translate(self, last: _Observation, stamp: int) -> BodyState:
+        """Return the last body, moved on as its torso moved, in the pose that it has."""
+        state, before = last.fit.state, self._state.before
+        if before is None:
             return state
-        moved = state.center[0] - self._before.fit.state.center[0]
-        return replace(state, center=state.center + self._stretch(self._before, last, stamp) * moved)
+        moved = state.center[0] - before.fit.state.center[0]
+        return replace(state, center=state.center + _stretch(before, last, stamp) * moved)
 
-    @staticmethod
-    def _stretch(before: _Observation, last: _Observation, stamp: int) -> float:
-        return min((stamp - last.stamp) / (last.stamp - before.stamp), MOST_STRETCH)
-
-    def _is_hidden(self, points: np.ndarray, stamp: int, viewpoint: np.ndarray) -> bool:
-        """Whether much less of the person is seen from one side than usual; what is usual follows what is seen."""
+    def _update_visible(self, points: F64, stamp: int, viewpoint: F64) -> bool:
+        """Return whether much less of the person is seen than normally; what is normal follows what is seen."""
+        state = self._state
         seen = len(points) * float(((points - viewpoint) ** 2).sum(axis=1).mean())
-        passed = 0.0 if self._last is None else 1e-9 * (stamp - self._last.stamp)
-        self._usual = max(seen, self._usual * 0.5 ** (passed / HALF_LIFE))
-        return seen < HIDDEN * self._usual
+        passed = 0.0 if state.last is None else 1e-9 * (stamp - state.last.stamp)
+        visible = max(seen, state.visible * 0.5 ** (passed / VISIBLE_HALF_LIFE_S))
+        self._state = replace(state, visible=visible)
+        return seen < MIN_VISIBLE * visible
 
-    def _refined(self, start: BodyState, cloud: Cloud, widths: tuple[float, float], steps: int) -> BodyFit:
+    def _refine(self, start: BodyState, cloud: Cloud, widths: tuple[float, float], steps: int) -> BodyFit:
         weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps)
-        learned = BELIEF * min(self._frames, MOST_FRAMES)
+        learned = SHAPE_WEIGHT_PER_FRAME * min(self._state.frames, MAX_SHAPE_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
-        # What turns to the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
+        # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
         facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint)
-        return self._fitter.result(self._fitter.gauss_newton.run(start, facing, self._none, weights), cloud)
+        return self._fitter.assess(self._fitter.gauss_newton.run(start, facing, self._no_joints, weights), cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
-        return fit.two_way_distance > self._settings.track_lost_ratio * self._best + self._settings.track_lost_distance
+        return fit.two_way_distance > self._settings.lost_ratio * self._state.best + self._settings.lost_distance
+
+
+def _stretch(before: _Observation, last: _Observation, stamp: int) -> float:
+    """Return by how many frames the last motion is extrapolated."""
+    return min((stamp - last.stamp) / (last.stamp - before.stamp), MAX_STRETCH)

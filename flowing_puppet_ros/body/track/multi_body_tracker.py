@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several people through a stream of clouds: each keeps an id while seen and a while beyond, and is tracked.
+"""Track several people through a stream of clouds: each keeps an id while seen and a while beyond.
 
-A full fit takes seconds, a tracked step a fraction of one. So new people, and people who were lost, wait in line for a
-full fit, one at a time, while everybody else is tracked on.
+A full fit takes seconds, a tracked step a fraction of one. So new people, and people who were lost, queue for a full
+fit, one at a time, while everybody else is tracked on.
 """
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
@@ -15,54 +14,60 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
-from flowing_puppet_ros.body.segmentation.people import PersonCloud
-from flowing_puppet_ros.body.track.background_fit import BackgroundFit, Task
+from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCloud
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
-from flowing_puppet_ros.parallel import parallel_map, usable_threads
+from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import setting
+from flowing_puppet_ros.threads import parallel_map, usable_threads
 
-NEAR = 0.6  # metres by which the middle of a person's cloud may miss where it is expected
-SPEED, FARTHEST = 2.0, 2.5  # metres a second by which that grows while unseen, and metres up to which
-NEWCOMER = 0.6  # metres that a distance counts more for who has no body yet, as what splits off from somebody
-RETRY_NS = 5_000_000_000  # a body that is not reliable is searched again so long after the last search
-OWNED = 0.3  # what a distance counts where the person's body lies in the cloud
-GAIN = 0.5  # share of a new velocity that is taken
-TRUSTED_NS = 1_000_000_000  # a velocity from clouds farther apart than this is none
-BODY_POINTS = 8  # every so many vertices stand for a body
+MATCH_DISTANCE_M = 0.6  # between the middle of a person's cloud and where it is expected
+MATCH_SPEED_M_PER_S, MAX_MATCH_DISTANCE_M = 2.0, 2.5  # by which that grows while unseen, and up to which
+NO_BODY_PENALTY_M = 0.6  # for tracks without a body, which are often fragments of a neighbour
+OWNED_FACTOR = 0.3  # of the distance where the track's body lies in the cloud
+VELOCITY_GAIN = 0.5  # fraction of a new velocity that is taken
+MAX_VELOCITY_GAP_NS = 1_000_000_000  # between clouds that give a velocity
+REFIT_INTERVAL_NS = 5_000_000_000  # from one full fit of an unreliable body to the next
+BODY_STRIDE = 8  # every so many vertices stand for a body
 
 
 @dataclass(frozen=True)
 class MultiBodyTrackerSettings(BodyTrackerSettings):
-    """Settings of `Crowd`."""
+    """Settings of `MultiBodyTracker`."""
 
     hold: float = setting(2.0, "time for which a person out of sight keeps the id", unit="s", low=0.0, high=60.0)
 
 
 @dataclass(slots=True, eq=False)
 class _BodyTrack:
-    """A person: where the middle (3,) of their points was and how it moves, m/s; what tracks them; the last search."""
+    """One person.
+
+    The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, the number of full fits
+    and the stamp of the last.
+    """
 
     id: str
     number: int
-    middle: np.ndarray
+    middle: F64
     stamp: int
     tracker: BodyTracker
-    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    searches: int = 0
-    searched: int = 0
+    velocity: F64 = field(default_factory=lambda: np.zeros(3))
+    fits: int = 0
+    fitted: int = 0
 
-    def expected(self, stamp: int) -> np.ndarray:
-        """Where the middle should be at a later time, nanoseconds."""
+    def predict_middle(self, stamp: int) -> F64:
+        """Return where the middle should be at a later time in nanoseconds."""
         return np.asarray(self.middle + self.velocity * 1e-9 * (stamp - self.stamp))
 
-    def seen(self, middle: np.ndarray, stamp: int) -> None:
+    def update(self, middle: F64, stamp: int) -> None:
         """Take where the person is now."""
-        if 0 < stamp - self.stamp <= TRUSTED_NS:
+        if 0 < stamp - self.stamp <= MAX_VELOCITY_GAP_NS:
             measured = (middle - self.middle) / (1e-9 * (stamp - self.stamp))
-            self.velocity = self.velocity + GAIN * (measured - self.velocity)
+            self.velocity = self.velocity + VELOCITY_GAIN * (measured - self.velocity)
         else:
             self.velocity = np.zeros(3)
         self.middle, self.stamp = middle, stamp
@@ -71,61 +76,57 @@ class _BodyTrack:
 class MultiBodyTracker:
     """Tracks everybody in the clouds of one sensor.
 
-    `counters` counts tracked people, searches and lost people, `errors` collects why people could not be used.
-
     In line (the default) the full fit is made in the cloud that needs it, at most one a cloud: the same clouds give
-    the same bodies. On the executor `background` it runs beside the clouds, and catches up with those that came in the
-    meantime before its body is shown: what a live node needs. Which cloud shows it first depends on the time it took.
+    the same bodies. On an executor it runs beside the clouds, and catches up with those that came in the meantime
+    before its body is shown: what a live node needs. Which cloud shows it first depends on the time it took.
     """
 
-    def __init__(self, fitter: BodyFitter, settings: MultiBodyTrackerSettings, seed: int) -> None:
-        """Fit with `fitter`; the first ids begin with b, and with more letters for seeds above 0."""
+    def __init__(
+        self, fitter: BodyFitter, settings: MultiBodyTrackerSettings, seed: int, report: Report | None = None
+    ) -> None:
+        """Fit with `fitter`; the first ids begin with b, and with more letters for seeds above 0.
+
+        `report` counts tracked people, full fits and lost people, and is told of clouds that cannot be used.
+        """
         self._fitter = fitter
         self._settings = settings
+        self._report = report or Report()
         self._threads = usable_threads(fitter.settings.threads)
         self._prefix = "b" + (letters_of_seed(seed) if seed else "")
         self._started = 0
-        self._members: list[_BodyTrack] = []
-        self._pursuit = BackgroundFit()
-        self.counters: Counter[str] = Counter()
-        self.errors: list[InputError] = []
+        self._tracks: list[_BodyTrack] = []
+        self._background_fit = BackgroundFit()
         self._stamp: int | None = None
 
     def reset(self) -> None:
         """Forget everybody; ids go on, so that none is used twice in a run."""
-        self._members = []
-        self._pursuit.stop()
+        self._tracks = []
+        self._background_fit.stop()
         self._stamp = None
 
     @property
     def occluded_ids(self) -> list[str]:
         """Ids of the people who have a body and were not seen in the last cloud."""
-        return [member.id for member in self._members if member.tracker.last and member.stamp != self._stamp]
+        return [track.id for track in self._tracks if track.tracker.last and track.stamp != self._stamp]
 
-    def bodies(self, stamp: int) -> list[np.ndarray]:
-        """Points (K, 3) on the body of every person, where it should be at a time in nanoseconds; none without one."""
+    def predict_bodies(self, stamp: int) -> list[F64]:
+        """Return points (K, 3) m on the body of each track, where it should be at a time in ns; none without a body."""
         found = []
-        for member in self._members:
-            moved, fit = member.expected(stamp) - member.middle, member.tracker.last
-            found.append(fit.vertices[::BODY_POINTS] + moved if fit else np.empty((0, 3)))
+        for track in self._tracks:
+            moved, fit = track.predict_middle(stamp) - track.middle, track.tracker.last
+            found.append(fit.vertices[::BODY_STRIDE] + moved if fit else np.empty((0, 3)))
         return found
 
     def step(
-        self,
-        people: Sequence[PersonCloud],
-        stamp: int,
-        viewpoint: np.ndarray | None,
-        seed: int,
-        background: Executor | None = None,
+        self, people: Sequence[PersonCloud], stamp: int, seed: int, executor: Executor | None = None
     ) -> list[tuple[str, BodyFit]]:
         """Track everybody to the people of the next cloud.
 
         Args:
-            people: as `extract_people` finds them, `owner` by the order of `bodies(stamp)`.
-            stamp: nanoseconds; one before the last starts anew.
-            viewpoint: (3,) where the sensor stood when the cloud shows one side only.
+            people: as `segment_people` finds them, `owner` by the order of `predict_bodies(stamp)`.
+            stamp: of the cloud in nanoseconds; one before the last restarts the tracker.
             seed: of what is random in this cloud.
-            background: where full fits run; None: in line.
+            executor: where full fits run; None: in line.
 
         Returns:
             (id, fit) of everybody who is seen and has a body.
@@ -134,127 +135,116 @@ class MultiBodyTracker:
             self.reset()
         self._stamp = stamp
         self._adopt_finished_fit()
-        seen = self._associated(people, stamp)
-        tasks = [
-            Task(person.points, person.normals, stamp, viewpoint, _person_seed(seed, member.number))
-            for member, person in seen
-        ]
-        followed = parallel_map(
-            _follow, [(m.tracker, task) for (m, _), task in zip(seen, tasks, strict=True)], self._threads
-        )
+        matched = self._associate(people, stamp)
+        fitted = parallel_map(_track, [(track.tracker, person) for track, person in matched], self._threads)
         fits: list[tuple[str, BodyFit]] = []
-        wanting: list[tuple[_BodyTrack, Task]] = []
-        for (member, _), task, fit in zip(seen, tasks, followed, strict=True):
+        waiting: list[tuple[_BodyTrack, SeededCloud]] = []
+        for (track, person), fit in zip(matched, fitted, strict=True):
             if isinstance(fit, InputError):
-                self.errors.append(fit)
+                self._report.count_unusable(fit)
                 continue
             if fit is not None:
-                fits.append((member.id, fit))
-            doubtful = fit is not None and not fit.reliable and stamp - member.searched >= RETRY_NS
-            if not self._pursuit.add(member.number, task) and (member.tracker.lost or doubtful):
-                wanting.append((member, task))
-        self.counters["tracked people"] += len(fits)
-        self._forget(stamp)
-        fits += self._search(wanting, background)
+                fits.append((track.id, fit))
+            unreliable = fit is not None and not fit.reliable and stamp - track.fitted >= REFIT_INTERVAL_NS
+            cloud = SeededCloud(person, _person_seed(seed, track.number))
+            if not self._background_fit.add(track.number, cloud) and (track.tracker.lost or unreliable):
+                waiting.append((track, cloud))
+        self._report.counters["tracked people"] += len(fits)
+        self._drop_lost(stamp)
+        fits += self._start_fit(waiting, executor)
         return sorted(fits, key=lambda pair: (len(pair[0]), pair[0]))
 
-    def step_one(
-        self,
-        person: PersonCloud,
-        stamp: int,
-        viewpoint: np.ndarray | None,
-        seed: int,
-        background: Executor | None = None,
-    ) -> list[tuple[str, BodyFit]]:
-        """As `step`, for clouds that all show one and the same person, wherever they are."""
-        for member in self._members:
-            member.middle, member.velocity = np.median(person.points, axis=0), np.zeros(3)
-        return self.step([person], stamp, viewpoint, seed, background)
+    def step_one(self, person: PersonCloud, seed: int, executor: Executor | None = None) -> list[tuple[str, BodyFit]]:
+        """Track like `step` in clouds that all show one and the same person, wherever they are."""
+        for track in self._tracks:
+            track.middle, track.velocity = person.middle, np.zeros(3)
+        return self.step([person], person.stamp, seed, executor)
 
     def associate_only(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[str, PersonCloud]]:
-        """Say who the people of the next cloud are, without tracking their bodies."""
+        """Return who the people of the next cloud are, without tracking their bodies."""
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
         self._stamp = stamp
-        named = [(member.id, person) for member, person in self._associated(people, stamp)]
-        self._forget(stamp)
+        named = [(track.id, person) for track, person in self._associate(people, stamp)]
+        self._drop_lost(stamp)
         return named
 
-    def _search(self, wanting: list[tuple[_BodyTrack, Task]], background: Executor | None) -> list[tuple[str, BodyFit]]:
+    def _start_fit(
+        self, waiting: list[tuple[_BodyTrack, SeededCloud]], executor: Executor | None
+    ) -> list[tuple[str, BodyFit]]:
         """Start a full fit of the person who needs it most; in line it is finished when this returns."""
-        if not wanting or self._pursuit.busy:
+        if not waiting or self._background_fit.busy:
             return []
-        # Who has no body comes first, then who was searched least, then who has waited longest.
-        member, task = min(
-            wanting, key=lambda pair: (pair[0].tracker.last is not None, pair[0].searches, pair[0].number)
-        )
-        member.searches, member.searched = member.searches + 1, task.stamp
-        self.counters["searches"] += 1
-        known = member.tracker.last
-        # Live, a body that may have a limb wrong is shown and followed while a better one is searched.
-        quick = background is not None and known is None
-        self._pursuit.start(member.number, member.tracker.fork(quick), task, background)
+        # Who has no body comes first, then who was fitted least often, then who has waited longest.
+        track, cloud = min(waiting, key=lambda pair: (pair[0].tracker.last is not None, pair[0].fits, pair[0].number))
+        track.fits, track.fitted = track.fits + 1, cloud.person.stamp
+        self._report.counters["searches"] += 1
+        known = track.tracker.last
+        # Live, a body that may have a limb wrong is shown and tracked while a better one is searched.
+        quick = executor is not None and known is None
+        self._background_fit.start(track.number, track.tracker.fork(quick), cloud, executor)
         self._adopt_finished_fit()
-        fit = member.tracker.last
-        return [(member.id, fit)] if known is None and fit is not None else []
+        fit = track.tracker.last
+        return [(track.id, fit)] if known is None and fit is not None else []
 
     def _adopt_finished_fit(self) -> None:
-        """Take over the tracker that a full fit has led to, unless the person's own is closer by now."""
-        done = self._pursuit.finished()
-        if done is None:
+        """Take over the tracker that a full fit has led to, unless the track's own is closer by now."""
+        finished = self._background_fit.take_finished()
+        if finished is None:
             return
-        number, tracker = done
-        for member in self._members:
-            if member.number == number and tracker.last is not None:
-                own = member.tracker.last
+        number, tracker = finished
+        for track in self._tracks:
+            if track.number == number and tracker.last is not None:
+                own = track.tracker.last
                 if own is None or tracker.last.two_way_distance < own.two_way_distance:
-                    member.tracker = tracker
+                    track.tracker = tracker
                 else:
-                    member.tracker.accept()
+                    track.tracker.accept()
 
-    def _associated(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[_BodyTrack, PersonCloud]]:
-        """Who each of the people is: the least summed distance from where they should be; the rest are new."""
-        middles = [np.median(person.points, axis=0) for person in people]
-        cost = np.full((len(self._members), len(people)), np.inf)
-        for row, member in enumerate(self._members):
-            limit = min(NEAR + SPEED * 1e-9 * (stamp - member.stamp), FARTHEST)
+    def _associate(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[_BodyTrack, PersonCloud]]:
+        """Match the people to the tracks at minimum total cost; the others start tracks."""
+        middles = [person.middle for person in people]
+        cost = np.full((len(self._tracks), len(people)), np.inf)
+        for row, track in enumerate(self._tracks):
+            unseen = 1e-9 * (stamp - track.stamp)
+            limit = min(MATCH_DISTANCE_M + MATCH_SPEED_M_PER_S * unseen, MAX_MATCH_DISTANCE_M)
             for column, (person, middle) in enumerate(zip(people, middles, strict=True)):
-                apart = float(np.linalg.norm(middle - member.expected(stamp)))
-                if apart < limit:
-                    extra = 0.0 if member.tracker.last else NEWCOMER
-                    cost[row, column] = extra + apart * (OWNED if person.owner == row else 1.0)
+                distance = float(np.linalg.norm(middle - track.predict_middle(stamp)))
+                if distance < limit:
+                    penalty = 0.0 if track.tracker.last else NO_BODY_PENALTY_M
+                    cost[row, column] = penalty + distance * (OWNED_FACTOR if person.owner == row else 1.0)
         rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
-        matched = {int(column): self._members[row] for row, column in zip(rows, columns, strict=True)
-                   if cost[row, column] < np.inf}  # fmt: skip
+        pairs = zip(rows, columns, strict=True)
+        matched = {int(column): self._tracks[row] for row, column in pairs if cost[row, column] < np.inf}
         for column, middle in enumerate(middles):
             if column in matched:
-                matched[column].seen(middle, stamp)
+                matched[column].update(middle, stamp)
             elif people[column].owner is None:
-                matched[column] = self._new(middle, stamp)
+                matched[column] = self._start_track(middle, stamp)
         return [(matched[column], person) for column, person in enumerate(people) if column in matched]
 
-    def _new(self, middle: np.ndarray, stamp: int) -> _BodyTrack:
+    def _start_track(self, middle: F64, stamp: int) -> _BodyTrack:
         self._started += 1
         tracker = BodyTracker(self._fitter, self._settings)
-        self._members.append(_BodyTrack(f"{self._prefix}{self._started}", self._started, middle, stamp, tracker))
-        return self._members[-1]
+        self._tracks.append(_BodyTrack(f"{self._prefix}{self._started}", self._started, middle, stamp, tracker))
+        return self._tracks[-1]
 
-    def _forget(self, stamp: int) -> None:
-        kept = [member for member in self._members if stamp - member.stamp <= 1e9 * self._settings.hold]
-        self.counters["lost people"] += sum(member.tracker.last is not None for member in self._members) - sum(
-            member.tracker.last is not None for member in kept
+    def _drop_lost(self, stamp: int) -> None:
+        kept = [track for track in self._tracks if stamp - track.stamp <= 1e9 * self._settings.hold]
+        self._report.counters["lost people"] += sum(track.tracker.last is not None for track in self._tracks) - sum(
+            track.tracker.last is not None for track in kept
         )
-        self._members = kept
+        self._tracks = kept
 
 
-def _follow(pair: tuple[BodyTracker, Task]) -> BodyFit | InputError | None:
-    tracker, task = pair
+def _track(pair: tuple[BodyTracker, PersonCloud]) -> BodyFit | InputError | None:
+    tracker, person = pair
     try:
-        return tracker.track(task.points, task.normals, task.stamp, task.viewpoint)
+        return tracker.track(person)
     except InputError as error:
         return error
 
 
 def _person_seed(seed: int, number: int) -> int:
-    """A seed of one person in one cloud."""
+    """Return a seed for one person in one cloud."""
     return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])

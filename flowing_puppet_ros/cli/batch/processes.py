@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tasks in processes of this machine, which share its cores; a process that dies takes no other task with it."""
+"""Tasks in local processes that share the cores; a process that dies does not affect other tasks."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
-from flowing_puppet_ros.cli.batch.task import Answer, Task, answer
-from flowing_puppet_ros.parallel import usable_threads
+from flowing_puppet_ros.cli.batch.task import BatchTask, TaskResult, execute
+from flowing_puppet_ros.threads import usable_threads
 
-# What tells the libraries how many threads to start; it is read when they are imported.
-THREADS = (
+# Environment variables that set the libraries' numbers of threads; read when the libraries are imported.
+THREAD_VARIABLES = (
     *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"),
     *("NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"),
 )
-MOST_THREADS = 1024
-TRIES = 2
+MAX_THREADS = 1024  # more than any machine has cores
+MAX_TRIES = 2  # of a task whose process dies
 
 
 @dataclass(slots=True, eq=False)
@@ -31,21 +31,21 @@ class _Worker:
     index: int
 
 
-def in_processes(tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Answer]]:
-    """Yield (index, answer) as tasks are done in `workers` processes, each with its share of the cores.
+def run_in_processes(tasks: Sequence[BatchTask], workers: int) -> Iterator[tuple[int, TaskResult]]:
+    """Yield (index, result) as tasks finish in `workers` processes, each with its share of the cores.
 
-    A task whose process dies (killed, out of memory) is tried once more in a new one before it counts as failed.
+    A task whose process dies (killed, out of memory) is tried once more in a new process before it counts as failed.
     """
-    share = max(1, usable_threads(MOST_THREADS) // workers)
+    share = max(1, usable_threads(MAX_THREADS) // workers)
     waiting = deque(range(len(tasks)))
     tries = [0] * len(tasks)
     running: dict[Connection, _Worker] = {}
     try:
         while waiting or running:
             while waiting and len(running) < workers:
-                pipe, process = _started(share)
+                pipe, process = _start(share)
                 running[pipe] = _Worker(process, -1)
-                _give(pipe, running[pipe], waiting, tries, tasks)
+                _assign(pipe, running[pipe], waiting, tries, tasks)
             for ready in wait(list(running)):
                 assert isinstance(ready, Connection)
                 pipe = ready
@@ -53,56 +53,58 @@ def in_processes(tasks: Sequence[Task], workers: int) -> Iterator[tuple[int, Ans
                 try:
                     found = pipe.recv()
                 except (EOFError, OSError):
-                    _end(pipe, running)
-                    if tries[worker.index] < TRIES:
+                    _close(pipe, running)
+                    if tries[worker.index] < MAX_TRIES:
                         waiting.appendleft(worker.index)
                     else:
-                        yield worker.index, _died(tasks[worker.index], worker.process)
+                        yield worker.index, _describe_death(tasks[worker.index], worker.process)
                     continue
                 index = worker.index
                 if waiting:
-                    _give(pipe, worker, waiting, tries, tasks)
+                    _assign(pipe, worker, waiting, tries, tasks)
                 else:
-                    _end(pipe, running)
+                    _close(pipe, running)
                 yield index, found
     finally:
         for pipe in list(running):
             running[pipe].process.terminate()
-            _end(pipe, running)
+            _close(pipe, running)
 
 
-def _give(pipe: Connection, worker: _Worker, waiting: deque[int], tries: list[int], tasks: Sequence[Task]) -> None:
+def _assign(
+    pipe: Connection, worker: _Worker, waiting: deque[int], tries: list[int], tasks: Sequence[BatchTask]
+) -> None:
     worker.index = waiting.popleft()
     tries[worker.index] += 1
-    with suppress(OSError):  # when it is dead already reading from it tells
+    with suppress(OSError):  # if it is already dead, reading from it shows that
         pipe.send(tasks[worker.index])
 
 
-def _end(pipe: Connection, running: dict[Connection, _Worker]) -> None:
-    """Close a pipe, which ends its process, and wait for that."""
+def _close(pipe: Connection, running: dict[Connection, _Worker]) -> None:
+    """Close a pipe, which ends its process, and join the process."""
     worker = running.pop(pipe)
     pipe.close()
     worker.process.join()
 
 
-def _died(task: Task, process: SpawnProcess) -> Answer:
+def _describe_death(task: BatchTask, process: SpawnProcess) -> TaskResult:
     code = process.exitcode or 0
     how = f"by signal {-code}" if code < 0 else f"with status {code}"
-    return Answer({}, f"{task.source} failed: its process ended {how} {TRIES} times; memory may be short", 1)
+    return TaskResult({}, f"{task.source} failed: its process ended {how} {MAX_TRIES} times; memory may be short", 1)
 
 
-def _started(share: int) -> tuple[Connection, SpawnProcess]:
+def _start(share: int) -> tuple[Connection, SpawnProcess]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs,), daemon=True)
-    with _environment(dict.fromkeys(THREADS, str(share))):
+    with _set_environment(dict.fromkeys(THREAD_VARIABLES, str(share))):
         process.start()
     theirs.close()
     return ours, process
 
 
 @contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
+def _set_environment(values: dict[str, str]) -> Iterator[None]:
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -116,10 +118,10 @@ def _environment(values: dict[str, str]) -> Iterator[None]:
 
 
 def _serve(pipe: Connection) -> None:
-    """Answer tasks until the pipe is closed; an interrupt is the parent's to handle."""
+    """Execute tasks until the pipe is closed; interrupts are left to the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         while True:
-            pipe.send(answer(pipe.recv()))
+            pipe.send(execute(pipe.recv()))
     except (EOFError, OSError):
         return

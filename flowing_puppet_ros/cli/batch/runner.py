@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many inputs, one result each: in parallel processes or on a Dask cluster, whatever fails, and resumable.
+"""Many inputs, one result each: in parallel processes or on a Dask cluster, despite failures, and resumable.
 
-A finished input is written down in a ledger beside the results, so that the same command goes on where it was stopped.
-The results do not depend on how many processes or machines made them.
+Finished inputs are logged beside the results, so that the same command resumes where it was stopped. The results do not
+depend on the number of processes or machines.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from typing import Any
 from tqdm import tqdm
 
 from flowing_puppet_ros import __version__
-from flowing_puppet_ros.cli.batch.task import Answer, Summary, Task, answer
+from flowing_puppet_ros.cli.batch.task import BatchTask, Summary, TaskResult, execute
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.parallel import usable_threads
 from flowing_puppet_ros.settings import make_out_folder
+from flowing_puppet_ros.threads import usable_threads
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,121 +33,125 @@ class Verb:
 
     Attributes:
         name: of the verb.
-        work: (input, options) -> summary that JSON can hold; a function of a module, options that can be pickled and
-            whose `repr` names all that the result depends on.
+        work: (input, options) -> JSON-ready summary; a module's function. Options must be picklable, and their `repr`
+            must name everything that the result depends on.
         files: (summary) -> the files that were written.
-        tell: (summary) -> nothing; prints it on stdout, and what is to be said of it on stderr.
+        report: prints a summary on stdout, and remarks on it on stderr.
     """
 
     name: str
     work: Callable[[Path, Any], Summary]
     files: Callable[[Summary], list[Path]]
-    tell: Callable[[Summary], None]
+    report: Callable[[Summary], None]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the flags of verbs that take many inputs."""
+    """Add the flags of verbs that take several inputs."""
     group = parser.add_argument_group("several inputs")
-    group.add_argument("--jobs", type=int, metavar="N", help="processes at a time [one a core]")
+    group.add_argument("--jobs", type=int, metavar="N", help="parallel processes [one per core]")
     group.add_argument(
         "--scheduler",
         metavar="ADDRESS",
-        help="work on the Dask cluster there, tcp://host:8786, whose machines see the same folders, instead of here",
+        help="run on the Dask cluster at tcp://host:8786, whose machines see the same folders, instead of locally",
     )
-    group.add_argument("--again", action="store_true", help="redo inputs that are finished")
+    group.add_argument("--again", action="store_true", help="redo finished inputs")
 
 
 def resolve_path(path: Path, arguments: argparse.Namespace) -> Path:
-    """A path as the machines of a cluster find it, whose processes run in other folders."""
+    """Return a path as the machines of a cluster find it, whose processes run in other folders."""
     return path if arguments.scheduler is None else path.absolute()
 
 
 def run_batch(verb: Verb, sources: Sequence[Path], options: Any, out: Path, arguments: argparse.Namespace) -> int:
-    """Work on every source that is not finished and return the exit status.
+    """Process every source that is not finished; return the exit status.
 
-    Results are told in the order of `sources`. 0 when all are done, 1 when some failed; when every one failed the
-    highest of their statuses.
+    Results are reported in the order of `sources`. The status is 0 if all are done, 1 if some failed, and the highest
+    of their statuses if all failed.
     """
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs is {arguments.jobs}; give 1 or more")
     _refuse_duplicates(sources)
     make_out_folder(out)
-    ledger = ResultLog(out / f"{verb.name}.jsonl", verb.files)
-    keys = [_key(verb.name, source, options) for source in sources]
-    answers: dict[int, Answer] = {}
+    log = ResultLog(out / f"{verb.name}.jsonl", verb.files)
+    keys = [_make_key(verb.name, source, options) for source in sources]
+    results: dict[int, TaskResult] = {}
     for index, key in enumerate(keys):
-        summary = None if arguments.again else ledger.finished(key)
+        summary = None if arguments.again else log.find_finished(key)
         if summary is not None:
-            answers[index] = Answer(summary)
-    todo = [index for index in range(len(sources)) if index not in answers]
-    if answers:
-        print(f"flowing-puppet {verb.name}: {len(answers)} finished inputs are skipped", file=sys.stderr)
-    tasks = [Task(verb.work, sources[index], options) for index in todo]
-    told = 0
-    with tqdm(total=len(sources), initial=len(answers), desc=verb.name, unit="input", file=sys.stderr) as bar:
-        with closing(_engine(tasks, arguments)) as done:
+            results[index] = TaskResult(summary)
+    todo = [index for index in range(len(sources)) if index not in results]
+    if results:
+        print(f"flowing-puppet {verb.name}: {len(results)} finished inputs are skipped", file=sys.stderr)
+    tasks = [BatchTask(verb.work, sources[index], options) for index in todo]
+    reported = 0
+    with tqdm(total=len(sources), initial=len(results), desc=verb.name, unit="input", file=sys.stderr) as bar:
+        with closing(_run_tasks(tasks, arguments)) as done:
             for place, found in done:
                 index = todo[place]
-                answers[index] = found
+                results[index] = found
                 if not found.error:
-                    ledger.add(keys[index], found.summary)
+                    log.add(keys[index], found.summary)
                 bar.update()
-                told = _tell(verb, sources, answers, told, bar)
-        _tell(verb, sources, answers, told, bar)
-    return _status(verb.name, sources, answers)
+                reported = _report_in_order(verb, sources, results, reported, bar)
+        _report_in_order(verb, sources, results, reported, bar)
+    return _exit_status(verb.name, sources, results)
 
 
-def _engine(tasks: Sequence[Task], arguments: argparse.Namespace) -> Generator[tuple[int, Answer]]:
-    """Yield (index, answer) as tasks are done, in any order."""
+def _run_tasks(tasks: Sequence[BatchTask], arguments: argparse.Namespace) -> Generator[tuple[int, TaskResult]]:
+    """Yield (index, result) as tasks finish, in any order."""
     workers = min(len(tasks), arguments.jobs or usable_threads(len(tasks)))
     if tasks and arguments.scheduler is not None:
-        from flowing_puppet_ros.cli.batch.cluster import on_cluster
+        from flowing_puppet_ros.cli.batch.cluster import run_on_cluster
 
-        yield from on_cluster(tasks, arguments.scheduler)
+        yield from run_on_cluster(tasks, arguments.scheduler)
     elif workers > 1:
-        from flowing_puppet_ros.cli.batch.processes import in_processes
+        from flowing_puppet_ros.cli.batch.processes import run_in_processes
 
-        yield from in_processes(tasks, workers)
+        yield from run_in_processes(tasks, workers)
     else:
-        yield from ((index, answer(task)) for index, task in enumerate(tasks))
+        yield from ((index, execute(task)) for index, task in enumerate(tasks))
 
 
-def _tell(verb: Verb, sources: Sequence[Path], answers: dict[int, Answer], told: int, bar: tqdm) -> int:
-    """Tell what can be told in order, from source `told` on; returns the next one's index."""
-    while told in answers:
-        found = answers[told]
+def _report_in_order(
+    verb: Verb, sources: Sequence[Path], results: dict[int, TaskResult], reported: int, bar: tqdm
+) -> int:
+    """Report finished sources in order, starting with source `reported`; return the index of the next one."""
+    while reported in results:
+        found = results[reported]
         with bar.external_write_mode(file=sys.stderr):
             if found.error:
                 print(f"flowing-puppet {verb.name}: {found.error}", file=sys.stderr)
-            verb.tell({"input": str(sources[told]), "error": found.error} if found.error else found.summary)
-        told += 1
-    return told
+            verb.report({"input": str(sources[reported]), "error": found.error} if found.error else found.summary)
+        reported += 1
+    return reported
 
 
-def _status(name: str, sources: Sequence[Path], answers: dict[int, Answer]) -> int:
-    failed = [index for index, found in sorted(answers.items()) if found.error]
+def _exit_status(name: str, sources: Sequence[Path], results: dict[int, TaskResult]) -> int:
+    failed = [index for index, found in sorted(results.items()) if found.error]
     if not failed:
         return 0
     listed = ", ".join(str(sources[index]) for index in failed)
     print(f"flowing-puppet {name}: {len(failed)} of {len(sources)} inputs failed: {listed}", file=sys.stderr)
-    return max(answers[index].status for index in failed) if len(failed) == len(sources) else 1
+    return max(results[index].status for index in failed) if len(failed) == len(sources) else 1
 
 
-def stem_of(source: Path) -> str:
-    """The name of a source's result: that of a folder, or of a file without its ending."""
+def result_stem(source: Path) -> str:
+    """Return the stem of a source's result: the name of a folder, or of a file without its suffix."""
     return source.name if source.is_dir() else source.stem
 
 
 def _refuse_duplicates(sources: Iterable[Path]) -> None:
-    double = next((stem for stem, count in Counter(map(stem_of, sources)).items() if count > 1), None)
+    double = next((stem for stem, count in Counter(map(result_stem, sources)).items() if count > 1), None)
     if double is not None:
-        raise InputError(f"two inputs are called {double!r} and would overwrite each other's result; do them apart")
+        raise InputError(
+            f"two inputs are called {double!r} and would overwrite each other's result; process them separately"
+        )
 
 
 class ResultLog:
-    """What is finished in a folder of results: a line of JSON for each, the last one that wrote a file counts.
+    """The finished inputs of a folder of results, one line of JSON each; the last line that wrote a file counts.
 
-    Only the process that runs the batch writes it; a line that was cut off in the middle does not count.
+    Only the process that runs the batch writes it; a line that was cut off does not count.
     """
 
     def __init__(self, path: Path, files: Callable[[Summary], list[Path]]) -> None:
@@ -158,18 +162,18 @@ class ResultLog:
         try:
             lines = path.read_text("utf8", errors="replace").splitlines() if path.exists() else []
         except OSError as error:
-            raise InputError(f"{path} cannot be read: {error.strerror}; remove it to start anew") from error
+            raise InputError(f"{path} cannot be read: {error.strerror}; remove it to start over") from error
         for line in lines:
             with suppress(ValueError, KeyError, TypeError, RecursionError):
                 entry = json.loads(line)
-                self._take(str(entry["key"]), dict(entry["summary"]))
+                self._store(str(entry["key"]), dict(entry["summary"]))
 
-    def _take(self, key: str, summary: Summary) -> None:
+    def _store(self, key: str, summary: Summary) -> None:
         self._writers |= dict.fromkeys(self._files(summary), key)
         self._summaries[key] = summary
 
-    def finished(self, key: str) -> Summary | None:
-        """The summary of a finished input whose files are still there and its own, else None."""
+    def find_finished(self, key: str) -> Summary | None:
+        """Return the summary of a finished input whose files still exist and are its own, else None."""
         summary = self._summaries.get(key)
         if summary is None:
             return None
@@ -177,15 +181,15 @@ class ResultLog:
         return summary if whole else None
 
     def add(self, key: str, summary: Summary) -> None:
-        """Write down that an input is finished."""
-        self._take(key, summary)
+        """Log that an input is finished."""
+        self._store(key, summary)
         with self._path.open("a", encoding="utf8") as stream:
-            # The line before may have been cut off by a kill.
+            # A kill may have cut off the line before.
             stream.write("\n" * bool(stream.tell()) + json.dumps({"key": key, "summary": summary}))
 
 
-def _key(verb: str, source: Path, options: Any) -> str:
-    """A name for a result: the input as it is now, and all that it is made with."""
+def _make_key(verb: str, source: Path, options: Any) -> str:
+    """Return a key of a result: a hash of the input as it is now, and of everything the result depends on."""
     paths = sorted(path for path in source.rglob("*") if path.is_file()) if source.is_dir() else [source]
     parts = [__version__, verb, repr(options)]
     for path in paths:

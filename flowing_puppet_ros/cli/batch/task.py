@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One input on its way to a process or another machine, and what comes back."""
+"""The task of processing one input in another process or on another machine, and its result."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from flowing_puppet_ros.errors import PuppetError
 
 Summary = dict[str, Any]
 
-# One input at a time a process: a process of a cluster may run several threads, and what works here uses all cores.
+# One input at a time per process: a cluster's process may run several threads, but each task uses all cores.
 _ALONE = Lock()
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
-    """One input on its way to a process or another machine."""
+class BatchTask:
+    """One input with the function that processes it."""
 
     work: Callable[[Path, Any], Summary]
     source: Path
@@ -29,22 +29,22 @@ class Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """The summary of a finished input, or one sentence about what failed and its exit status."""
+class TaskResult:
+    """The summary of a finished input, or an error sentence with its exit status."""
 
     summary: Summary
     error: str = ""
     status: int = 0
 
 
-def answer(task: Task) -> Answer:
-    """Do one task; whatever goes wrong is in the answer."""
+def execute(task: BatchTask) -> TaskResult:
+    """Execute one task; errors are returned in the result."""
     if task.version != __version__:
-        return Answer({}, f"a worker has version {__version__} of this package and not {task.version}", 1)
+        return TaskResult({}, f"a worker has version {__version__} of this package and not {task.version}", 1)
     try:
         with _ALONE:
-            return Answer(task.work(task.source, task.options))
+            return TaskResult(task.work(task.source, task.options))
     except PuppetError as error:
-        return Answer({}, str(error), error.exit_status)
+        return TaskResult({}, str(error), error.exit_status)
     except Exception as error:  # one input of a thousand must not end the others
-        return Answer({}, f"{task.source} failed: {type(error).__name__}: {error}", 1)
+        return TaskResult({}, f"{task.source} failed: {type(error).__name__}: {error}", 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`flowing-puppet evaluate KIND`: one module a kind of measurement.
+"""`flowing-puppet evaluate KIND`: one module per kind of measurement.
 
 Arguments come in; a table, JSON, CSV and plots go out. Read `verb` first.
 """

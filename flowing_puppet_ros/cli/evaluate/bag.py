@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Output bags against true people: MPJPE, vertex to surface, ids, latency, drops; several runs stand side by side."""
+"""Output bags against true people: MPJPE, vertex to surface, ids, latency, drops; several runs side by side."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.evaluate.bag.figures import BagFigures, measured
-from flowing_puppet_ros.evaluate.bag.truth import People, read_truth
-from flowing_puppet_ros.evaluate.output import Chart, Line, Outcome, run_names
+from flowing_puppet_ros.evaluate.bag.figures import BagFigures, measure_bag
+from flowing_puppet_ros.evaluate.bag.truth import PeopleByStamp, read_truth
+from flowing_puppet_ros.evaluate.output import Chart, EvaluationReport, Line, name_runs
 from flowing_puppet_ros.evaluate.output import add_arguments as add_output
 
-LIMITS_CM = np.linspace(0, 20, 201)
+LIMITS_CM = np.linspace(0, 20, 201)  # thresholds of the curve
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,27 +35,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure every run, print the figures and return the exit status."""
     truth = None if arguments.truth is None else read_truth(arguments.truth)
-    names = run_names(arguments.outputs)
+    names = name_runs(arguments.outputs)
     runs = {
-        name: _measured(arguments.input or path, path, truth)
+        name: _measure_run(arguments.input or path, path, truth)
         for name, path in zip(names, arguments.outputs, strict=True)
     }
     details = {
         "joints, m": {
-            name: {joint: one.summary() for joint, one in found.errors.per_joint().items() if one.known.size}
+            name: {joint: one.summarise() for joint, one in found.errors.per_joint().items() if one.known.size}
             for name, found in runs.items()
         }
     }
-    Outcome("bag", {name: found.figures for name, found in runs.items()}, details, _charts(runs)).give(arguments)
+    EvaluationReport("bag", {name: found.figures for name, found in runs.items()}, details, _make_charts(runs)).emit(
+        arguments
+    )
     return 0
 
 
-def _measured(given: Path, made: Path, truth: People | None) -> BagFigures:
+def _measure_run(given: Path, made: Path, truth: PeopleByStamp | None) -> BagFigures:
     with open_bag(given, salvage=True) as input_bag, open_bag(made, salvage=True) as output_bag:
-        return measured(input_bag, output_bag, truth)
+        return measure_bag(input_bag, output_bag, truth)
 
 
-def _charts(runs: dict[str, BagFigures]) -> list[Chart]:
+def _make_charts(runs: dict[str, BagFigures]) -> list[Chart]:
     known = {name: found for name, found in runs.items() if found.errors.known.size}
     within = [
         Line(name, LIMITS_CM, 100 * (100 * found.errors.known[:, None] <= LIMITS_CM).mean(axis=0))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`flowing-puppet evaluate bodies`: fits of scanned synthetic people, whose every vertex is known."""
+"""`flowing-puppet evaluate bodies`: fits of scanned synthetic people whose every vertex is known."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from tqdm import tqdm
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.body.bodies import KINDS, BodyScore, drawn_scans, scored_fit, summary
+from flowing_puppet_ros.evaluate.body.bodies import KINDS, BodyScore, draw_scans, score_fit, summarise
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
-from flowing_puppet_ros.evaluate.tables import json_text, text_table, write_csv, write_json
+from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import make_out_folder
 
@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--count", type=int, default=20, help="people [%(default)s]")
     parser.add_argument("--people-seed", type=int, default=1, help="seed of the people and their scans [%(default)s]")
-    parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture; without it all poses are hard ones")
+    parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture; without it all poses are hard")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for bodies_KIND.csv and bodies_KIND.json")
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
     FitterSettings.add_arguments(parser)
@@ -42,16 +42,16 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         make_out_folder(arguments.out)
     source = BodySource(arguments.mocap)
-    scans = drawn_scans(arguments.kind, source, arguments.count, arguments.people_seed)
+    scans = draw_scans(arguments.kind, source, arguments.count, arguments.people_seed)
     scores: list[BodyScore] = []
     with tqdm(scans, total=arguments.count, file=sys.stderr, disable=arguments.json) as bar:
         for body, scene, cloud in bar:
-            scores.append(scored_fit(fitter, body, scene, cloud, source.joint_names)[1])
+            scores.append(score_fit(fitter, body, scene, cloud, source.joint_names)[1])
             bar.set_postfix_str(f"{100 * scores[-1].vertex_error:.2f} cm")
-    figures = summary(scores)
+    figures = summarise(scores)
     if arguments.out is not None:
         rows = [asdict(score) for score in scores]
         write_csv(arguments.out / f"bodies_{arguments.kind}.csv", rows)
         write_json(arguments.out / f"bodies_{arguments.kind}.json", {"summary": figures, "bodies": rows})
-    print(json_text(figures) if arguments.json else text_table([{"kind": arguments.kind} | figures]))
+    print(format_json(figures) if arguments.json else format_table([{"kind": arguments.kind} | figures]))
     return 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy of 2D joints against the threshold, from tracks.json or poses.json; several runs stand side by side."""
+"""Accuracy of 2D joints over the threshold, from tracks.json or poses.json; several runs side by side."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.output import Chart, Line, Outcome, run_names
+from flowing_puppet_ros.evaluate.output import Chart, EvaluationReport, Line, name_runs
 from flowing_puppet_ros.evaluate.output import add_arguments as add_output
-from flowing_puppet_ros.evaluate.video.tracks import JointMisses, joint_misses, read_tracks
+from flowing_puppet_ros.evaluate.video.tracks import JointMisses, measure_misses, read_tracks
 from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
 
-DRAWN = ("wrists", "elbows", "all joints")
+DRAWN_GROUPS = ("wrists", "elbows", "all joints")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,36 +26,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Measure, print accuracy at some thresholds, medians and jitter of every run, and return the exit status."""
+    """Measure, print accuracy at some thresholds, median and jitter of every run, and return the exit status."""
     if arguments.most < 4:
         raise InputError(f"--most is {arguments.most}; give at least 4 pixels")
-    names = run_names(arguments.tracks)
+    names = name_runs(arguments.tracks)
     truth = read_keypoints(arguments.truth)
     thresholds = np.arange(1, arguments.most + 1)
     shown = sorted({max(arguments.most * share // 8, 1) for share in (1, 2, 4, 8)})
     figures, curves, lines = {}, {}, []
     for name, path in zip(names, arguments.tracks, strict=True):
         tracks = read_tracks(path)
-        misses = joint_misses(tracks.frames, truth)
-        figures[name] = _figures(misses, shown) | {"jitter, px": tracks.jitter()}
+        misses = measure_misses(tracks.frames, truth)
+        figures[name] = _summarise(misses, shown) | {"jitter, px": tracks.jitter()}
         curves[name] = {joint: curve.tolist() for joint, curve in misses.accuracy(thresholds).items()}
         lines += [
             Line(group, thresholds, 100 * (values[:, None] <= thresholds).mean(axis=0), name if len(names) > 1 else "")
-            for group, values in misses.grouped().items()
-            if group in DRAWN
+            for group, values in misses.group().items()
+            if group in DRAWN_GROUPS
         ]
     title = "Accuracy of joints; people nobody found are misses"
     chart = Chart("accuracy", title, "threshold, px", "joints within, %", lines, y_limits=(0, 100))
     details = {"thresholds_px": thresholds.tolist(), "percent_within": curves}
-    Outcome("joints", figures, details, [chart]).give(arguments)
+    EvaluationReport("joints", figures, details, [chart]).emit(arguments)
     return 0
 
 
-def _figures(misses: JointMisses, thresholds: list[int]) -> dict[str, float]:
+def _summarise(misses: JointMisses, thresholds: list[int]) -> dict[str, float]:
     figures = {}
-    for group, values in misses.grouped().items():
+    for group, values in misses.group().items():
         for threshold in thresholds:
             figures[f"{group} within {threshold} px, %"] = 100 * float(np.mean(values <= threshold))
-        # Halfway between a distance and a miss there is nothing: a middle joint that was missed is a miss.
+        # A distance and a miss cannot be interpolated; a missed median joint makes the median a miss.
         figures[f"{group}, median px"] = float(np.quantile(values, 0.5, method="higher"))
     return figures

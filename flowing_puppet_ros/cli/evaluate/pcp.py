@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Percentage of correct parts (PCP) of poses, or of every method on a folder of images (thesis, Table 1).
 
-Each INPUT is a poses.json of `pose`, or a folder of images: then the detector alone, NL (no likelihood), NS (no shape),
-plain PMP and D-PMP are measured on it. Several inputs stand side by side. The truth is the annotation tool's JSON,
-keypoints.json, or a text file of sticks as of the Buffy Stickmen.
+Each INPUT is a poses.json of `pose`, or a folder of images, on which the detector alone, NL (no likelihood), NS (no
+shape), plain PMP and D-PMP are measured. Several inputs are shown side by side. The truth is the annotation tool's
+JSON, keypoints.json, or a text file of sticks like those of the Buffy Stickmen.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from tqdm import tqdm
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.image.pcp import GROUPS, PosedSticks, Tally
 from flowing_puppet_ros.evaluate.image.pcp_methods import measure_methods
-from flowing_puppet_ros.evaluate.image.pcp_truth import Truth, images_of, read_truth
-from flowing_puppet_ros.evaluate.output import Chart, Figures, Line, Outcome, run_names
+from flowing_puppet_ros.evaluate.image.pcp_truth import StickTruth, open_true_images, read_stick_truth
+from flowing_puppet_ros.evaluate.output import Chart, EvaluationReport, Figures, Line, name_runs
 from flowing_puppet_ros.evaluate.output import add_arguments as add_output
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
@@ -33,7 +33,7 @@ SWITCHES = ("likelihood", "shape", "diverse")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of `evaluate pcp`."""
+    """Add the flags of `evaluate pcp`."""
     parser.add_argument("inputs", nargs="+", type=Path, metavar="INPUT", help="folder of images, or poses.json")
     parser.add_argument(
         "--truth", type=Path, help="annotations.json, keypoints.json or sticks.txt [annotations.json in INPUT]"
@@ -49,30 +49,32 @@ def run(arguments: argparse.Namespace) -> int:
     if not arguments.pixels > 0:
         raise InputError(f"--pixels is {arguments.pixels}; it must be positive")
     figures: Figures = {}
-    for name, path in zip(run_names(arguments.inputs), arguments.inputs, strict=True):
-        truth = _truth(path, arguments.truth)
+    for name, path in zip(name_runs(arguments.inputs), arguments.inputs, strict=True):
+        truth = _read_truth(path, arguments.truth)
         if path.is_dir():
-            methods = _of_images(arguments, path, truth)
+            methods = _measure_images(arguments, path, truth)
             figures |= {
                 method if len(arguments.inputs) == 1 else f"{name} {method}": methods[method] for method in methods
             }
         else:
-            figures[name] = _of_poses(arguments, path, truth)
-    Outcome("pcp", figures, charts=[_chart(figures, rule) for rule in ("strict", "loose")]).give(arguments)
+            figures[name] = _measure_poses(arguments, path, truth)
+    EvaluationReport("pcp", figures, charts=[_make_chart(figures, rule) for rule in ("strict", "loose")]).emit(
+        arguments
+    )
     return 0
 
 
-def _truth(source: Path, given: Path | None) -> Truth:
+def _read_truth(source: Path, given: Path | None) -> StickTruth:
     path = given or (source / "annotations.json" if source.is_dir() else None)
     if path is None:
         raise InputError(f"{source} needs the truth: name it with --truth")
-    truth = read_truth(path)
+    truth = read_stick_truth(path)
     if not any(truth.values()):
         raise InputError(f"{path} has no person in any image")
     return truth
 
 
-def _chart(figures: Figures, rule: str) -> Chart:
+def _make_chart(figures: Figures, rule: str) -> Chart:
     groups = [group for group in GROUPS if any(f"{rule} {group}" in row for row in figures.values())]
     lines = [
         Line(run, np.arange(len(groups)), np.array([row.get(f"{rule} {group}", np.nan) for group in groups]))
@@ -82,9 +84,9 @@ def _chart(figures: Figures, rule: str) -> Chart:
     return Chart(rule, title, "", "parts correct, %", lines, "bars", groups, (0, 100))
 
 
-def _of_images(arguments: argparse.Namespace, folder: Path, truth: Truth) -> Figures:
+def _measure_images(arguments: argparse.Namespace, folder: Path, truth: StickTruth) -> Figures:
     settings = PoseSettings.from_arguments(arguments)
-    images = ((frame.image, people) for frame, people in images_of(folder, truth))
+    images = ((frame.image, people) for frame, people in open_true_images(folder, truth))
     with tqdm(total=sum(bool(people) for people in truth.values()), unit="image", disable=None) as progress:
         return measure_methods(
             images,
@@ -98,16 +100,18 @@ def _of_images(arguments: argparse.Namespace, folder: Path, truth: Truth) -> Fig
         )
 
 
-def _of_poses(arguments: argparse.Namespace, source: Path, truth: Truth) -> dict[str, float]:
-    """Figures of a file of poses; an image is known by its place, its path or the number in its name."""
+def _measure_poses(arguments: argparse.Namespace, source: Path, truth: StickTruth) -> dict[str, float]:
+    """Measure a file of poses; images are identified by index, path or the number in their names."""
     try:
         data = json.loads(source.read_text(encoding="utf-8"))
         names = tuple(data["joint_names"])
-        frames = [(frame["index"], frame.get("path", ""), _people(names, frame["puppets"])) for frame in data["frames"]]
+        frames = [
+            (frame["index"], frame.get("path", ""), _read_people(names, frame["puppets"])) for frame in data["frames"]
+        ]
     except OSError as error:
         raise InputError(f"{source} cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{source} is no file of poses ({error!r})") from error
+        raise InputError(f"{source} is not a file of poses ({error!r})") from error
     tally = Tally(arguments.pixels)
     matched = 0
     for key, people in truth.items():
@@ -120,11 +124,11 @@ def _of_poses(arguments: argparse.Namespace, source: Path, truth: Truth) -> dict
         if people:
             tally.add(found[0] if found else [], people)
     if not matched:
-        raise InputError(f"no image of {source} is one of the truth's")
-    return tally.figures()
+        raise InputError(f"{source} and the truth have no image in common")
+    return tally.summarise()
 
 
-def _people(names: tuple[str, ...], puppets: list[dict[str, Any]]) -> list[PosedSticks]:
+def _read_people(names: tuple[str, ...], puppets: list[dict[str, Any]]) -> list[PosedSticks]:
     people = []
     for puppet in puppets:
         sticks = sticks_from_joints(names, np.array(puppet["joints"], np.float64)[:, :2])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure poses and bodies against the truth."""
+"""Measure poses and bodies against the ground truth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KINDS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add one sub-command a kind of measurement."""
+    """Add one sub-command per kind of measurement."""
     kinds = parser.add_subparsers(dest="kind_of_truth", required=True, metavar="|".join(KINDS))
     for name, module in KINDS.items():
         summary = (module.__doc__ or "").partition("\n")[0].rstrip(".").replace("%", "%%")

@@ -16,47 +16,42 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from tqdm import tqdm
 
-from flowing_puppet_ros.blas import one_blas_thread
-from flowing_puppet_ros.draw.plots import Series, line_plot
+from flowing_puppet_ros.draw.plots import Series, draw_line_plot
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.tables import text_table, write_csv, write_json
+from flowing_puppet_ros.evaluate.tables import format_table, write_csv, write_json
 from flowing_puppet_ros.evaluate.video.errors import (
-    CALIBRATED,
-    MEASURED,
-    THRESHOLDS,
+    CALIBRATION_DISTANCE_PX,
+    MEASURED_JOINTS,
+    THRESHOLDS_PX,
     ClipErrors,
     TrackedPerson,
-    calibration,
     calibration_error,
-    clip_errors,
-    gain,
-    summary,
+    measure_calibration,
+    measure_clip,
+    measure_gain,
+    summarise,
 )
 from flowing_puppet_ros.evaluate.video.methods import (
     INIT,
     MEDIAN,
     METHODS,
     ClipRun,
-    Located,
-    VideoSettings,
+    LocatedPerson,
     all_names,
-    checked_names,
-    median_filtered,
+    check_names,
+    filter_by_median,
     run_method,
 )
-from flowing_puppet_ros.evaluate.video.truth import People, find_clips, read_people
-from flowing_puppet_ros.image.arms.viterbi import PathSettings
+from flowing_puppet_ros.evaluate.video.truth import PeopleByFrame, find_clips, read_people
 from flowing_puppet_ros.image.formats.tracks_json import write_tracks
 from flowing_puppet_ros.image.formats.video_reader import open_frames
-from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings
-from flowing_puppet_ros.image.thesis_loop.loop import LoopSettings
-from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings
-from flowing_puppet_ros.report.page import page, paragraph, table
+from flowing_puppet_ros.image.video.clip import ClipSettings
+from flowing_puppet_ros.report.page import build_page, paragraph, table
 from flowing_puppet_ros.settings import make_out_folder
+from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
 MOST_FRAMES = 2000
 BASES = {"": "detector", INIT: f"{INIT}detector"}
@@ -76,10 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--again", action="store_true", help="track again what was tracked before")
     parser.add_argument("--processes", type=int, default=2, help="clips at a time [%(default)s]")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
-    PathSettings.add_arguments(parser)
-    SmoothingSettings.add_arguments(parser)
-    LoopSettings.add_arguments(parser)
-    EnergySettings.add_arguments(parser)
+    ClipSettings.add_arguments(parser, main="tracker")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -90,13 +82,8 @@ def run(arguments: argparse.Namespace) -> int:
     truth = read_people(arguments.truth, clips)
     given = {} if arguments.init is None else read_people(arguments.init, clips)
     chosen = _listed(arguments.methods) or all_names(arguments.init is not None)
-    methods = checked_names(chosen, arguments.init is not None)
-    settings = VideoSettings(
-        path=PathSettings.from_arguments(arguments),
-        smoothing=SmoothingSettings.from_arguments(arguments),
-        loop=LoopSettings.from_arguments(arguments),
-        energy=EnergySettings.from_arguments(arguments),
-    )
+    methods = check_names(chosen, arguments.init is not None)
+    settings = ClipSettings.from_arguments(arguments)
     make_out_folder(arguments.out)
     tasks = [_Task(name, clips[name], given.get(name), methods, settings, arguments) for name in truth]
     for _ in tqdm(_done(tasks, arguments.processes), total=len(tasks), unit="clip", disable=None):
@@ -116,9 +103,9 @@ class _Task:
 
     name: str
     path: Path
-    given: People | None
+    given: PeopleByFrame | None
     methods: list[str]
-    settings: VideoSettings
+    settings: ClipSettings
     arguments: argparse.Namespace
 
     def file(self, method: str) -> Path:
@@ -130,8 +117,7 @@ class _Task:
         plain = dict.fromkeys(name.removesuffix(MEDIAN) for name in self.methods)
         missing = [name for name in plain if self.arguments.again or not self.file(name).is_file()]
         if missing:
-            cv2.setNumThreads(1)
-            with one_blas_thread():
+            with one_blas_thread(), one_opencv_thread():
                 self._track(missing)
         for name in self.methods:
             if name.endswith(MEDIAN):
@@ -158,7 +144,7 @@ class _Task:
         data = json.loads(self.file(plain).read_text(encoding="utf-8"))
         track = [[_located(puppet) for puppet in frame["puppets"]] for frame in data["frames"]]
         indices = [frame["index"] for frame in data["frames"]]
-        entries = (_entry(index, people) for index, people in zip(indices, median_filtered(track), strict=True))
+        entries = (_entry(index, people) for index, people in zip(indices, filter_by_median(track), strict=True))
         write_tracks(self.file(name), tuple(data["joint_names"]), data["fps"], entries)
         self._about_file(name).write_text(self._about_file(plain).read_text())
 
@@ -166,7 +152,7 @@ class _Task:
         """CPU seconds a frame that a method took, without what an earlier one had done for it."""
         return float(self._about(method)["seconds"])
 
-    def errors(self, method: str, truth: People) -> ClipErrors:
+    def errors(self, method: str, truth: PeopleByFrame) -> ClipErrors:
         """Compare the tracks of a method with the truth."""
         data = json.loads(self.file(method).read_text(encoding="utf-8"))
         width, height = self._about(method)["size"]
@@ -174,7 +160,7 @@ class _Task:
             int(frame["index"]): [_person(data["joint_names"], _located(puppet)) for puppet in frame["puppets"]]
             for frame in data["frames"]
         }
-        return clip_errors(found, truth, (width, height))
+        return measure_clip(found, truth, (width, height))
 
     def _about(self, method: str) -> dict[str, Any]:
         return dict(json.loads(self._about_file(method).read_text()))
@@ -183,7 +169,7 @@ class _Task:
         return self.file(method).with_suffix(".about")
 
 
-def _entry(index: int, people: Sequence[Located]) -> dict[str, Any]:
+def _entry(index: int, people: Sequence[LocatedPerson]) -> dict[str, Any]:
     puppets = []
     for person in people:
         rows = np.column_stack([np.round(person.joints, 2), np.round(person.confidence, 4)])
@@ -191,12 +177,12 @@ def _entry(index: int, people: Sequence[Located]) -> dict[str, Any]:
     return {"index": index, "puppets": puppets}
 
 
-def _located(puppet: Mapping[str, Any]) -> Located:
+def _located(puppet: Mapping[str, Any]) -> LocatedPerson:
     rows = np.array(puppet["joints"], np.float64)
-    return Located(puppet["id"], rows[:, :2], rows[:, 2])
+    return LocatedPerson(puppet["id"], rows[:, :2], rows[:, 2])
 
 
-def _person(names: Sequence[str], person: Located) -> TrackedPerson:
+def _person(names: Sequence[str], person: LocatedPerson) -> TrackedPerson:
     return TrackedPerson.of(names, person.joints, person.confidence)
 
 
@@ -225,12 +211,12 @@ def _write(
     rows: list[dict[str, Any]] = []
     curves = {}
     for name, clips in errors.items():
-        curves[name] = calibration(clips)
-        row = {"method": name} | summary(clips)
+        curves[name] = measure_calibration(clips)
+        row = {"method": name} | summarise(clips)
         row |= {"calibration_error": calibration_error(curves[name])}
         rows.append(row | {"seconds_a_frame": round(float(np.mean(seconds[name])), 3)})
     gains = {name: _gains(name, errors) for name in errors}
-    by_clip = {name: {clip: summary({clip: one}) for clip, one in clips.items()} for name, clips in errors.items()}
+    by_clip = {name: {clip: summarise({clip: one}) for clip, one in clips.items()} for name, clips in errors.items()}
     figures = {"methods": {row["method"]: row for row in rows}, "gains": gains, "calibration": curves, "clips": by_clip}
     write_csv(arguments.out / "video.csv", rows)
     write_json(arguments.out / "video.json", figures)
@@ -238,7 +224,7 @@ def _write(
     if arguments.json:
         print(json.dumps({row["method"]: row for row in rows}))
         return
-    print(text_table([{key.replace("_px", ""): value for key, value in row.items()} for row in rows]))
+    print(format_table([{key.replace("_px", ""): value for key, value in row.items()} for row in rows]))
     for name, text in gains.items():
         if text:
             print(f"{name} over {BASES[INIT if name.startswith(INIT) else '']}: {text}")
@@ -249,9 +235,9 @@ def _gains(name: str, errors: Mapping[str, Mapping[str, ClipErrors]]) -> str:
     if name == base or base not in errors:
         return ""
     found = []
-    for kind in MEASURED:
-        for threshold in THRESHOLDS:
-            points, low, high = gain(errors[name], errors[base], kind, threshold)
+    for kind in MEASURED_JOINTS:
+        for threshold in THRESHOLDS_PX:
+            points, low, high = measure_gain(errors[name], errors[base], kind, threshold)
             found.append(f"{kind}s within {threshold:g} px {points:+.1f} [{low:+.1f}, {high:+.1f}]")
     return ", ".join(found)
 
@@ -271,6 +257,8 @@ def _page(
         for name, curve in curves.items()
         if curve
     ]
-    plot = line_plot(lines, "confidence against truth", "confidence", f"share within {CALIBRATED:g} px")
+    plot = draw_line_plot(
+        lines, "confidence against truth", "confidence", f"share within {CALIBRATION_DISTANCE_PX:g} px"
+    )
     lead = paragraph("True joints inside the image; who is not found counts as wrong. Intervals: bootstrap over clips.")
-    return page("Tracks against the truth", lead, [("Figures", figures), ("Calibration", plot)])
+    return build_page("Tracks against the truth", lead, [("Figures", figures), ("Calibration", plot)])

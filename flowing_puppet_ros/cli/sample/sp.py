@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 
 from flowing_puppet_ros.body.scans.scan import write_ply
-from flowing_puppet_ros.draw.mesh_render import orthographic, render
+from flowing_puppet_ros.draw.mesh_render import fit_orthographic_camera, render
 from flowing_puppet_ros.draw.palette import part_colours
-from flowing_puppet_ros.draw.pictures import contact_sheet, save
+from flowing_puppet_ros.draw.pictures import make_contact_sheet, save
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
-SIZE = (300, 440)  # pixels
-SCALE = 200.0  # pixels per metre, the same for all bodies
-VIEWS = ((-1.0, -0.4, -0.15), (0.4, -1.0, -0.15))  # looking directions: from the front and from behind at the left
-COLUMNS = 8
+SIZE_PX = (300, 440)
+PIXELS_PER_METRE = 200.0  # the same for all bodies
+VIEWS = ((-1.0, -0.4, -0.15), (0.4, -1.0, -0.15))  # viewing directions: from the front and from behind on the left
+COLUMNS = 8  # of the contact sheet
 FILES = "sp_GENDER_000.ply ... and sp_GENDER.png"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """`sample sp` has no flags of its own."""
+    """Add no flags: `sample sp` has none of its own."""
 
 
 def draw(arguments: argparse.Namespace, rng: np.random.Generator) -> Iterator[Path]:
@@ -37,8 +37,8 @@ def draw(arguments: argparse.Namespace, rng: np.random.Generator) -> Iterator[Pa
         write_ply(path, vertices, model.faces, colours)
         yield path
         for looking in VIEWS:
-            camera = orthographic(vertices, looking, SIZE, scale=SCALE)
-            pictures.append(render(vertices, model.faces, camera, SIZE, colours.astype(np.float64)).rgb)
+            camera = fit_orthographic_camera(vertices, looking, SIZE_PX, scale=PIXELS_PER_METRE)
+            pictures.append(render(vertices, model.faces, camera, SIZE_PX, colours.astype(np.float64)).rgb)
     sheet = arguments.out / f"sp_{model.name}.png"
-    save(contact_sheet(pictures, COLUMNS), sheet)
+    save(make_contact_sheet(pictures, COLUMNS), sheet)
     yield sheet

@@ -16,7 +16,7 @@ MODELS = {"ds": ds, "sp": sp}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add one sub-command a model."""
+    """Add one sub-command per model."""
     models = parser.add_subparsers(dest="model", required=True, metavar="ds|sp")
     for name, module in MODELS.items():
         flags = models.add_parser(name, description=module.__doc__)
@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw from the chosen model, print the paths of what was written and return the exit status."""
+    """Draw from the chosen model, print the paths of the files and return the exit status."""
     if arguments.count < 1:
         raise InputError(f"--count is {arguments.count}; draw at least 1")
     if arguments.seed < 0:

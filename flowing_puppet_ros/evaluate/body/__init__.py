@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fits of scans against the truth, on synthetic people of whom every vertex is known, and between scans.
+"""Fits of scans against the ground truth: synthetic people with known vertices, and correspondence between scans.
 
 Fits and true vertices come in; errors in metres go out. Read `bodies` first, then `synthetic_scans`.
 """

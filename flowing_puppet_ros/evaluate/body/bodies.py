@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far fitted bodies are from the people that were scanned, on synthetic scans of which every vertex is known."""
+"""Errors of bodies fitted to synthetic scans of people whose every vertex is known."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
 from flowing_puppet_ros.evaluate.body.synthetic_scans import (
     DepthSettings,
-    Scene,
+    RaycastScene,
     SensedCloud,
-    depth_view,
-    lidar_view,
-    sensor_place,
-    whole_scan,
+    draw_sensor_position,
+    scan_depth,
+    scan_lidar,
+    scan_whole,
 )
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
-WHOLE_POINTS = 10000
-# Of every so many people one is in a hard pose.
+WHOLE_SCAN_POINTS = 10000
+# One person in so many is in a hard pose; 0 for none.
 HARD_EVERY = {"whole": 2, "single": 4, "lidar": 0}
 KINDS = tuple(HARD_EVERY)
-DEPTH_DISTANCE, DEPTH_HEIGHT = (2.0, 4.0), (0.8, 1.8)  # metres
-LIDAR_DISTANCE, LIDAR_HEIGHT = (4.5, 7.5), (1.6, 1.9)  # metres: 300 to 800 points on a person
-BAD = 0.04  # metres: mean vertex error of a body with a limb in a wrong place
-SIGHT = 0.005  # metres: a vertex this much behind the first hit of its ray is still seen
+DEPTH_DISTANCE_M, DEPTH_HEIGHT_M = (2.0, 4.0), (0.8, 1.8)  # minimum and maximum of the sensor
+LIDAR_DISTANCE_M, LIDAR_HEIGHT_M = (4.5, 7.5), (1.6, 1.9)  # gives 300 to 800 points on a person
+MIN_BAD_ERROR_M = 0.04  # mean vertex error of a body with a misplaced limb
+VISIBILITY_TOLERANCE_M = 0.005  # a vertex this far behind the first hit of its ray is still visible
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,10 +40,10 @@ class BodyScore:
         hard: whether the pose was drawn from joint limits alone.
         points: of the cloud.
         vertex_error: over all vertices of the template.
-        visible_error: over those that the sensor saw; of a whole scan all.
+        visible_error: over the visible vertices; of a whole scan, all.
         joint_error: over all joints.
         flipped: whether the body is nearer to the truth with left and right swapped.
-        two_way_distance, confidence, reliable: as the fit says.
+        two_way_distance, confidence, reliable: as reported by the fit.
         seconds: processor time of the fit.
     """
 
@@ -59,7 +59,9 @@ class BodyScore:
     seconds: float
 
 
-def drawn_scans(kind: str, source: BodySource, count: int, seed: int) -> Iterator[tuple[TrueBody, Scene, SensedCloud]]:
+def draw_scans(
+    kind: str, source: BodySource, count: int, seed: int
+) -> Iterator[tuple[TrueBody, RaycastScene, SensedCloud]]:
     """Draw `count` people and scan them: whole, from a single side by a depth camera, or by a LiDAR.
 
     Every pose is hard when the source has no motion capture.
@@ -67,22 +69,22 @@ def drawn_scans(kind: str, source: BodySource, count: int, seed: int) -> Iterato
     rng = np.random.default_rng(seed)
     every = HARD_EVERY[kind]
     for index in range(count):
-        body = source.body(rng, hard=not source.has_mocap or (every > 0 and index % every == every - 1))
-        scene = Scene(body.vertices, source.triangles)
+        body = source.draw_body(rng, hard=not source.has_mocap or (every > 0 and index % every == every - 1))
+        scene = RaycastScene(body.vertices, source.triangles)
         if kind == "whole":
-            yield body, scene, whole_scan(scene, rng, WHOLE_POINTS)
+            yield body, scene, scan_whole(scene, rng, WHOLE_SCAN_POINTS)
         elif kind == "single":
-            eye = sensor_place(rng, body.vertices, DEPTH_DISTANCE, DEPTH_HEIGHT)
-            yield body, scene, depth_view(scene, rng, eye, DepthSettings())
+            eye = draw_sensor_position(rng, body.vertices, DEPTH_DISTANCE_M, DEPTH_HEIGHT_M)
+            yield body, scene, scan_depth(scene, rng, eye, DepthSettings())
         else:
-            eye = sensor_place(rng, body.vertices, LIDAR_DISTANCE, LIDAR_HEIGHT)
-            yield body, scene, lidar_view(scene, rng, eye)
+            eye = draw_sensor_position(rng, body.vertices, LIDAR_DISTANCE_M, LIDAR_HEIGHT_M)
+            yield body, scene, scan_lidar(scene, rng, eye)
 
 
-def scored_fit(
-    fitter: BodyFitter, body: TrueBody, scene: Scene, cloud: SensedCloud, joint_names: Sequence[str]
+def score_fit(
+    fitter: BodyFitter, body: TrueBody, scene: RaycastScene, cloud: SensedCloud, joint_names: Sequence[str]
 ) -> tuple[BodyFit, BodyScore]:
-    """Fit a model to a synthetic cloud and compare; `joint_names` are those of the body's joints."""
+    """Fit a model to a synthetic cloud and compare with the truth; `joint_names` name the body's joints."""
     started = time.process_time()
     fit = fitter.fit(cloud.points, cloud.normals, viewpoint=cloud.viewpoint)
     seconds = time.process_time() - started
@@ -93,7 +95,7 @@ def scored_fit(
         hard=body.hard,
         points=len(cloud.points),
         vertex_error=float(error.mean()),
-        visible_error=float(error[seen_vertices(scene, truth, cloud.viewpoint)].mean()),
+        visible_error=float(error[find_visible_vertices(scene, truth, cloud.viewpoint)].mean()),
         joint_error=float(np.linalg.norm(fit.joints - joints, axis=1).mean()),
         flipped=is_flipped(fit.vertices, truth, fitter.model),
         two_way_distance=fit.two_way_distance,
@@ -104,24 +106,24 @@ def scored_fit(
 
 
 def is_flipped(vertices: np.ndarray, truth: np.ndarray, model: StitchedPuppet) -> bool:
-    """Whether a body (V, 3) is nearer to the truth (V, 3) with left and right swapped, as when it faces backward."""
+    """Return whether a body (V, 3) is nearer to the truth (V, 3) with left and right swapped, as if it faced back."""
     own = np.linalg.norm(vertices - truth, axis=1).mean()
     return bool(np.linalg.norm(vertices[model.mirror_vertex] - truth, axis=1).mean() < own)
 
 
-def seen_vertices(scene: Scene, vertices: np.ndarray, viewpoint: np.ndarray | None) -> np.ndarray:
-    """Which vertices (V,) on the surface of a scene a sensor at `viewpoint` sees; without a viewpoint all."""
+def find_visible_vertices(scene: RaycastScene, vertices: np.ndarray, viewpoint: np.ndarray | None) -> np.ndarray:
+    """Return which vertices (V,) on a scene's surface are visible from `viewpoint`; without a viewpoint, all."""
     if viewpoint is None:
         return np.ones(len(vertices), dtype=bool)
     rays = vertices - viewpoint
     length = np.linalg.norm(rays, axis=1)
-    return scene.cast(viewpoint, rays / length[:, None])[0] > length - SIGHT
+    return scene.cast(viewpoint, rays / length[:, None])[0] > length - VISIBILITY_TOLERANCE_M
 
 
-def summary(scores: Sequence[BodyScore]) -> dict[str, float]:
-    """Figures over many fits; distances in centimetres.
+def summarise(scores: Sequence[BodyScore]) -> dict[str, float]:
+    """Summarise many fits; distances in centimetres.
 
-    `unreliable` counts the fits that say so of themselves, `bad` those that are wrong by more than 4 cm on average.
+    `unreliable` counts the fits that report themselves as unreliable, `bad` those with a mean error above 4 cm.
     """
     vertex = 100 * np.array([score.vertex_error for score in scores])
     return {
@@ -134,8 +136,8 @@ def summary(scores: Sequence[BodyScore]) -> dict[str, float]:
         "two_way_mean_cm": 100 * float(np.mean([score.two_way_distance for score in scores])),
         "flipped": sum(score.flipped for score in scores),
         "unreliable": sum(not score.reliable for score in scores),
-        "bad": sum(score.vertex_error > BAD for score in scores),
-        "bad_unreliable": sum(score.vertex_error > BAD and not score.reliable for score in scores),
+        "bad": sum(score.vertex_error > MIN_BAD_ERROR_M for score in scores),
+        "bad_unreliable": sum(score.vertex_error > MIN_BAD_ERROR_M and not score.reliable for score in scores),
         "confidence_lowest": min(score.confidence for score in scores),
         "seconds_mean": float(np.mean([score.seconds for score in scores])),
         "seconds_worst": max(score.seconds for score in scores),

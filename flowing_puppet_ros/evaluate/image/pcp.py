@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Percentage of correctly estimated body parts (PCP), and elbows and wrists within a distance, over many images.
 
-A part is correct when its ends lie within half of the true stick's length from the true ends: each of them (strict;
-Pishchulin et al., "Articulated people detection and pose estimation", CVPR 2012), or both on average (loose, as the
-Buffy Stickmen software does; Ferrari, Marin-Jimenez and Zisserman, CVPR 2008). Sticks are (6,2,2) px in the order of
+A part is correct if its ends are within half the true stick's length of the true ends: each of them (strict;
+Pishchulin et al., "Articulated people detection and pose estimation", CVPR 2012), or both on average (loose, like the
+Buffy Stickmen software; Ferrari, Marin-Jimenez and Zisserman, CVPR 2008). Sticks are (6, 2, 2) px in the order of
 `image.formats.stickmen.STICKS`; a stick with a NaN is unknown.
 """
 
@@ -17,9 +17,9 @@ import numpy as np
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.image.formats.stickmen import STICKS
 
-THRESHOLD = 0.5
-FOUND = 0.75
-"""Share of the true torso's length that the ends of torso and head of a found person are off, on average, at most."""
+MAX_END_SHARE = 0.5  # distance of a correct part's ends, as a share of the true stick's length
+MAX_MATCH_SHARE = 0.75
+"""Maximum mean distance of the ends of torso and head of a found person, as a share of the true torso's length."""
 
 GROUPS = {
     "torso": ("torso",),
@@ -34,28 +34,28 @@ _LOWER_ARMS = [STICKS.index("left_lower_arm"), STICKS.index("right_lower_arm")]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedSticks:
-    """One estimated person: sticks (6,2,2) px, and those of all its solutions (n,6,2,2), the best included."""
+    """One estimated person: `sticks` (6, 2, 2) px, and `solutions` (n, 6, 2, 2) px including the best one."""
 
     sticks: Array
     solutions: Array
 
 
 def end_distances(sticks: Array, truth: Array) -> Array:
-    """Distances (6,2) of the ends of sticks (6,2,2) from the true ones, each stick in the order that fits better."""
+    """Return distances (6, 2) px of the ends of sticks (6, 2, 2) from the true ends, each in the better order."""
     straight = np.linalg.norm(sticks - truth, axis=2)
     swapped = np.linalg.norm(sticks[:, ::-1] - truth, axis=2)
     return np.where((swapped.sum(axis=1) < straight.sum(axis=1))[:, None], swapped, straight)
 
 
-def correct_parts(sticks: Array, truth: Array) -> tuple[Array, Array]:
-    """Whether each stick (6,) is correct, strictly and loosely; an unknown estimate is wrong."""
-    allowed = THRESHOLD * np.linalg.norm(truth[:, 1] - truth[:, 0], axis=1)
+def check_parts(sticks: Array, truth: Array) -> tuple[Array, Array]:
+    """Return whether each stick (6,) is correct, strictly and loosely; an unknown estimate is wrong."""
+    allowed = MAX_END_SHARE * np.linalg.norm(truth[:, 1] - truth[:, 0], axis=1)
     apart = np.where(np.isfinite(sticks).all(axis=(1, 2))[:, None], end_distances(sticks, truth), np.inf)
     return (apart <= allowed[:, None]).all(axis=1), apart.mean(axis=1) <= allowed
 
 
 def match_people(people: Sequence[PosedSticks], truths: Sequence[Array]) -> list[PosedSticks | None]:
-    """For each true person the estimated one whose torso and head fit best; None where nobody is near."""
+    """Match each true person with the estimate whose torso and head fit best; None if no estimate is near."""
     cost = np.full((len(truths), len(people)), np.inf)
     for row, truth in enumerate(truths):
         length = np.linalg.norm(truth[_TORSO, 1] - truth[_TORSO, 0])
@@ -66,7 +66,7 @@ def match_people(people: Sequence[PosedSticks], truths: Sequence[Array]) -> list
             if np.isfinite(apart).any():
                 cost[row, column] = np.nanmean(apart) / length
     matched: list[PosedSticks | None] = [None] * len(truths)
-    while cost.size and cost.min() <= FOUND:
+    while cost.size and cost.min() <= MAX_MATCH_SHARE:
         row, column = divmod(int(cost.argmin()), cost.shape[1])
         matched[row] = people[column]
         cost[row], cost[:, column] = np.inf, np.inf
@@ -75,7 +75,7 @@ def match_people(people: Sequence[PosedSticks], truths: Sequence[Array]) -> list
 
 @dataclass(slots=True)
 class Tally:
-    """Counts over all true people; people who are not found count as wrong in every part that is known."""
+    """Counts over all true people; every known part of a missed person counts as wrong."""
 
     pixels: float = 20.0
     people: int = 0
@@ -98,20 +98,20 @@ class Tally:
             if person is None:
                 continue
             self.found += 1
-            strict, loose = correct_parts(person.sticks, truth)
+            strict, loose = check_parts(person.sticks, truth)
             self.strict += strict & known
             self.loose += loose & known
-            self.near += self._near(person.sticks[None], truth, ends)
-            self.near_of_several += self._near(person.solutions, truth, ends)
+            self.near += self._count_near(person.sticks[None], truth, ends)
+            self.near_of_several += self._count_near(person.solutions, truth, ends)
 
-    def _near(self, several: Array, truth: Array, ends: Array) -> Array:
-        """How many elbows and wrists (2,) lie within `pixels` in at least one of several poses (n,6,2,2)."""
+    def _count_near(self, several: Array, truth: Array, ends: Array) -> Array:
+        """Count elbows and wrists (2,) within `pixels` in at least one of several poses (n, 6, 2, 2)."""
         apart = np.linalg.norm(several[:, _LOWER_ARMS] - truth[_LOWER_ARMS], axis=3)
         near = (np.nan_to_num(apart, nan=np.inf) <= self.pixels).any(axis=0)
         return np.asarray((near & ends).sum(axis=0))
 
-    def figures(self) -> dict[str, float]:
-        """Percentages by name, JSON-ready; names of parts that are nowhere known are left out."""
+    def summarise(self) -> dict[str, float]:
+        """Return percentages by name, JSON-ready; parts that are never known are left out."""
         figures = {"people": float(self.people), "found": _percent(self.found, self.people)}
         for name, counts in (("strict", self.strict), ("loose", self.loose)):
             for group, parts in GROUPS.items():

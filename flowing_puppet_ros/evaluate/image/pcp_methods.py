@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The rows of the thesis's Table 1: the detector alone, and the search without likelihood, without shape, and whole."""
+"""The rows of the thesis's Table 1: detector alone, and the search without likelihood, without shape, and in full."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ METHODS: dict[str, dict[str, bool]] = {
     "DS, PMP": {"diverse": False},
     "DS, D-PMP": {},
 }
-"""Settings of each row that differ from those of the whole search: no likelihood, no shape, plain particles."""
+"""Settings of each row that differ from the full search: no likelihood, no shape, no diverse particles."""
 
 DETECTOR = "detector"
 
 
-class _Once:
-    """A detector that looks at each image once, for all rows."""
+class _SharedDetector:
+    """A detector that runs once per image for all rows."""
 
     def __init__(self, detector: PoseDetectorLike) -> None:
         self._detector = detector
@@ -55,11 +55,11 @@ def measure_methods(
     pixels: float,
     progress: Callable[[], None],
 ) -> dict[str, dict[str, float]]:
-    """Figures of `Tally` and CPU seconds an image by method, over images (H,W,3) with the true sticks of their people.
+    """Return the figures of `Tally` and CPU seconds per image by method, over images (H, W, 3) with true sticks.
 
-    `progress` is called after each image. The time of the search is without the detector's.
+    `progress` is called after each image. The time of the search excludes the detector.
     """
-    once = _Once(detector)
+    once = _SharedDetector(detector)
     tallies = {name: Tally(pixels) for name in (DETECTOR, *METHODS)}
     seconds = dict.fromkeys(tallies, 0.0)
     estimators = {
@@ -69,29 +69,29 @@ def measure_methods(
     count = 0
     for image, truths in images:
         began = time.process_time()
-        people = [_detected(found, model) for found in once.detect(np.ascontiguousarray(image))]
+        people = [_sticks_from_detection(found, model) for found in once.detect(np.ascontiguousarray(image))]
         seconds[DETECTOR] += time.process_time() - began
         tallies[DETECTOR].add(people, truths)
         for name, estimator in estimators.items():
             began = time.process_time()
-            posed = [_posed(one, model) for one in estimator.estimate(image)]
+            posed = [_sticks_from_pose(one, model) for one in estimator.estimate(image)]
             seconds[name] += time.process_time() - began
             tallies[name].add(posed, truths)
         count += 1
         progress()
     return {
-        name: tally.figures() | {"seconds an image": round(seconds[name] / max(count, 1), 3)}
+        name: tally.summarise() | {"seconds an image": round(seconds[name] / max(count, 1), 3)}
         for name, tally in tallies.items()
     }
 
 
-def _posed(posed: PosedPuppet, model: DeformableStructures) -> PosedSticks:
+def _sticks_from_pose(posed: PosedPuppet, model: DeformableStructures) -> PosedSticks:
     solutions = [sticks_from_joints(model.joint_names, solution.joints) for solution in posed.solutions]
     return PosedSticks(sticks_from_joints(model.joint_names, posed.joints), np.stack(solutions))
 
 
-def _detected(found: PersonHypotheses, model: DeformableStructures) -> PosedSticks:
-    """The detector's own answer: its best pose, and as many others as it knows."""
+def _sticks_from_detection(found: PersonHypotheses, model: DeformableStructures) -> PosedSticks:
+    """Return the detector's own result: its best pose and up to nine others."""
     several = []
     for keypoints, _ in found.modes(10):
         joints, _ = joints_from_keypoints(model, keypoints)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of clips, and the people of their frames: the true ones, or those that start the tracker.
+"""A folder of clips, and the people in their frames: the ground truth, or the tracker's initial detections.
 
-A clip is a video file or a sub-folder of images. People are read from one JSON of all clips, from one keypoints.json
-when there is one clip, or from a folder with a keypoints.json called like each clip. See `image.formats.annotations`.
+A clip is a video file or a sub-folder of images. People are read from one JSON of all clips, from one keypoints.json if
+there is one clip, or from a folder with a keypoints file named after each clip. See `image.formats.annotations`.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from flowing_puppet_ros.image.formats.video_reader import IMAGE_SUFFIXES, open_f
 VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".m4v", ".mkv", ".mov", ".mpg", ".mpeg", ".webm"})
 
 type Clips = Mapping[str, Path]
-"""Video files and folders of images by the name of the clip."""
+"""Video files and folders of images by clip name."""
 
-type People = Mapping[int, Sequence[Keypoints]]
-"""People of a clip by frame; frames that nobody looked at are absent."""
+type PeopleByFrame = Mapping[int, Sequence[Keypoints]]
+"""People of a clip by frame; frames that were not annotated are absent."""
 
 
 def find_clips(folder: Path, wanted: Sequence[str] = ()) -> dict[str, Path]:
-    """The clips of a folder, or only those that are `wanted`; InputError when there is none or one is not there.
+    """Find the clips of a folder, or only those that are `wanted`; InputError if there is none or one is missing.
 
-    A folder that holds images itself, and a video file, is one clip.
+    A video file, or a folder that holds images itself, is one clip.
     """
     if not folder.exists():
         raise InputError(f"{folder} does not exist; name a folder of videos, or of sub-folders of images")
@@ -53,35 +53,35 @@ def _has_images(place: Path) -> bool:
     return place.is_dir() and any(file.suffix.lower() in IMAGE_SUFFIXES for file in place.iterdir())
 
 
-def read_people(path: Path, clips: Clips) -> dict[str, People]:
-    """People by clip, of the clips that the file or folder `path` speaks of; InputError when it speaks of none."""
+def read_people(path: Path, clips: Clips) -> dict[str, PeopleByFrame]:
+    """Read people by clip from the file or folder `path`; InputError if it covers none of the clips."""
     if path.is_dir():
         files = {name: path / f"{clip.stem}.json" for name, clip in clips.items()}
-        found: dict[str, People] = {name: read_keypoints(file) for name, file in files.items() if file.is_file()}
-    elif "frames" in _keys(path):
+        found: dict[str, PeopleByFrame] = {name: read_keypoints(file) for name, file in files.items() if file.is_file()}
+    elif "frames" in _read_object(path):
         if len(clips) != 1:
             raise InputError(f"{path} has the frames of one clip, but there are {len(clips)}; choose one with --clips")
         found = {name: read_keypoints(path) for name in clips}
     else:
-        found = _of_annotations(Annotations.load(path), clips)
+        found = _select_annotated(Annotations.load(path), clips)
     found = {name: people for name, people in found.items() if any(people.values())}
     if not found:
-        raise InputError(f"{path} has nobody in any of the clips {', '.join(list(clips)[:3])} ...")
+        raise InputError(f"{path} has no person in any of the clips {', '.join(list(clips)[:3])} ...")
     return found
 
 
-def _keys(path: Path) -> Mapping[str, object]:
+def _read_object(path: Path) -> Mapping[str, object]:
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no JSON file: {error}") from error
+        raise InputError(f"{path} is not a JSON file: {error}") from error
     return data if isinstance(data, dict) else {}
 
 
-def _of_annotations(annotations: Annotations, clips: Clips) -> dict[str, People]:
-    """The annotated people; images of a clip's folder are its frames in natural order."""
+def _select_annotated(annotations: Annotations, clips: Clips) -> dict[str, PeopleByFrame]:
+    """Select the annotated people of the clips; images in a clip's folder are its frames in natural order."""
     names = {known: name for name, clip in clips.items() for known in (name, clip.stem)}
     found: dict[str, dict[int, Sequence[Keypoints]]] = {}
     for file, frames in annotations.people.items():

@@ -17,22 +17,22 @@ from numba import njit
 
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 
-MAX_CELLS = 2_000_000
-DISTANCE_OFFSET = 0.001
-DISTANCE_POWER = 0.45
-MISMATCH_COSINE = np.cos(0.75 * np.pi)
+MAX_CELLS = 2_000_000  # a grid of more would take too much memory; its cells are made larger instead
+DISTANCE_OFFSET = 0.001  # square metres, of Eq. 53 ...
+DISTANCE_POWER = 0.45  # ... whose robust distance is (d^2 + offset)^power
+MISMATCH_COSINE = np.cos(0.75 * np.pi)  # normals farther apart contradict each other (R of Eq. 52)
 
 
 class DataCost(Protocol):
     """A cloud that surface points are compared with."""
 
     def data_cost(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `CloudGrid.data_cost`."""
+        """Return costs as `CloudGrid.data_cost` does."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ExactCloud:
-    """A cloud whose nearest points are found exactly: for one body rather than for many particles.
+    """A cloud whose nearest points are found exactly: for one body rather than many particles.
 
     Attributes:
         points: (N, 3) metres.
@@ -45,7 +45,7 @@ class ExactCloud:
     tree: NearestPoints
 
     def data_cost(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same as `CloudGrid.data_cost`."""
+        """Return the same as `CloudGrid.data_cost`, with the exact closest points (Eqs. 53 and 54)."""
         distance, index = self.tree.query(points.reshape(-1, 3))
         distance, index = distance.reshape(points.shape[:-1]), index.reshape(points.shape[:-1])
         cosine = (normals * self.normals[index]).sum(axis=-1)
@@ -78,8 +78,8 @@ class CloudGrid:
         Args:
             points: (N, 3) metres, N > 0.
             normals: (N, 3) unit normals.
-            cell: edge of a cell in metres; made larger when the cloud is so wide that memory would suffer.
-            margin: how far the grid reaches beyond the cloud, metres; a point further out is looked up at the border.
+            cell: edge of a cell in metres; made larger if the grid would have more than MAX_CELLS.
+            margin: how far the grid reaches beyond the cloud, metres; a point farther out is looked up at the border.
         """
         points = np.ascontiguousarray(points, dtype=np.float64)
         low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
@@ -99,8 +99,8 @@ class CloudGrid:
             normals: (P, K, 3) unit normals.
 
         Returns:
-            Mean robust distance (P,), (d^2 + 0.001)^0.45 with d in metres, and (P,) the fraction of points whose
-            normal is more than 3/4 pi away from the normal of the closest cloud point (0 to 1; the indicator of R in
+            Mean robust distance (P,), (d^2 + 0.001)^0.45 with d of Eq. 54 in metres, and (P,) the fraction of points
+            whose normal is more than 3/4 pi away from that of the closest cloud point (0 to 1; the indicator of R in
             Eq. 52 divided by the number of points, so that it does not depend on the template's resolution).
         """
         points = np.ascontiguousarray(points, dtype=np.float64)
@@ -113,7 +113,7 @@ def _offer(
     points: np.ndarray, low: np.ndarray, cell: float, nearest: np.ndarray, distance: np.ndarray,
     i: int, j: int, k: int, candidate: int,
 ) -> None:  # fmt: skip
-    """Let a cell take a point if that is nearer to the cell's centre than what it has."""
+    """Store a point in a cell if it is nearer to the cell's centre than the stored one."""
     x = low[0] + cell * i - points[candidate, 0]
     y = low[1] + cell * j - points[candidate, 1]
     z = low[2] + cell * k - points[candidate, 2]

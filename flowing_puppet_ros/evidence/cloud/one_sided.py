@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a cloud that was seen from one place says of a body: surface, free space, and what nobody can know.
+"""What a cloud seen from one viewpoint says about a body: surface, free space and unknown space.
 
-A point of the body may lie on the seen surface or anywhere behind it. It must not lie before it, nor beside the
-silhouette, because there the sensor looked through. The cloud is its own depth image: directions are looked up in a
-grid of the nearest seen directions, and rings of a LiDAR are as wide apart as the cloud says.
+A point of the body may lie on the seen surface or anywhere behind it. It must not lie in front of it, nor beside the
+silhouette, because the sensor saw through there. The cloud is its own depth image: directions are looked up in a grid
+of the nearest seen directions, whose spacing (as between the rings of a LiDAR) comes from the cloud.
 """
 
 from __future__ import annotations
@@ -14,15 +14,15 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-MAX_CELLS = 60_000
-NEIGHBOUR = 4
-SPACING_SHARE = 90
-TOLERANCE = 1.5
+MAX_CELLS = 60_000  # of the grid of directions
+SPACING_NEIGHBOUR = 4  # the spacing of directions is the distance to this neighbour ...
+SPACING_PERCENTILE = 90  # ... at this percentile over the cloud
+TOLERANCE_SPACINGS = 1.5
 """Spacings of the seen directions beyond which a direction is beside the silhouette."""
-MISS = 0.15
-"""Metres; nothing counts as farther off than this."""
-HIDDEN = 0.05
-"""Metres behind the seen surface from which on a point that faces the sensor is taken to be hidden by another part."""
+MAX_DISTANCE_M = 0.15
+"""Distance at which costs saturate."""
+OCCLUSION_DEPTH_M = 0.05
+"""Depth behind the seen surface from which a point facing the sensor counts as occluded by another part."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,9 +34,9 @@ class OneSidedView:
         axes: (3, 3), rows right, down and forward, forward towards the middle of the cloud.
         directions: (N, 2) right and down over forward of the cloud's points.
         depth: (N,) metres along forward.
-        tolerance: distance of directions from which on one is beside the silhouette.
-        low: (2,) centre of the first cell.
-        cell: edge of a cell.
+        tolerance: distance between directions beyond which one is beside the silhouette.
+        low: (2,) centre of the first cell, as directions.
+        cell: edge of a cell, as directions.
         nearest: (w, h) int32, index of the point seen nearest to the cell's centre.
     """
 
@@ -51,46 +51,46 @@ class OneSidedView:
 
     @classmethod
     def build(cls, points: np.ndarray, viewpoint: np.ndarray) -> OneSidedView:
-        """Index a cloud (N, 3) in metres, seen from `viewpoint` (3,), which lies outside of it."""
+        """Index a cloud `points` (N, 3) m, seen from `viewpoint` (3,) m, which lies outside of it."""
         axes = _axes(points.mean(axis=0) - viewpoint)
         directions, depth = _project(points, viewpoint, axes)
         tree = cKDTree(directions)
-        neighbours = min(NEIGHBOUR + 1, len(points))
-        spacing = float(np.percentile(tree.query(directions, k=neighbours)[0][:, -1], SPACING_SHARE))
+        neighbours = min(SPACING_NEIGHBOUR + 1, len(points))
+        spacing = float(np.percentile(tree.query(directions, k=neighbours)[0][:, -1], SPACING_PERCENTILE))
         low, high = directions.min(axis=0) - 4 * spacing, directions.max(axis=0) + 4 * spacing
         cell = max(spacing / 2, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
         shape = np.ceil((high - low) / cell).astype(np.int64) + 1
         centres = np.stack(np.meshgrid(*(low[k] + cell * np.arange(shape[k]) for k in (0, 1)), indexing="ij"), axis=-1)
         nearest = tree.query(centres.reshape(-1, 2))[1].astype(np.int32).reshape(shape)
-        tolerance = TOLERANCE * spacing
+        tolerance = TOLERANCE_SPACINGS * spacing
         return cls(viewpoint, axes, directions, depth, tolerance, low, cell, np.ascontiguousarray(nearest))
 
     def compare(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Where points (N, 3) lie against the seen surface.
+        """Return where `points` (N, 3) m lie relative to the seen surface.
 
         Returns:
-            How far beside the silhouette (N, 3), a vector in metres at a right angle to the ray, zero inside of it;
-            and how far behind the surface (N,), metres along forward, negative before it.
+            (N, 3) vectors in metres, at a right angle to the ray, by which points are beside the silhouette, zero
+            inside of it; and (N,) metres along forward by which they are behind the surface, negative in front of it.
         """
         beside, behind = _compare(np.ascontiguousarray(points, dtype=np.float64), *self._arrays())
         return beside, behind
 
-    def hidden(self, points: np.ndarray) -> np.ndarray:
-        """Which points (N,) of (N, 3) lie behind the seen surface so far that it hides them."""
+    def find_hidden(self, points: np.ndarray) -> np.ndarray:
+        """Return which of `points` (N, 3) m lie so far behind the seen surface that it hides them, (N,) bool."""
         beside, behind = self.compare(points)
-        return (behind > HIDDEN) & ~beside.any(axis=1)
+        return (behind > OCCLUSION_DEPTH_M) & ~beside.any(axis=1)
 
     def misfit(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean distance in metres by which surface points contradict the view, for many sets of points at once.
+        """Return the mean distance by which surface points contradict the view, for many sets of points at once.
 
         Args:
             points: (P, K, 3) metres.
             normals: (P, K, 3) unit normals.
 
         Returns:
-            (P,) metres: beside the silhouette and before the surface the distance, on the surface too if the normal
-            faces the sensor, at most 5 cm behind it, nothing for a point behind the surface that faces away, never
-            more than 15 cm; and (P, K) bool, which points face the sensor.
+            (P,) metres, and (P, K) bool, which points face the sensor. A point beside the silhouette or in front of the
+            surface costs its distance, at most 15 cm; one behind the surface costs its depth, at most 5 cm, if it faces
+            the sensor, and nothing otherwise.
         """
         return _misfit(np.ascontiguousarray(points), np.ascontiguousarray(normals), *self._arrays())
 
@@ -101,15 +101,15 @@ class OneSidedView:
 
 
 def distances(targets: np.ndarray, points: np.ndarray, allowed: np.ndarray) -> np.ndarray:
-    """Distance (P, M) of every target (M, 3) to the nearest allowed point of each set (P, K, 3), at most 15 cm.
+    """Return the distance (P, M) m of every target to the nearest allowed point of each set, at most 15 cm.
 
-    allowed: (P, K) bool. Metres.
+    `targets` (M, 3) m, `points` (P, K, 3) m, `allowed` (P, K) bool.
     """
     return _distances(np.ascontiguousarray(targets), np.ascontiguousarray(points), allowed)
 
 
 def mean_distance(points: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """Mean distance (P,) of the points of each set (P, K, 3) to their nearest target (M, 3), each at most 15 cm."""
+    """Return the mean distance (P,) m of `points` (P, K, 3) m to the nearest `targets` (M, 3) m, capped at 15 cm."""
     return _mean_distance(np.ascontiguousarray(points), np.ascontiguousarray(targets))
 
 
@@ -128,7 +128,7 @@ def _project(points: np.ndarray, viewpoint: np.ndarray, axes: np.ndarray) -> tup
 
 @njit(cache=True, inline="always")
 def _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
-    """Index of the point seen nearest in direction, depth, and the two components of what is beside the silhouette."""
+    """Return the index of the point seen nearest in direction, depth, and the offset (x, y) beside the silhouette."""
     x, y, z = x - viewpoint[0], y - viewpoint[1], z - viewpoint[2]
     depth = max(axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z, 1e-6)
     right = (axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z) / depth
@@ -169,11 +169,11 @@ def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, 
             behind = depth - seen[found]
             beside = np.sqrt(dx * dx + dy * dy)
             if beside > 0:
-                cost[p] += min(beside, MISS)
+                cost[p] += min(beside, MAX_DISTANCE_M)
             elif behind < 0:
-                cost[p] += min(-behind, MISS)
+                cost[p] += min(-behind, MAX_DISTANCE_M)
             elif facing[p, k]:
-                cost[p] += min(behind, HIDDEN)
+                cost[p] += min(behind, OCCLUSION_DEPTH_M)
         cost[p] /= points.shape[1]
     return cost, facing
 
@@ -183,7 +183,7 @@ def _distances(targets, points, allowed):  # type: ignore[no-untyped-def]
     result = np.empty((len(points), len(targets)))
     for p in range(len(points)):
         for m in range(len(targets)):
-            best = MISS * MISS
+            best = MAX_DISTANCE_M * MAX_DISTANCE_M
             for k in range(points.shape[1]):
                 if allowed[p, k]:
                     dx = points[p, k, 0] - targets[m, 0]
@@ -199,7 +199,7 @@ def _mean_distance(points, targets):  # type: ignore[no-untyped-def]
     result = np.zeros(len(points))
     for p in range(len(points)):
         for k in range(points.shape[1]):
-            best = MISS * MISS
+            best = MAX_DISTANCE_M * MAX_DISTANCE_M
             for m in range(len(targets)):
                 dx = points[p, k, 0] - targets[m, 0]
                 dy = points[p, k, 1] - targets[m, 1]

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Orientation maps of an image at any cell size: what steered HOG descriptors are read from.
+"""Orientation maps of an image at any cell size, from which steered HOG descriptors are read.
 
 A descriptor is the histogram of gradient orientations of a cell, weighted by magnitude (Dalal and Triggs, CVPR 2005),
-without the gradient's sign. It is kept as the Fourier coefficients of that histogram up to the fourth order: nine
-numbers, as many as nine bins, which a turn of the frame of reference changes exactly (Liu et al., IJCV 2014).
+without the gradient's sign. It is stored as the Fourier coefficients of that histogram up to the fourth order: nine
+numbers, as many as nine bins, which rotate exactly with the frame of reference (Liu et al., IJCV 2014).
 """
 
 from __future__ import annotations
@@ -17,29 +17,30 @@ from numba import njit
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.arrays import F32, U8, Array
-from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.images import as_rgb
+from flowing_puppet_ros.threads import one_opencv_thread
 
-ORDERS = 4
+ORDERS = 4  # of the Fourier series of a descriptor
 CHANNELS = 2 * ORDERS + 1
-"""Numbers of a descriptor: a_0, then (a_k cos, a_k sin) of the k-th order."""
+"""Values of a descriptor: a_0, then (a_k cos, a_k sin) of the k-th order."""
 
-CELL = 4
-"""Side of a cell, in pixels of the level that it is read from."""
+CELL_PX = 4
+"""Side of a cell, in pixels of the level from which it is read."""
 
-STEPS = 4
-"""Levels of the pyramid an octave."""
+LEVELS_PER_OCTAVE = 4
+"""Levels of the pyramid per octave."""
 
-LARGEST = 4e6
-"""Pixels of the largest level; at 9 float32 each it takes 144 MB."""
+MAX_LEVEL_PIXELS = 4e6
+"""Maximum number of pixels of a level; at 9 float32 each, that takes 144 MB."""
 
-_POOLING = 0.41 * CELL  # px: standard deviation of a cell with bilinear sharing between neighbours
-_BLOCK = 1.0 * CELL  # px: standard deviation of the surroundings that a cell is normalised by
-_NOISE = 2.0  # grey levels a pixel: gradients below are not blown up by the normalisation
+_POOLING_PX = 0.41 * CELL_PX  # standard deviation of a cell with bilinear sharing between neighbours
+_BLOCK_PX = 1.0 * CELL_PX  # standard deviation of the surroundings by which a cell is normalised
+_NOISE_FLOOR = 2.0  # grey levels per pixel: gradients below are not amplified by the normalisation
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OrientationMap:
-    """Descriptors at every pixel of one level: `values` (h,w,CHANNELS) float32, `scale` (2,) level px an image px."""
+    """Descriptors at every pixel of a level: `values` (h, w, CHANNELS), `scale` (2,) level pixels per image pixel."""
 
     values: F32
     scale: tuple[float, float]
@@ -47,59 +48,56 @@ class OrientationMap:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageFeatures:
-    """The orientation maps of one image, made when they are first asked for. `image` (H,W,3) RGB uint8."""
+    """Orientation maps of one `image` (H, W, 3) RGB uint8, each computed at its first use."""
 
     image: U8
     _levels: dict[int, OrientationMap] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, image: U8) -> ImageFeatures:
-        """Features of an RGB (H,W,3) or grey (H,W) uint8 image; InputError for anything else."""
-        cv2.setNumThreads(1)  # results may depend on the number of threads otherwise
+        """Prepare the features of an RGB (H, W, 3) or grey (H, W) uint8 image; InputError for anything else."""
         return cls(as_rgb(image))
 
-    def levels_of(self, cell: Array) -> NDArray[np.intp]:
-        """Numbers (...,) of the levels whose cells are nearest to `cell` (...,) image pixels wide.
+    def find_levels(self, cell: Array) -> NDArray[np.intp]:
+        """Return the numbers (...,) of the levels whose cells are closest to `cell` (...,) image pixels wide.
 
-        Images are enlarged at most twice, and to LARGEST pixels: smaller cells are read from larger ones.
+        Images are enlarged at most twofold, and to MAX_LEVEL_PIXELS: smaller cells are read as larger ones.
         """
-        finest = max(-STEPS, math.ceil(STEPS / 2 * math.log2(self.image[:, :, 0].size / LARGEST)))
-        return np.asarray(np.maximum(np.rint(STEPS * np.log2(np.asarray(cell) / CELL)), finest), dtype=np.intp)
+        finest = max(
+            -LEVELS_PER_OCTAVE,
+            math.ceil(LEVELS_PER_OCTAVE / 2 * math.log2(self.image[:, :, 0].size / MAX_LEVEL_PIXELS)),
+        )
+        return np.asarray(
+            np.maximum(np.rint(LEVELS_PER_OCTAVE * np.log2(np.asarray(cell) / CELL_PX)), finest), dtype=np.intp
+        )
 
     def level(self, number: int) -> OrientationMap:
-        """Orientation map in which a cell is CELL * 2^(number / STEPS) image pixels wide."""
+        """Return the orientation map in which a cell is CELL_PX * 2^(number / LEVELS_PER_OCTAVE) image pixels wide."""
         if number not in self._levels:
-            self._levels[number] = orientation_map(self.image, 2.0 ** (-number / STEPS))
+            # Results may depend on the number of threads otherwise.
+            with one_opencv_thread():
+                self._levels[number] = orientation_map(self.image, 2.0 ** (-number / LEVELS_PER_OCTAVE))
         return self._levels[number]
 
 
-def as_rgb(image: U8) -> U8:
-    """Return an RGB (H,W,3) or grey (H,W) uint8 image as RGB; InputError for anything else."""
-    if image.dtype == np.uint8 and image.ndim == 2:
-        image = np.repeat(image[:, :, None], 3, axis=2)
-    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
-        raise InputError(f"the image has the shape {image.shape} of {image.dtype}; it must be RGB or grey uint8")
-    return np.ascontiguousarray(image)
-
-
 def orientation_map(image: Array, factor: float) -> OrientationMap:
-    """Orientation map of an image (H,W,3), grey levels of any type, that is first resized by a factor."""
+    """Compute the orientation map of an `image` (H, W, 3), grey levels of any type, resized by `factor`."""
     height, width = image.shape[:2]
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     method = cv2.INTER_AREA if factor < 1.0 else cv2.INTER_LINEAR
     resized = np.asarray(cv2.resize(image, size, interpolation=method), np.float32)
     padded = np.pad(resized, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    histogram = cv2.GaussianBlur(_histogram(padded), (0, 0), _POOLING, borderType=cv2.BORDER_REPLICATE)
+    histogram = cv2.GaussianBlur(_histogram(padded), (0, 0), _POOLING_PX, borderType=cv2.BORDER_REPLICATE)
     histogram = np.asarray(histogram, np.float32).reshape(size[1], size[0], CHANNELS)
     energy = np.ascontiguousarray(histogram[:, :, 0])
-    around = cv2.GaussianBlur(energy, (0, 0), _BLOCK, borderType=cv2.BORDER_REPLICATE).reshape(energy.shape)
-    histogram /= np.asarray(around + _NOISE, np.float32)[:, :, None]
+    around = cv2.GaussianBlur(energy, (0, 0), _BLOCK_PX, borderType=cv2.BORDER_REPLICATE).reshape(energy.shape)
+    histogram /= np.asarray(around + _NOISE_FLOOR, np.float32)[:, :, None]
     return OrientationMap(histogram, (size[0] / width, size[1] / height))
 
 
 @njit(cache=True, nogil=True)
 def _histogram(padded: F32) -> F32:
-    """Magnitude times e^{2ik phi} of the strongest channel's gradient at every inner pixel of `padded` (h+2,w+2,3)."""
+    """Return magnitude times e^{2ik phi} of the strongest channel's gradient at the inner pixels of `padded`."""
     height, width = padded.shape[0] - 2, padded.shape[1] - 2
     out = np.zeros((height, width, 2 * ORDERS + 1), np.float32)
     for y in range(height):

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hands in an image, by how they look and by how they move (thesis, video chapter, "Image Likelihood", Figs. 6 and 7).
+"""Hand detectors by appearance and by motion (thesis, video chapter, "Image Likelihood", Figs. 6 and 7).
 
-Two linear SVMs over oriented boxes at the wrist: one on HOG of the image and on how much each cell is skin, one on HOG
-of the gradient magnitude of the optical flow and on how much its cells move. A box is a grid of cells that turns with
-the forearm, left and right hands share a filter. The map of a detector is the maximum over orientations.
+Two linear SVMs score oriented boxes at the wrist: one on HOG of the image and the skin ratio of each cell, one on HOG
+of the optical flow's gradient magnitude and the motion of each cell. A box is a grid of cells that rotates with the
+forearm; left and right hands share a filter. The map of a detector is the maximum over orientations.
 """
 
 from __future__ import annotations
@@ -17,53 +17,59 @@ import numpy as np
 from numba import njit
 
 from flowing_puppet_ros.arrays import F32, F64, Array, Flow
-from flowing_puppet_ros.evidence.image.features import CHANNELS, ORDERS, STEPS, OrientationMap, orientation_map
+from flowing_puppet_ros.evidence.image.features import (
+    CHANNELS,
+    LEVELS_PER_OCTAVE,
+    ORDERS,
+    OrientationMap,
+    orientation_map,
+)
 from flowing_puppet_ros.evidence.image.likelihood import ImageEvidence
 from flowing_puppet_ros.model import weights
 
-CELL_METRES = 0.04
+CELL_METRES = 0.04  # side of a cell
 ALONG, ACROSS = np.arange(-2, 5), np.arange(-2, 3)
-"""Cells of a box along the forearm, from the wrist towards the finger tips, and across it."""
+"""Cells of a box along the forearm, from the wrist towards the fingertips, and across it."""
 
 EXTRAS = {"image": ("skin",), "flow": ("gradient", "speed")}
-"""What a cell has beside its HOG descriptor: the mean log ratio of skin; the flow's gradient and speed, in [0, 1]."""
+"""Values of a cell besides its HOG descriptor: the mean log ratio of skin; the flow's gradient and speed, in [0, 1]."""
 
 LENGTH = {kind: len(ALONG) * len(ACROSS) * (CHANNELS + len(extras)) for kind, extras in EXTRAS.items()}
-"""Numbers of a descriptor."""
+"""Values of a descriptor."""
 
-ORIENTATIONS = 12
-PITCH = 0.03  # m; between the places of a map
-SHORT = 0.05  # m; a forearm that is seen shorter than this has no direction
-_GRADIENT = 0.25  # px/px a frame at which the flow's gradient counts 63 %
-SPEED = 0.06  # m a frame beside the background at which the speed counts 63 %
+ORIENTATIONS = 12  # of a box, over which a map takes the maximum
+MAP_PITCH_M = 0.03  # between the positions of a map
+MIN_FOREARM_M = 0.05  # a forearm that appears shorter has no direction
+_GRADIENT_SCALE = 0.25  # px/px per frame at which the flow's gradient counts 63 %
+SPEED_SCALE_M = 0.06  # per frame, relative to the background, at which the speed counts 63 %
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandField:
-    """What one detector reads: an orientation map, and the extras (h,w,S) of each of its pixels."""
+    """Input of one detector: an orientation map, and the `extras` (h, w, S) of each of its pixels."""
 
     level: OrientationMap
     extras: F32
 
     @classmethod
-    def of_image(cls, scene: ImageEvidence, scale: float) -> Self:
-        """HOG and skin of a scene in which people have `scale` px/m."""
-        number = int(scene.features.levels_of(np.array(CELL_METRES * scale)))
-        level = scene.features.level(number)
-        skin = _pooled(scene.skin.values.astype(np.float32), level)
+    def of_image(cls, evidence: ImageEvidence, scale: float) -> Self:
+        """Compute HOG and skin of an image in which the person has `scale` px/m."""
+        number = int(evidence.features.find_levels(np.array(CELL_METRES * scale)))
+        level = evidence.features.level(number)
+        skin = _pool(evidence.skin.values.astype(np.float32), level)
         return cls(level, skin[..., None])
 
     @classmethod
     def of_flow(cls, flows: Sequence[Flow], scale: float) -> Self:
-        """HOG of the gradient magnitude, and motion, of the flows (H,W,2) px that lead away from one image."""
-        pictures = [_moving(flow, scale) for flow in flows]
-        gradient, speed = np.mean(pictures, axis=0)
-        factor = 2.0 ** (-round(STEPS * np.log2(max(CELL_METRES * scale, 2.0) / 4.0)) / STEPS)
+        """Compute HOG of the gradient magnitude, and motion, of the `flows` (H, W, 2) px from one image."""
+        motions = [_measure_motion(flow, scale) for flow in flows]
+        gradient, speed = np.mean(motions, axis=0)
+        factor = 2.0 ** (-round(LEVELS_PER_OCTAVE * np.log2(max(CELL_METRES * scale, 2.0) / 4.0)) / LEVELS_PER_OCTAVE)
         level = orientation_map(np.repeat(255 * gradient[..., None], 3, axis=2), factor)
-        return cls(level, np.stack([_pooled(gradient, level), _pooled(speed, level)], axis=2))
+        return cls(level, np.stack([_pool(gradient, level), _pool(speed, level)], axis=2))
 
     def describe(self, wrist: F64, angle: F64, cell: float) -> F32:
-        """Descriptors (N,D) of boxes at wrists (N,2) px that point along `angle` (N,), with cells of `cell` px."""
+        """Describe boxes at `wrist` (N, 2) px that point along `angle` (N,) rad, with cells of `cell` px, as (N, D)."""
         size = self.level.values.shape[2] + self.extras.shape[2]
         out = np.zeros((len(wrist), len(ALONG) * len(ACROSS), size), np.float32)
         places = np.ascontiguousarray(np.nan_to_num(wrist), np.float64)
@@ -71,18 +77,18 @@ class HandField:
         return out.reshape(len(wrist), len(ALONG) * len(ACROSS) * size)
 
 
-def _moving(flow: Flow, scale: float) -> tuple[F32, F32]:
-    """Gradient magnitude of a flow field (H,W,2) and its speed beside the background's, each (H,W) in [0, 1]."""
+def _measure_motion(flow: Flow, scale: float) -> tuple[F32, F32]:
+    """Return a flow's gradient magnitude and its speed relative to the background, each (H, W) in [0, 1]."""
     known = np.nan_to_num(flow)
     vertical, horizontal = np.gradient(known, axis=(0, 1))
     gradient = np.sqrt((vertical**2 + horizontal**2).sum(axis=2))
     beside = known - np.median(known.reshape(-1, 2), axis=0)
-    speed = np.hypot(beside[..., 0], beside[..., 1]) / (SPEED * scale)
-    return (1 - np.exp(-gradient / _GRADIENT)).astype(np.float32), (1 - np.exp(-speed)).astype(np.float32)
+    speed = np.hypot(beside[..., 0], beside[..., 1]) / (SPEED_SCALE_M * scale)
+    return (1 - np.exp(-gradient / _GRADIENT_SCALE)).astype(np.float32), (1 - np.exp(-speed)).astype(np.float32)
 
 
-def _pooled(values: F32, level: OrientationMap) -> F32:
-    """A map (H,W) at the resolution of a level, each pixel the mean of about a cell."""
+def _pool(values: F32, level: OrientationMap) -> F32:
+    """Resize a map `values` (H, W) to a level's resolution, each pixel the mean of about a cell."""
     height, width = level.values.shape[:2]
     small = cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.GaussianBlur(small, (0, 0), 1.6, borderType=cv2.BORDER_REPLICATE)).reshape(height, width)
@@ -127,8 +133,8 @@ def _describe(
                 re, im = re * turn_re - im * turn_im, re * turn_im + im * turn_re
 
 
-def mirrored(descriptors: F32) -> F32:
-    """Descriptors (N,D) of the same boxes seen in a mirror along the forearm: a left hand's become a right hand's."""
+def mirror(descriptors: F32) -> F32:
+    """Mirror `descriptors` (N, D) of boxes along the forearm: a left hand's become a right hand's."""
     cells = descriptors.reshape(len(descriptors), len(ALONG), len(ACROSS), -1)[:, :, ::-1].copy()
     cells[..., 2:CHANNELS:2] *= -1
     return cells.reshape(descriptors.shape)
@@ -143,25 +149,25 @@ class HandFilter:
     odds: tuple[float, float]
 
     def margin(self, descriptors: F32) -> F64:
-        """Output (N,) for descriptors (N,D)."""
+        """Return the SVM's output (N,) for `descriptors` (N, D)."""
         return np.asarray(descriptors @ self.weight + self.bias, np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandDetectors:
-    """Both filters, and how much their margins count together: `joint` (3,) weights of image and flow, and bias."""
+    """Both filters, and how their margins combine: `joint` (3,) are the weights of image and flow, and a bias."""
 
     filters: Mapping[str, HandFilter]
     joint: F64
 
     @classmethod
     def load(cls, name: str = "upper") -> Self:
-        """The shipped detectors; InputError when there are none of that name."""
+        """Load the shipped detectors; InputError if there are none of that name."""
         return cls.from_arrays(weights.load("hands", name))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array]) -> Self:
-        """Detectors of the arrays that `to_arrays` gives."""
+        """Build from the arrays that `to_arrays` returns."""
         filters = {}
         for kind in EXTRAS:
             bias, slope, offset = (float(value) for value in arrays[f"{kind}_odds"])
@@ -169,7 +175,7 @@ class HandDetectors:
         return cls(filters, np.asarray(arrays["joint"], np.float64))
 
     def to_arrays(self) -> dict[str, F32]:
-        """Arrays for an .npz file."""
+        """Return the arrays for an .npz file."""
         arrays = {"joint": self.joint.astype(np.float32)}
         for kind, known in self.filters.items():
             arrays[f"{kind}_weight"] = known.weight.astype(np.float32)
@@ -179,10 +185,10 @@ class HandDetectors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandMaps:
-    """The evidence for hands in one image in which people have `scale` px/m; without flow, the image's alone.
+    """Evidence for hands in one image in which the person has `scale` px/m; without flow, by appearance alone.
 
-    `fields` by kind ("image", "flow"), in the pixels of a piece of the image: `corner` (2,) is its place, and `factor`
-    its pixels per pixel, of the image in whose pixels places are given.
+    `fields` by kind ("image", "flow") are in the pixels of a crop: `corner` (2,) is its position in the image in whose
+    pixels wrists are given, and `factor` its pixels per pixel of that image.
     """
 
     detectors: HandDetectors
@@ -195,27 +201,27 @@ class HandMaps:
     def of(
         cls,
         detectors: HandDetectors,
-        scene: ImageEvidence,
+        evidence: ImageEvidence,
         flows: Sequence[Flow],
         scale: float,
         corner: F64 | None = None,
         factor: float = 1.0,
     ) -> Self:
-        """Maps of a scene; `flows` (H,W,2) lead away from its image, on its grid and in its pixels, as does `scale`."""
-        fields = {"image": HandField.of_image(scene, scale)}
+        """Compute the maps of a crop; `flows` (H, W, 2) from it are on its grid and, like `scale`, in its pixels."""
+        fields = {"image": HandField.of_image(evidence, scale)}
         if flows:
             fields["flow"] = HandField.of_flow(flows, scale)
         return cls(detectors, fields, scale, np.zeros(2) if corner is None else corner, factor)
 
     def log_odds(self, kind: str, wrist: F64, angle: F64) -> F64:
-        """Log odds (N,) of hands at wrists (N,2) px along `angle` (N,), by one detector; 0 where it has no field."""
+        """Return one detector's log odds (N,) of hands at `wrist` (N, 2) px along `angle` (N,); 0 without a field."""
         if kind not in self.fields:
             return np.zeros(len(wrist))
         slope, offset = self.detectors.filters[kind].odds
         return slope * self._margin(kind, wrist, angle) + offset
 
     def score(self, wrist: F64, angle: F64) -> F64:
-        """Log odds (N,) of hands by both detectors together."""
+        """Return the log odds (N,) of hands by both detectors together."""
         if "flow" not in self.fields:
             return self.log_odds("image", wrist, angle)
         image, flow, bias = self.detectors.joint
@@ -227,24 +233,24 @@ class HandMaps:
         return self.detectors.filters[kind].margin(described)
 
     def best_orientation(self, kind: str, places: F64) -> tuple[F64, F64]:
-        """Largest log odds (N,) over the orientations of a box at places (N,2) px, and the orientation (N,)."""
+        """Return the maximum log odds (N,) over box orientations at `places` (N, 2) px, and the angles (N,) rad."""
         turns = np.arange(ORIENTATIONS) * (2 * np.pi / ORIENTATIONS)
         odds = np.stack([self.log_odds(kind, places, np.full(len(places), turn)) for turn in turns])
         return odds.max(axis=0), np.asarray(turns[odds.argmax(axis=0)], np.float64)
 
 
 def hand_score(maps: HandMaps, wrist: F64, elbow: F64, scale: float) -> F64:
-    """Log odds (N,) that the hands of forearms from `elbow` (N,2) to `wrist` (N,2) px are there; `scale` px/m.
+    """Return the log odds (N,) of hands at forearms from `elbow` (N, 2) to `wrist` (N, 2) px; `scale` in px/m.
 
-    The log odds are those against random places near a person, one for one. A forearm that points at the camera may
-    have its hand in any direction. 0 where a place is not finite.
+    They are relative to as many random positions near a person. A forearm that points at the camera may have its hand
+    in any direction. 0 where a position is not finite.
     """
     wrist, elbow = np.asarray(wrist, np.float64), np.asarray(elbow, np.float64)
     along = wrist - elbow
     known = np.isfinite(along).all(axis=1)
     angle = np.arctan2(np.where(known, along[:, 1], 0.0), np.where(known, along[:, 0], 1.0))
     score = maps.score(wrist, angle)
-    short = known & (np.hypot(along[:, 0], along[:, 1]) < SHORT * scale)
+    short = known & (np.hypot(along[:, 0], along[:, 1]) < MIN_FOREARM_M * scale)
     if short.any():
         turns = np.arange(ORIENTATIONS) * (2 * np.pi / ORIENTATIONS)
         score[short] = np.max([maps.score(wrist[short], np.full(short.sum(), turn)) for turn in turns], axis=0)

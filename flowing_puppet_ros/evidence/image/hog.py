@@ -3,7 +3,7 @@
 
 P. F. Felzenszwalb, R. B. Girshick, D. McAllester, D. Ramanan: Object Detection with Discriminatively Trained
 Part-Based Models, section 6. Cells at the border are normalised with their own replicas beyond it, so that no row or
-column is lost, and a 32nd dimension is 0 inside the image: whoever pads the grid sets it to 1.
+column is lost. The 32nd dimension is 0 inside the image; code that pads the grid sets it to 1.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from numba import njit
 
 from flowing_puppet_ros.arrays import F32, U8
 
-SIGNED = 18  # orientations that tell dark-to-bright from bright-to-dark
-UNSIGNED = 9
+SIGNED = 18  # orientations that distinguish dark-to-bright from bright-to-dark ...
+UNSIGNED = 9  # ... and that do not
 DIMENSIONS = 32
-OUTSIDE = 31  # index of the dimension that is 1 in cells outside the image
-TRUNCATE = 0.2
-TEXTURE = 0.2357  # weight of the four gradient energies
-LEAST_ENERGY = 1e-4
+OUTSIDE_INDEX = 31  # of the dimension that is 1 in cells outside the image
+MAX_VALUE = 0.2  # at which normalised votes are truncated
+TEXTURE_WEIGHT = 0.2357  # of the four gradient energies
+MIN_ENERGY = 1e-4  # keeps flat blocks from a division by zero
 
 
 def hog(image: U8, cell: int) -> F32:
-    """HOG (H // cell, W // cell, 32) of `image` (H, W, 3) or (H, W); `cell` in px, what is over is left out.
+    """Compute HOG (H // cell, W // cell, 32) of `image` (H, W, 3) or (H, W); `cell` in px, remainders are left out.
 
     The gradient of the strongest channel votes at its orientation, linearly shared by the four nearest cells.
     """
@@ -43,7 +43,7 @@ def hog(image: U8, cell: int) -> F32:
 
 @cache
 def _gradient_table() -> tuple[U8, F32]:
-    """Orientation bin and magnitude of the gradient (dx, dy), both at [dy + 255, dx + 255]."""
+    """Tabulate orientation bin and magnitude of the gradient (dx, dy), both at [dy + 255, dx + 255]."""
     dy, dx = np.mgrid[-255:256, -255:256].astype(np.float64)
     angles = np.arange(SIGNED) * (2 * math.pi / SIGNED)
     scores = np.stack([math.cos(angle) * dx + math.sin(angle) * dy for angle in angles])
@@ -52,7 +52,7 @@ def _gradient_table() -> tuple[U8, F32]:
 
 @njit(cache=True, nogil=True)
 def _histograms(pixels: U8, cell: int, rows: int, columns: int, orientation: U8, magnitude: F32) -> Any:
-    """Votes (rows, columns, 18) of the pixels of whole cells, without the image's outermost pixels."""
+    """Collect the votes (rows, columns, 18) of the pixels of whole cells, without the image's outermost pixels."""
     votes = np.zeros((rows + 2, columns + 2, SIGNED), np.float32)
     height, width, channels = pixels.shape
     for y in range(1, min(rows * cell, height - 1)):
@@ -81,7 +81,7 @@ def _histograms(pixels: U8, cell: int, rows: int, columns: int, orientation: U8,
 
 @njit(cache=True, nogil=True)
 def _normalise(histogram: F32) -> Any:
-    """Features (rows, columns, 32): 18 signed, 9 unsigned orientations, 4 gradient energies, and 0."""
+    """Return the features (rows, columns, 32): 18 signed, 9 unsigned orientations, 4 gradient energies, and 0."""
     rows, columns = histogram.shape[:2]
     energy = np.zeros((rows + 2, columns + 2), np.float32)
     for r in range(rows + 2):
@@ -96,14 +96,14 @@ def _normalise(histogram: F32) -> Any:
             for block in range(4):
                 y, x = r + block // 2, c + block % 2
                 total = energy[y, x] + energy[y, x + 1] + energy[y + 1, x] + energy[y + 1, x + 1]
-                scale = np.float32(1.0) / np.sqrt(total + np.float32(LEAST_ENERGY))
+                scale = np.float32(1.0) / np.sqrt(total + np.float32(MIN_ENERGY))
                 strength = np.float32(0.0)
                 for o in range(SIGNED):
-                    value = min(at[o] * scale, np.float32(TRUNCATE))
+                    value = min(at[o] * scale, np.float32(MAX_VALUE))
                     out[o] += np.float32(0.5) * value
                     strength += value
                 for o in range(UNSIGNED):
                     both = (at[o] + at[o + UNSIGNED]) * scale
-                    out[SIGNED + o] += np.float32(0.5) * min(both, np.float32(TRUNCATE))
-                out[SIGNED + UNSIGNED + block] = np.float32(TEXTURE) * strength
+                    out[SIGNED + o] += np.float32(0.5) * min(both, np.float32(MAX_VALUE))
+                out[SIGNED + UNSIGNED + block] = np.float32(TEXTURE_WEIGHT) * strength
     return features

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Geometry of closed part contours: which way they run, their direction and their outward normal."""
+"""Geometry of closed part contours: winding, direction and outward normal."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from numba import njit
 
 from flowing_puppet_ros.arrays import F64, Array
 
-FARTHEST = 1e7  # px; coordinates beyond are moved here, where no image is
-_REACH = 2  # points on either side that tell the direction of a contour
+MAX_COORDINATE_PX = 1e7  # coordinates are clipped here, far outside of any image
+_DIRECTION_STEP = 2  # points on either side from which the direction of a contour is computed
 
 
-def checked(contours: Array) -> F64:
-    """Contours (P,K,2) as contiguous float64 whose products cannot overflow; what is NaN stays NaN."""
-    return np.ascontiguousarray(np.clip(np.asarray(contours, np.float64), -FARTHEST, FARTHEST))
+def clip_coordinates(contours: Array) -> F64:
+    """Return contours (P, K, 2) as contiguous float64 whose products cannot overflow; NaN stays NaN."""
+    return np.ascontiguousarray(np.clip(np.asarray(contours, np.float64), -MAX_COORDINATE_PX, MAX_COORDINATE_PX))
 
 
-def mirrored_order(contours: Array) -> Array:
-    """The points of contours (...,K,2) in the order in which they run on the part of the body's other side."""
+def mirror_order(contours: Array) -> Array:
+    """Return the points of contours (..., K, 2) in the order of the part on the body's other side."""
     return contours[..., -np.arange(contours.shape[-2]) % contours.shape[-2], :]
 
 
-def grown(contours: Array, distance: Array) -> F64:
-    """Contours (P,K,2) whose points are moved outward by `distance` (P,) px along their normals."""
-    moved = checked(contours).copy()
-    _grow(checked(contours), np.ascontiguousarray(distance, np.float64), moved)
+def grow(contours: Array, distance: Array) -> F64:
+    """Move the points of contours (P, K, 2) outward by `distance` (P,) px along their normals."""
+    moved = clip_coordinates(contours).copy()
+    _grow(clip_coordinates(contours), np.ascontiguousarray(distance, np.float64), moved)
     return moved
 
 
 @njit(cache=True, nogil=True)
 def winding(contour: Array) -> float:
-    """1 for a contour that runs like a right part's in the front view, -1 for a mirrored one, NaN for a broken one.
+    """Return 1 for a contour that runs like a right part's in the front view, -1 for a mirrored one, NaN if not finite.
 
     With it, the outward normal is `winding * (-t_y, t_x)` where t is the direction.
     """
@@ -47,9 +47,9 @@ def winding(contour: Array) -> float:
 
 @njit(cache=True, nogil=True)
 def direction(contour: Array, k: int) -> tuple[float, float]:
-    """Unit vector along a contour (K,2) at its point k."""
+    """Return the unit vector along a contour (K, 2) at its point `k`."""
     count = contour.shape[0]
-    a, b = (k + count - _REACH) % count, (k + _REACH) % count
+    a, b = (k + count - _DIRECTION_STEP) % count, (k + _DIRECTION_STEP) % count
     tx, ty = contour[b, 0] - contour[a, 0], contour[b, 1] - contour[a, 1]
     length = np.sqrt(tx * tx + ty * ty)
     return (tx / length, ty / length) if length > 0.0 else (1.0, 0.0)

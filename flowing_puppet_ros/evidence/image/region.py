@@ -9,44 +9,44 @@ import numpy as np
 from numba import njit
 
 from flowing_puppet_ros.arrays import F64, Array
-from flowing_puppet_ros.evidence.image.outline import checked
+from flowing_puppet_ros.evidence.image.outline import clip_coordinates
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RegionMap:
-    """A map over the image, made ready for sums over regions. `values` (H,W), `along` (H,W+1) sums of its rows."""
+    """A map over the image, prepared for sums over regions: `values` (H, W), `along` (H, W+1) sums of its rows."""
 
     values: F64
     along: F64
 
     @classmethod
     def of(cls, values: Array) -> RegionMap:
-        """Prepare a map (H,W)."""
+        """Prepare a map `values` (H, W)."""
         values = np.ascontiguousarray(values, np.float64)
         return cls(values, np.pad(np.cumsum(values, axis=1), ((0, 0), (1, 0))))
 
     def sums(self, contours: Array) -> tuple[F64, F64]:
-        """Sum (P,) over the pixels whose centres lie in closed contours (P,K,2) px, and how many those are (P,).
+        """Sum the map over the pixels with centres inside closed `contours` (P, K, 2) px.
 
-        NaN where a contour is not finite.
+        Returns the sums (P,) and the numbers of pixels (P,); NaN where a contour is not finite.
         """
         total, area = np.zeros(len(contours)), np.zeros(len(contours))
-        _sums(self.along, checked(contours), total, area)
+        _sums(self.along, clip_coordinates(contours), total, area)
         return total, area
 
     def mean(self, contours: Array) -> F64:
-        """Mean (P,) over the regions of contours (P,K,2) px: 0 where none is in the image, NaN where not finite."""
+        """Average the map over the regions of `contours` (P, K, 2) px: 0 outside the image, NaN where not finite."""
         return ratio(*self.sums(contours))
 
 
 def ratio(total: Array, count: Array) -> F64:
-    """Divide sums by counts; 0 where there is nothing."""
+    """Divide sums by counts; 0 where the count is 0."""
     return np.where(count == 0.0, 0.0, total / np.where(count == 0.0, 1.0, count))
 
 
 @njit(cache=True, nogil=True)
 def _sums(along: Array, contours: Array, total: Array, area: Array) -> None:
-    """Green's theorem by rows: every edge adds, with its sign, what lies to the left of where it crosses a row."""
+    """Sum by Green's theorem, row by row: every edge adds, with its sign, what lies to the left of its crossing."""
     height, width = along.shape[0], along.shape[1] - 1
     for p in range(contours.shape[0]):
         last = contours.shape[1] - 1

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """HOG descriptors along a contour, on it, inside and outside, steered to its local direction (thesis, Figs. 2, 3, 5).
 
-The frame of a descriptor is the outward normal and the direction in which the contour's points run: a contour that is
-turned or mirrored together with the image keeps its descriptors.
+The frame of a descriptor is the outward normal and the direction in which the contour's points run: a contour rotated
+or mirrored together with the image keeps its descriptors.
 """
 
 from __future__ import annotations
@@ -12,28 +12,28 @@ from numba import njit
 
 from flowing_puppet_ros.arrays import F32, Array, Bools
 from flowing_puppet_ros.evidence.image.features import CHANNELS, ORDERS, OrientationMap
-from flowing_puppet_ros.evidence.image.outline import checked, direction, winding
+from flowing_puppet_ros.evidence.image.outline import clip_coordinates, direction, winding
 
 SIDES = 3
-"""Descriptors at a place: inside the contour, on it, outside."""
+"""Descriptors per contour point: inside the contour, on it, outside."""
 
 
 def descriptors(level: OrientationMap, contours: Array, places: Array, offset: Array) -> tuple[F32, Bools]:
-    """Steered descriptors (P,n,SIDES,CHANNELS) of contours (P,K,2) px at the point indices `places` (n,).
+    """Return steered descriptors (P, n, SIDES, CHANNELS) of `contours` (P, K, 2) px at the point indices `places` (n,).
 
-    `offset` (P,) px is how far inside and outside. The second array (P,n,SIDES) tells which lie in the image; the
+    `offset` (P,) px is how far inside and outside. The second array (P, n, SIDES) tells which lie in the image; the
     others' descriptors are 0, and so are those of contours that are not finite.
     """
     found = np.zeros((len(contours), len(places), SIDES, CHANNELS), np.float32)
     visible = np.zeros(found.shape[:3], np.bool_)
     places, offset = np.ascontiguousarray(places, np.int64), np.ascontiguousarray(offset, np.float64)
-    _descriptors(level.values, *level.scale, checked(contours), places, offset, found, visible)
+    _descriptors(level.values, *level.scale, clip_coordinates(contours), places, offset, found, visible)
     return found, visible
 
 
 @njit(cache=True, nogil=True)
 def _read(values: Array, x: float, y: float, steer: tuple[float, float, float], out: Array) -> None:
-    """Bilinear descriptor at level pixel (x, y), turned so that angles count from the normal (cos 2a, sin 2a, hand)."""
+    """Interpolate at level pixel (x, y) and rotate: angles count from the normal; `steer` is cos 2a, sin 2a, hand."""
     height, width = values.shape[0], values.shape[1]
     x, y = min(max(x, 0.0), width - 1.0), min(max(y, 0.0), height - 1.0)
     left, top = int(x), int(y)

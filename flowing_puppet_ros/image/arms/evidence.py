@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How one person is seen in one image: what the detector and the evidence say of any place of the arms."""
+"""Evidence for the arms of one person in one image: scores of any arm position by detector, contours and colour."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from typing import Self
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, U8
-from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
-from flowing_puppet_ros.image.arms.viterbi import PathSettings
+from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
 from flowing_puppet_ros.image.detector.detection import PersonDetection
 from flowing_puppet_ros.image.pose.evidence import LikelihoodLike, PersonWindow
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
+from flowing_puppet_ros.threads import one_blas_thread
 
 ARM_JOINTS = ("elbow", "wrist")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmEvidence:
-    """A person in one image.
+    """One person in one image.
 
-    `joints` (J, 2) px as tracked, the `detection` (None where it was missed), and the evidence around the person (None
-    outside of the image).
+    `joints` (J, 2) px are as tracked, `scale` is in px/m, `detection` is None if the person was missed, and `window`,
+    the image evidence around the person, is None outside of the image.
     """
 
     model: DeformableStructures
@@ -37,18 +37,18 @@ class ArmEvidence:
     window: PersonWindow | None
 
     @property
-    def width(self) -> float:
-        """Shoulder width in px."""
+    def shoulder_width_px(self) -> float:
+        """Shoulder width in pixels."""
         return self.scale * self.model.shoulder_width
 
     def hypotheses(self, side: str, count: int) -> F64:
-        """Elbow and wrist (K, 2, 2) px of the detector's modes of an arm; without it the tracked ones."""
+        """Return elbow and wrist (K, 2, 2) px of up to `count` modes of the detector; without it, the tracked ones."""
         if self.detection is not None:
-            return self.detection.arms(side, count)
+            return self.detection.arm_hypotheses(side, count)
         return self.joints[None, [self.model.joint_names.index(f"{side}_{name}") for name in ARM_JOINTS]]
 
-    def score(self, side: str, places: F64, settings: PathSettings) -> F64:
-        """Score (K,) in nats of elbow and wrist at places (K, 2, 2) px."""
+    def score(self, side: str, places: F64, settings: ArmPathSettings) -> F64:
+        """Score elbow and wrist at `places` (K, 2, 2) px, (K,) nats."""
         score = np.zeros(len(places))
         if self.detection is not None:
             elbow, wrist = (
@@ -56,15 +56,15 @@ class ArmEvidence:
             )
             score = settings.detector_weight * np.minimum(elbow, wrist)
         if self.window is not None and settings.evidence_weight > 0:
-            score = score + settings.evidence_weight * self._evidence(self.window, side, places)
+            score = score + settings.evidence_weight * self._window_score(self.window, side, places)
         return score
 
     @property
     def pose_score(self) -> float:
-        """Score of the detected pose; NaN where nobody was detected."""
+        """Score of the detected pose; NaN if the person was missed."""
         return np.nan if self.detection is None else self.detection.score
 
-    def _evidence(self, window: PersonWindow, side: str, places: F64) -> F64:
+    def _window_score(self, window: PersonWindow, side: str, places: F64) -> F64:
         rows = [self.model.joint_names.index(f"{side}_{name}") for name in ARM_JOINTS]
         parts = [self.model.tree.names.index(f"{side}_{name}") for name in ("upper_arm", "lower_arm")]
         joints = np.repeat(self.joints[None], len(places), axis=0)
@@ -78,7 +78,7 @@ class ArmEvidence:
 def person_window(
     model: DeformableStructures, likelihood: LikelihoodLike, image: U8, puppet: TrackedPuppet
 ) -> PersonWindow | None:
-    """The evidence around a puppet in an image (H, W, 3), with the colours of its torso and head; None outside."""
+    """Prepare the evidence around a puppet in `image` (H, W, 3), with its torso's and head's colours; None outside."""
     window = PersonWindow.around(likelihood, image, puppet.joints, puppet.scale)
     if window is None:
         return None
@@ -88,9 +88,9 @@ def person_window(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmEvidenceModel:
-    """What sees the arms of people: evidence, and the model of ten parts for which it was learned.
+    """Image likelihood of arms, and the model of ten parts for which it was learned.
 
-    A puppet with hands and feet has these parts and joints too, and before its others.
+    A puppet with hands and feet has these parts and joints too, in front of its others.
     """
 
     model: DeformableStructures
@@ -98,11 +98,11 @@ class ArmEvidenceModel:
 
     @classmethod
     def load(cls, name: str) -> Self:
-        """Eyes for puppets of a body model, "neutral", "female" or "male"."""
+        """Load the model for puppets of a body model, "neutral", "female" or "male"."""
         return cls(DeformableStructures.load(name), PartLikelihood.load())
 
-    def evidence(self, image: U8, puppet: TrackedPuppet, detection: PersonDetection | None) -> ArmEvidence:
-        """How a tracked puppet is seen in an image (H, W, 3) or (H, W), where the detector found it so."""
+    def extract(self, image: U8, puppet: TrackedPuppet, detection: PersonDetection | None) -> ArmEvidence:
+        """Extract the arm evidence of a tracked puppet, and its detection, in an image (H, W, 3) or (H, W)."""
         colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
         # Sums of several BLAS threads would differ in their last bits.
         with one_blas_thread():

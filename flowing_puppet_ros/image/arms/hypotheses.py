@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hypotheses of the arms of the people in a clip: the detector's, and their neighbours' in time carried by the flow.
+"""Hypotheses of a person's arms over time: the detector's, and those propagated by the flow from neighbouring images.
 
-Each hypothesis is judged in its own image, by the detector's max-marginals and by contour and colour; which is true is
-decided at the end of the clip, by `arm_path`.
+Each hypothesis is scored in its own image, by the detector's max-marginals and by contour and colour. `ArmSmoother`
+chooses among them at the end of a clip, by `viterbi`; `ArmFilter` chooses in every image.
 """
 
 from __future__ import annotations
@@ -15,66 +15,66 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arms.evidence import ARM_JOINTS, ArmEvidence
-from flowing_puppet_ros.image.arms.viterbi import ArmHypotheses, PathSettings, max_marginals, step_costs
+from flowing_puppet_ros.image.arms.viterbi import ArmHypotheses, ArmPathSettings, max_marginals, step_costs
 from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.image.tracking.smoothing import flow_at_joints, sample_flow
 
 SIDES = ("right", "left")
-MAX_PROPAGATED = 3  # hypotheses of a neighbouring image that are carried into this one
-MAX_KEPT, MIN_DISTANCE = 8, 0.2
-"""Live more are carried, since one that is dropped is lost; and only such as differ by so many shoulder widths at elbow
-or wrist, since the best ones often are one and the same."""
-NEAR = 0.35  # shoulder widths within which hypotheses of the wrist agree
-DOUBT = 2.0  # nats, cost difference at which a path counts 1/e of the best
-RIGHT = np.array([[-0.07, 0.10, 0.23], [-0.51, 0.23, 0.26]])
-"""Log-odds that elbow and wrist lie within 20 px of a 320x240 image's true place: a constant, and by the scores of the
-arm and of the whole pose. Logistic regression over the live and batch tracks of 31 annotated clips."""
+MAX_PROPAGATED = 3  # hypotheses propagated from a neighbouring image
+MAX_LIVE, MIN_DISTINCT_WIDTHS = 8, 0.2
+"""Live mode keeps more hypotheses, since dropped ones cannot return, and only distinct ones: at least so many shoulder
+widths apart at elbow or wrist."""
+SAME_WRIST_WIDTHS = 0.35  # shoulder widths within which hypotheses of the wrist agree
+PATH_TEMPERATURE_NATS = 2.0  # cost difference at which a path counts 1/e of the best
+CORRECTNESS_WEIGHTS = np.array([[-0.07, 0.10, 0.23], [-0.51, 0.23, 0.26]])
+"""Weights of the log odds that elbow and wrist lie within 20 px of the truth in a 320x240 image: a constant, the score
+of the arm and that of the whole pose. Logistic regression over the live and batch tracks of 31 annotated clips."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmTrajectory:
     """Elbow and wrist over T images.
 
-    `places` (T, 2, 2) px, `motion` (T, 2, 2) px to the next, `sure` (T,) how clearly they beat other paths, 0 to 1, and
-    `right` (T, 2) probability that they are in place, NaN where nobody was detected.
+    `places` (T, 2, 2) px, `motion` (T, 2, 2) px to the next image, `certainty` (T,) in [0, 1] of the choice of path,
+    `correctness` (T, 2), the probability that each joint is right, NaN where the person was missed.
     """
 
     places: F64
     motion: F64
-    sure: F64
-    right: F64
+    certainty: F64
+    correctness: F64
 
 
 @dataclass(slots=True, eq=False)
 class ArmSmoother:
     """Hypotheses of both arms of one person over consecutive images."""
 
-    settings: PathSettings
+    settings: ArmPathSettings
     _arms: dict[str, list[ArmHypotheses]] = field(default_factory=lambda: {side: [] for side in SIDES})
     _poses: list[float] = field(default_factory=list)
     _last: ArmEvidence | None = None
 
-    def add(self, sight: ArmEvidence, flow: FlowPair | None, grid: ImageScale) -> None:
-        """Take the next image; `flow` (forward, backward) leads to it from the one before, on the working grid."""
+    def add(self, evidence: ArmEvidence, flow: FlowPair | None, grid: ImageScale) -> None:
+        """Add the next image; `flow` (forward, backward) leads to it from the one before, on the working grid."""
         for side in SIDES:
             arms = self._arms[side]
-            own = sight.hypotheses(side, self.settings.modes)
+            own = evidence.hypotheses(side, self.settings.modes)
             if arms and flow is not None and self._last is not None:
-                arms[-1] = self._extended(arms[-1], side, own, flow, grid)
-                own = np.concatenate([own, _best(arms[-1])])
-            score = sight.score(side, own, self.settings)
+                arms[-1] = self._extend_backward(arms[-1], side, own, flow, grid)
+                own = np.concatenate([own, _propagate_best(arms[-1])])
+            score = evidence.score(side, own, self.settings)
             arms.append(ArmHypotheses(own, score, np.zeros_like(own)))
-        self._poses.append(sight.pose_score)
-        self._last = sight
+        self._poses.append(evidence.pose_score)
+        self._last = evidence
 
-    def _extended(
+    def _extend_backward(
         self, before: ArmHypotheses, side: str, after: F64, flow: FlowPair, grid: ImageScale
     ) -> ArmHypotheses:
-        """The image before with the best of this image carried back into it, and everybody's motion."""
+        """Return the hypotheses `before`, with motions, and the best of `after` propagated back into that image."""
         assert self._last is not None
-        motion = _motion(flow, grid, before.places)
+        motion = _measure_motion(flow, grid, before.places)
         source = after[:MAX_PROPAGATED]
-        back = source + _motion((flow[1], flow[0]), grid, source)
+        back = source + _measure_motion((flow[1], flow[0]), grid, source)
         score = self._last.score(side, back, self.settings)
         return ArmHypotheses(
             np.concatenate([before.places, back]),
@@ -83,113 +83,116 @@ class ArmSmoother:
         )
 
     def resolve(self, width: float) -> dict[str, ArmTrajectory]:
-        """The best path of each arm; `width` is the shoulder width in pixels."""
-        return {side: _resolved(arms, self._poses, width, self.settings) for side, arms in self._arms.items() if arms}
+        """Return the best path of each arm; `width` is the shoulder width in pixels."""
+        return {
+            side: _resolve_arm(arms, self._poses, width, self.settings) for side, arms in self._arms.items() if arms
+        }
 
 
 @dataclass(slots=True, eq=False)
 class ArmFilter:
-    """The arms of one person live: of every hypothesis the cost of the best path that leads there, nothing older."""
+    """Forward pass over the arms of one person: it keeps each hypothesis with the score of the best path to it."""
 
-    settings: PathSettings
+    settings: ArmPathSettings
     _arms: dict[str, ArmHypotheses] = field(default_factory=dict)
     _images: int = 0
 
     def propagate(self, flow: FlowPair | None, grid: ImageScale) -> None:
-        """Go on to the next image, whether anybody looks there or not.
+        """Propagate the hypotheses to the next image, with or without a detection there.
 
-        `flow` (forward, backward) leads there, on the working grid; without one nothing before that image counts.
+        `flow` (forward, backward) leads there, on the working grid; without one, the past is dropped.
         """
         if flow is None:
             self._arms.clear()
         else:
-            self.predict(lambda places: places + _motion(flow, grid, places), 1)
+            self.predict(lambda places: places + _measure_motion(flow, grid, places), 1)
 
-    def predict(self, moved: Callable[[F64], F64], images: int) -> None:
-        """Go `images` on, where `moved` takes places (K, 2, 2) px of this image."""
+    def predict(self, warp: Callable[[F64], F64], images: int) -> None:
+        """Advance by `images` images; `warp` moves positions (K, 2, 2) px of this image there."""
         self._images += images
-        self._arms = {side: replace(arm, places=moved(arm.places)) for side, arm in self._arms.items()}
+        self._arms = {side: replace(arm, places=warp(arm.places)) for side, arm in self._arms.items()}
 
-    def step(self, sight: ArmEvidence) -> dict[str, tuple[F64, F64]]:
-        """Elbow and wrist (2, 2) px of each arm in this image, and the probabilities (2,) that they are right.
+    def step(self, evidence: ArmEvidence) -> dict[str, tuple[F64, F64]]:
+        """Score this image; return each arm's elbow and wrist (2, 2) px, and their probabilities (2,) of being right.
 
-        NaN where nobody was detected.
+        The probabilities are NaN if the person was missed.
         """
-        # What the flow errs adds up from image to image.
+        # Errors of the flow add up from image to image.
         settings = replace(self.settings, flow_strength=self.settings.flow_strength / max(1, self._images))
         self._images = 0
-        return {side: self._side(side, sight, settings) for side in SIDES}
+        return {side: self._step_side(side, evidence, settings) for side in SIDES}
 
-    def joints(self, sight: ArmEvidence) -> dict[int, tuple[F64, float]]:
-        """The same by the joints' indices in the model: place (2,) px and probability of each."""
-        names = sight.model.joint_names
+    def step_joints(self, evidence: ArmEvidence) -> dict[int, tuple[F64, float]]:
+        """Do a `step`; return by joint index of the model the position (2,) px and the probability of each."""
+        names = evidence.model.joint_names
         return {
-            names.index(f"{side}_{name}"): (ends[k], float(right[k]))
-            for side, (ends, right) in self.step(sight).items()
+            names.index(f"{side}_{name}"): (arm[k], float(correctness[k]))
+            for side, (arm, correctness) in self.step(evidence).items()
             for k, name in enumerate(ARM_JOINTS)
         }
 
-    def _side(self, side: str, sight: ArmEvidence, settings: PathSettings) -> tuple[F64, F64]:
-        before, places = self._arms.get(side), sight.hypotheses(side, settings.modes)
+    def _step_side(self, side: str, evidence: ArmEvidence, settings: ArmPathSettings) -> tuple[F64, F64]:
+        before, places = self._arms.get(side), evidence.hypotheses(side, settings.modes)
+        width = evidence.shoulder_width_px
         if before is not None:
-            places = np.concatenate([places, _distinct(before, sight.width)])
-        score = own = sight.score(side, places, settings)
+            places = np.concatenate([places, _select_distinct(before, width)])
+        score = own = evidence.score(side, places, settings)
         if before is not None:
             now = ArmHypotheses(places, own, np.zeros_like(places))
-            score = own + (before.score[:, None] - step_costs(before, now, sight.width, settings)).max(axis=0)
+            score = own + (before.score[:, None] - step_costs(before, now, width, settings)).max(axis=0)
         arm = ArmHypotheses(places, score - score.max(), np.zeros_like(places))
         self._arms[side] = arm
         best = int(score.argmax())
-        return places[best], joint_correctness(float(own[best]), sight.pose_score)
+        return places[best], joint_correctness(float(own[best]), evidence.pose_score)
 
 
 def joint_correctness(score: float, pose_score: float) -> F64:
-    """Probabilities (2,) that elbow and wrist of an arm are right, by its score and the pose's."""
-    return np.asarray(1 / (1 + np.exp(-RIGHT @ np.array([1.0, score, pose_score]))))
+    """Return the probabilities (2,) that elbow and wrist of an arm are right, by its score and the pose's."""
+    return np.asarray(1 / (1 + np.exp(-CORRECTNESS_WEIGHTS @ np.array([1.0, score, pose_score]))))
 
 
-def _resolved(
-    arms: Sequence[ArmHypotheses], poses: Sequence[float], width: float, settings: PathSettings
+def _resolve_arm(
+    arms: Sequence[ArmHypotheses], poses: Sequence[float], width: float, settings: ArmPathSettings
 ) -> ArmTrajectory:
-    places, motion, sure, right = [], [], [], []
+    places, motion, certainty, correctness = [], [], [], []
     for arm, pose, cost in zip(arms, poses, max_marginals(arms, width, settings), strict=True):
-        best, certainty = _surest(arm, cost, width)
+        best, certain = _pick_best(arm, cost, width)
         places.append(arm.places[best])
         motion.append(arm.motion[best])
-        sure.append(certainty)
-        right.append(joint_correctness(float(arm.score[best]), pose))
-    return ArmTrajectory(np.array(places), np.array(motion), np.array(sure), np.array(right))
+        certainty.append(certain)
+        correctness.append(joint_correctness(float(arm.score[best]), pose))
+    return ArmTrajectory(np.array(places), np.array(motion), np.array(certainty), np.array(correctness))
 
 
-def _surest(arm: ArmHypotheses, cost: F64, width: float) -> tuple[int, float]:
-    """The hypothesis of least cost (K,), and how sure it is (0 to 1)."""
+def _pick_best(arm: ArmHypotheses, cost: F64, width: float) -> tuple[int, float]:
+    """Return the hypothesis of minimum `cost` (K,), and its certainty in [0, 1]."""
     best = int(cost.argmin())
-    weight = np.exp((cost[best] - cost) / DOUBT)
-    near = np.linalg.norm(arm.places[:, 1] - arm.places[best, 1], axis=1) < NEAR * width
-    # Hypotheses in one place are one: of each place the best counts.
+    weight = np.exp((cost[best] - cost) / PATH_TEMPERATURE_NATS)
+    near = np.linalg.norm(arm.places[:, 1] - arm.places[best, 1], axis=1) < SAME_WRIST_WIDTHS * width
+    # Hypotheses with nearly the same wrist support each other: only others reduce the certainty.
     return best, 1.0 / (1.0 + float(weight[~near].max(initial=0.0)))
 
 
-def _best(arm: ArmHypotheses) -> F64:
-    """The best hypotheses (up to CARRIED, 2, 2) where the flow takes them."""
+def _propagate_best(arm: ArmHypotheses) -> F64:
+    """Return the best hypotheses (up to MAX_PROPAGATED, 2, 2) where the flow takes them."""
     order = np.argsort(-arm.score, kind="stable")[:MAX_PROPAGATED]
     return np.asarray(arm.places[order] + arm.motion[order])
 
 
-def _distinct(arm: ArmHypotheses, width: float) -> F64:
-    """The best hypotheses (up to KEPT, 2, 2) that differ."""
+def _select_distinct(arm: ArmHypotheses, width: float) -> F64:
+    """Return the best distinct hypotheses (up to MAX_LIVE, 2, 2)."""
     kept: list[int] = []
     for k in np.argsort(-arm.score, kind="stable").tolist():
-        apart = np.linalg.norm(arm.places[kept] - arm.places[k], axis=2).max(axis=1)
-        if (apart >= MIN_DISTANCE * width).all():
+        distance = np.linalg.norm(arm.places[kept] - arm.places[k], axis=2).max(axis=1)
+        if (distance >= MIN_DISTINCT_WIDTHS * width).all():
             kept.append(k)
-        if len(kept) == MAX_KEPT:
+        if len(kept) == MAX_LIVE:
             break
     return arm.places[kept]
 
 
-def _motion(flow: FlowPair, grid: ImageScale, places: F64) -> F64:
-    """How far the flow takes places (K, 2, 2)."""
+def _measure_motion(flow: FlowPair, grid: ImageScale, places: F64) -> F64:
+    """Return the motion (K, 2, 2) px of `places` (K, 2, 2) px by the flow."""
     flat = places.reshape(-1, 2)
     ahead = np.nan_to_num(sample_flow(flow[0], grid.to_work(flat))) / grid.factor
     moved, _ = flow_at_joints(flow, grid, flat, flat + ahead)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A second look at places that may show a person: boosted decision trees over gradients and colours of the window.
+"""Rescoring of windows that may show a person: boosted decision trees over gradients and colours.
 
-The trees see what rigid filters miss: 16 x 16 cells of S / 7 around head and shoulders, in each cell the 32 dimensions
+The trees see what rigid filters miss: 16 x 16 cells of S / 7 around head and shoulders. Each cell has the 32 dimensions
 of HOG and its colour (CIE L*a*b*) less the window's mean, every value quantised to 0..31.
 """
 
@@ -17,34 +17,36 @@ from numba import njit
 from flowing_puppet_ros.arrays import F32, I32, U8
 from flowing_puppet_ros.evidence.image.hog import DIMENSIONS
 
-SIDE = 16  # cells
-ABOVE, ASIDE = 1, 2  # cells that the window reaches beyond the head-and-shoulders filters' at the top and the left
-COLOURS = 3
-FEATURES = SIDE * SIDE * (DIMENSIONS + COLOURS)
-BINS = 32
-HOG_RANGE = 0.4  # a value of this size or more gets the last code
-COLOUR_RANGE = 0.3  # of +-1; the same for colours
+WINDOW_CELLS = 16  # cells on each side of a window
+CELLS_ABOVE, CELLS_LEFT = 1, 2  # of the window beyond the head-and-shoulders filters
+COLOUR_CHANNELS = 3
+FEATURES = WINDOW_CELLS * WINDOW_CELLS * (DIMENSIONS + COLOUR_CHANNELS)
+BINS = 32  # codes of a value
+HOG_RANGE = 0.4  # HOG values from here on get the last code
+COLOUR_RANGE = 0.3  # colours, in +-1, beyond this get the first or the last code
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BoostedTrees:
-    """T complete trees of depth D: go right where code > threshold; the leaves' sum is the score.
+    """T complete trees of depth D: go right where code > threshold; the sum of the leaves is the score.
 
-    `feature` (T, 2**D - 1) int32 and `threshold` (T, 2**D - 1) uint8 of the inner nodes, breadth first, and
-    `leaves` (T, 2**D).
+    Attributes:
+        feature: (T, 2**D - 1) int32, the code that an inner node compares; nodes breadth first.
+        threshold: (T, 2**D - 1) uint8 of the inner nodes.
+        leaves: (T, 2**D) values.
     """
 
     feature: I32
     threshold: U8
     leaves: F32
 
-    def scores(self, codes: U8) -> F32:
-        """Scores (N,) of windows (N, FEATURES)."""
-        return np.asarray(_scores(codes, self.feature, self.threshold, self.leaves), np.float32)
+    def score(self, codes: U8) -> F32:
+        """Return the scores (N,) of windows with `codes` (N, FEATURES)."""
+        return np.asarray(_score(codes, self.feature, self.threshold, self.leaves), np.float32)
 
 
 def cell_colours(image: U8, rows: int, columns: int) -> F32:
-    """CIE L*a*b* (rows, columns, 3), each divided by 255, averaged over the cells that cover the image."""
+    """Return CIE L*a*b* (rows, columns, 3), each divided by 255, averaged over the cells that cover the image."""
     coloured = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
     means = cv2.resize(coloured, (columns, rows), interpolation=cv2.INTER_AREA)
     colours = np.asarray(cv2.cvtColor(means, cv2.COLOR_RGB2LAB), np.float32)
@@ -53,12 +55,12 @@ def cell_colours(image: U8, rows: int, columns: int) -> F32:
 
 
 def quantise_features(features: F32, colours: F32, row: int, column: int) -> U8:
-    """Codes (FEATURES,) of the window whose filters start at (row, column) of a level (R, C, 32) and (R, C, 3).
+    """Return the codes (FEATURES,) of the window whose filters start at (row, column) of a level.
 
-    Beyond the level its border is repeated.
+    `features` (R, C, 32) and `colours` (R, C, 3) of the level; its border is repeated beyond it.
     """
-    rows = np.clip(np.arange(row - ABOVE, row - ABOVE + SIDE), 0, features.shape[0] - 1)
-    columns = np.clip(np.arange(column - ASIDE, column - ASIDE + SIDE), 0, features.shape[1] - 1)
+    rows = np.clip(np.arange(row - CELLS_ABOVE, row - CELLS_ABOVE + WINDOW_CELLS), 0, features.shape[0] - 1)
+    columns = np.clip(np.arange(column - CELLS_LEFT, column - CELLS_LEFT + WINDOW_CELLS), 0, features.shape[1] - 1)
     gradients = features[rows[:, None], columns[None, :]] * np.float32(BINS / HOG_RANGE)
     colour = colours[rows[:, None], columns[None, :]]
     relative = (colour - colour.mean(axis=(0, 1))) * np.float32(BINS / 2 / COLOUR_RANGE) + np.float32(BINS / 2)
@@ -67,7 +69,7 @@ def quantise_features(features: F32, colours: F32, row: int, column: int) -> U8:
 
 
 @njit(cache=True, nogil=True)
-def _scores(codes: U8, feature: I32, threshold: U8, leaves: F32) -> Any:
+def _score(codes: U8, feature: I32, threshold: U8, leaves: F32) -> Any:
     inner = feature.shape[1]
     out = np.zeros(len(codes), np.float32)
     for i in range(len(codes)):

@@ -17,17 +17,20 @@ from numba import njit
 
 from flowing_puppet_ros.arrays import F32, I64
 
-NOWHERE = np.float32(-1e9)
+LOWEST_SCORE = np.float32(-1e9)  # of a message before any layer is considered
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterTree:
     """P parts with L layers in all.
 
-    `parents` (P,), -1 for the root, which is part 0; `first` (P + 1,); `anchor` (L, 2) where a part of this type
-    stands from its parent, in cells (x, y); `spring` (L, 2) what a squared cell of deviation costs along x and y;
-    `bias` (L, T): of a layer and the type of its parent (T is the most types of a part), in the first column the
-    bias of the root's layers.
+    Attributes:
+        parents: (P,), -1 for the root, which is part 0.
+        first: (P + 1,) first layer of each part.
+        anchor: (L, 2) offset of a part of this type from its parent, in cells (x, y).
+        spring: (L, 2) cost of a squared cell of deviation along x and y.
+        bias: (L, T) of a layer and the type of its parent, T being the maximum number of types of a part; the first
+            column holds the bias of the root's layers.
     """
 
     parents: I64
@@ -39,10 +42,12 @@ class FilterTree:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaxMarginals:
-    """What the passes leave.
+    """The result of the passes; `up + down` are the max-marginals.
 
-    `up` (L, H, W) are the unary scores with the messages of the children, `message` (P, T, H, W) is that of each part
-    to its parent's types, `down` (L, H, W) that from the parents, None before the downward pass.
+    Attributes:
+        up: (L, H, W) unary scores plus the messages of the children.
+        message: (P, T, H, W) of each part to its parent's types.
+        down: (L, H, W) messages from the parents; None before the downward pass.
     """
 
     up: F32
@@ -51,25 +56,25 @@ class MaxMarginals:
 
 
 def pass_up(tree: FilterTree, unary: F32) -> MaxMarginals:
-    """Messages from the leaves to the root for the layers' scores `unary` (L, H, W)."""
+    """Pass messages from the leaves to the root for the layers' scores `unary` (L, H, W)."""
     up = unary.copy()
     types = tree.bias.shape[1]
-    message = np.full((len(tree.parents), types, *unary.shape[1:]), NOWHERE, np.float32)
-    _upward(tree.parents, tree.first, tree.anchor, tree.spring, tree.bias, up, message)
+    message = np.full((len(tree.parents), types, *unary.shape[1:]), LOWEST_SCORE, np.float32)
+    _send_up(tree.parents, tree.first, tree.anchor, tree.spring, tree.bias, up, message)
     return MaxMarginals(up, message, None)
 
 
 def pass_down(tree: FilterTree, beliefs: MaxMarginals) -> MaxMarginals:
     """Add the messages from the root to the leaves; `up + down` are then the max-marginals of every layer."""
     down = np.zeros_like(beliefs.up)
-    _downward(tree.parents, tree.first, tree.anchor, tree.spring, tree.bias, beliefs.up, beliefs.message, down)
+    _send_down(tree.parents, tree.first, tree.anchor, tree.spring, tree.bias, beliefs.up, beliefs.message, down)
     return MaxMarginals(beliefs.up, beliefs.message, down)
 
 
-def best_placement(tree: FilterTree, beliefs: MaxMarginals, fixed: tuple[int, int, int, int] | None = None) -> I64:
-    """The best placement (P, 3): layer, x, y of every part.
+def find_best_placement(tree: FilterTree, beliefs: MaxMarginals, fixed: tuple[int, int, int, int] | None = None) -> I64:
+    """Return the best placement (P, 3): layer, x, y of every part.
 
-    With `fixed` (part, layer, x, y) the best one in which that part is so; this needs the downward pass.
+    With `fixed` (part, layer, x, y) return the best one with that part there; this needs the downward pass.
     """
     placement = np.full((len(tree.parents), 3), -1, np.int64)
     down = np.zeros((0, 0, 0), np.float32) if beliefs.down is None else beliefs.down
@@ -95,8 +100,8 @@ def best_placement(tree: FilterTree, beliefs: MaxMarginals, fixed: tuple[int, in
     return placement
 
 
-def score_of(tree: FilterTree, unary: F32, placement: I64) -> float:
-    """Score of a placement (P, 3)."""
+def score_placement(tree: FilterTree, unary: F32, placement: I64) -> float:
+    """Return the score of a placement (P, 3)."""
     layer, x, y = placement.T
     total = float(unary[layer, y, x].sum())
     total += float(tree.bias[layer[0], 0])
@@ -113,14 +118,14 @@ def distance_transform(scores: F32, anchor: F32, spring: F32, out: F32) -> None:
     """Set out[y, x] to the maximum over (v, u) of scores[v, u] - sx (u - x - ax)^2 - sy (v - y - ay)^2.
 
     `scores` and `out` (H, W); `anchor` a and `spring` s (2,), along x and y. All shifts are tried, whole images at a
-    time: on grids of some thousand cells this is many times faster than the envelope of parabolas.
+    time: on grids of a few thousand cells this is many times faster than the envelope of parabolas.
     """
     height, width = scores.shape
-    turned, moved = np.empty((width, height), np.float32), np.empty((width, height), np.float32)
+    transposed, moved = np.empty((width, height), np.float32), np.empty((width, height), np.float32)
     for y in range(height):
         for x in range(width):
-            turned[x, y] = scores[y, x]
-    _transform_rows(turned, anchor[0], spring[0], moved)
+            transposed[x, y] = scores[y, x]
+    _transform_rows(transposed, anchor[0], spring[0], moved)
     along_x = np.empty((height, width), np.float32)
     for x in range(width):
         for y in range(height):
@@ -137,13 +142,13 @@ def _transform_rows(values: F32, anchor: float, spring: float, out: F32) -> None
     for value in flat:
         lowest, highest = min(lowest, value), max(highest, value)
     target[:] = np.float32(-np.inf)
-    # Rows that look into the grid find something for this much there.
-    enough = highest - lowest + np.float32(0.25) * spring
+    # A row whose anchor lies inside the grid can do with this cost, so costlier shifts cannot win there.
+    max_cost = highest - lowest + np.float32(0.25) * spring
     for shift in range(1 - height, height):
         off = anchor - np.float32(shift)
         cost = np.float32(spring * off * off)
         begin, end = max(0, -shift), min(height, height - shift)
-        if cost > enough:
+        if cost > max_cost:
             if anchor < 0:
                 end = min(end, int(np.ceil(-anchor)))
             else:
@@ -154,7 +159,7 @@ def _transform_rows(values: F32, anchor: float, spring: float, out: F32) -> None
 
 
 @njit(cache=True, nogil=True)
-def _upward(parents: I64, first: I64, anchor: F32, spring: F32, bias: F32, up: F32, message: F32) -> None:
+def _send_up(parents: I64, first: I64, anchor: F32, spring: F32, bias: F32, up: F32, message: F32) -> None:
     height, width = up.shape[1:]
     moved = np.empty((height, width), np.float32)
     for layer in range(first[1]):
@@ -178,7 +183,7 @@ def _keep_larger(target: F32, values: F32, add: float) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _downward(
+def _send_down(
     parents: I64,
     first: I64,
     anchor: F32,
@@ -195,7 +200,7 @@ def _downward(
         rest = up[start : start + count] + down[start : start + count] - message[part, :count]
         best = np.empty((height, width), np.float32)
         for layer in range(first[part], first[part + 1]):
-            best[:] = NOWHERE
+            best[:] = LOWEST_SCORE
             for type_ in range(count):
                 _keep_larger(best.reshape(-1), rest[type_].reshape(-1), bias[layer, type_])
             distance_transform(best, -anchor[layer], spring[layer], down[layer])
@@ -223,7 +228,7 @@ def _trace_up(
         for type_ in range(first[parent + 1] - first[parent]):
             above = first[parent] + type_
             rest = up[above] + down[above] - message[part, type_]
-            found, v, u = _best_cell(rest, x - anchor[layer, 0], y - anchor[layer, 1], spring[layer])
+            found, v, u = _find_best_cell(rest, x - anchor[layer, 0], y - anchor[layer, 1], spring[layer])
             found += bias[layer, type_]
             if found > best:
                 best = found
@@ -233,7 +238,7 @@ def _trace_up(
 
 @njit(cache=True, nogil=True)
 def _trace_down(parents: I64, first: I64, anchor: F32, spring: F32, bias: F32, up: F32, placement: I64) -> None:
-    """Place every part that has no place yet, the best given its parent."""
+    """Place every part that is not placed yet, each the best given its parent."""
     for part in range(1, len(parents)):
         if placement[part, 0] >= 0:
             continue
@@ -242,7 +247,7 @@ def _trace_down(parents: I64, first: I64, anchor: F32, spring: F32, bias: F32, u
         type_ = above - first[parent]
         best = np.float32(-np.inf)
         for layer in range(first[part], first[part + 1]):
-            found, v, u = _best_cell(up[layer], x + anchor[layer, 0], y + anchor[layer, 1], spring[layer])
+            found, v, u = _find_best_cell(up[layer], x + anchor[layer, 0], y + anchor[layer, 1], spring[layer])
             found += bias[layer, type_]
             if found > best:
                 best = found
@@ -250,8 +255,8 @@ def _trace_down(parents: I64, first: I64, anchor: F32, spring: F32, bias: F32, u
 
 
 @njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})
-def _best_cell(scores: F32, x: float, y: float, spring: F32) -> tuple[np.float32, int, int]:
-    """The best of scores[v, u] - sx (u - x)^2 - sy (v - y)^2, and its v and u."""
+def _find_best_cell(scores: F32, x: float, y: float, spring: F32) -> tuple[np.float32, int, int]:
+    """Return the maximum of scores[v, u] - sx (u - x)^2 - sy (v - y)^2, and its v and u."""
     height, width = scores.shape
     line, along = np.empty(width, np.float32), np.empty(width, np.float32)
     for u in range(width):
@@ -260,11 +265,11 @@ def _best_cell(scores: F32, x: float, y: float, spring: F32) -> tuple[np.float32
     best, best_v, best_u = np.float32(-np.inf), 0, 0
     for v in range(height):
         off = np.float32(v) - np.float32(y)
-        less = spring[1] * off * off
+        penalty = spring[1] * off * off
         row = scores[v]
         highest = np.float32(-np.inf)
         for u in range(width):
-            line[u] = row[u] - along[u] - less
+            line[u] = row[u] - along[u] - penalty
             highest = line[u] if line[u] > highest else highest
         if highest > best:
             best, best_v, best_u = highest, v, int(np.argmax(line))

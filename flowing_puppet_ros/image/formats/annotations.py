@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""People annotated on images: the folders of the annotation tool, and lists of joints a video clip.
+"""People annotated on images: folders of the annotation tool, and lists of joints per video clip.
 
-Two JSON layouts are read. The annotation tool's has one entry an image or video frame,
+Two JSON layouts are read. The annotation tool's has one entry per image or video frame,
 `{"joint_names": [...], "images": {"street.png": [PERSON, ...], "walk.avi#12": [PERSON, ...]}}` with PERSON
 `{"joints": [[x, y, visible], ...], "gender": "female", "view": "front"}`, paths relative to the JSON. The other has one
-person a video, `{"joint_names": [...], "clips": {"walk.avi": [[[x, y, visibility], ...] or null, ...]}}` (or
+person per video, `{"joint_names": [...], "clips": {"walk.avi": [[[x, y, visibility], ...] or null, ...]}}` (or
 `{"joints": that list}` in place of the list), with the videos in a folder of their own. Pixels; left is the person's.
 """
 
@@ -25,11 +25,11 @@ from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.video_reader import open_frames
 from flowing_puppet_ros.model.ds.shape import View
 
-HIDDEN = 0.2
-"""Confidence of a joint that a person annotated as hidden: its place is a guess, yet a good one."""
+HIDDEN_CONFIDENCE = 0.2
+"""Confidence of a joint annotated as hidden: its position is a guess, yet a good one."""
 
 VIEWS: Mapping[str, View] = {"front": "front", "back": "back"}
-CLIPS = "clips"
+CLIPS_FOLDER = "clips"
 _ACTIONS = (
     "brush_hair|catch|clap|climb_stairs|golf|jump|kick_ball|pick|pour|pullup|push|run|shoot_ball|shoot_bow|shoot_gun"
     "|sit|stand|swing_baseball|throw|walk|wave"
@@ -39,7 +39,7 @@ _CLIP_NAME = re.compile(rf"(.+?)_({_ACTIONS})_[a-z]_(?:cm|nm)_np\d_[a-z]{{2}}_[a
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnnotatedPerson:
-    """Joints of one person in px (a hidden joint has the confidence HIDDEN or less), gender, and side seen if told."""
+    """Joints of one person in px (hidden ones have at most HIDDEN_CONFIDENCE), gender, and the side seen if known."""
 
     keypoints: Keypoints
     gender: str
@@ -48,21 +48,21 @@ class AnnotatedPerson:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AnnotatedFrame:
-    """An image (H,W,3) RGB uint8 and its people. `file` is relative to the folder, `index` the frame of a video.
+    """An image (H, W, 3) RGB uint8 and its people. `file` is relative to the folder, `index` the frame of a video.
 
-    `before` is the image before it in the video, None of the first and of still images.
+    `previous` is the image before it in the video, None for the first and for still images.
     """
 
     file: str
     index: int
     image: U8
     people: tuple[AnnotatedPerson, ...]
-    before: U8 | None = None
+    previous: U8 | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Annotations:
-    """The people of every annotated file: `people[file][frame]`; still images have the one frame 0."""
+    """The people of every annotated file: `people[file][frame]`; still images have frame 0 alone."""
 
     folder: Path
     people: Mapping[str, Mapping[int, tuple[AnnotatedPerson, ...]]]
@@ -78,12 +78,12 @@ class Annotations:
         except OSError as error:
             raise InputError(f"the annotations {path} cannot be read: {error.strerror}") from error
         except ValueError as error:
-            raise InputError(f"the annotations {path} are no JSON: {error}") from error
+            raise InputError(f"the annotations {path} are not JSON: {error}") from error
         try:
             names = tuple(str(name) for name in data["joint_names"])
             if "images" in data:
-                return cls(folder or path.parent, _of_images(data["images"], names))
-            return cls(folder or path.parent / CLIPS, _of_clips(data["clips"], names))
+                return cls(folder or path.parent, _parse_images(data["images"], names))
+            return cls(folder or path.parent / CLIPS_FOLDER, _parse_clips(data["clips"], names))
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(
                 f"the annotations {path} have neither layout that is read (joint_names with images, or with clips): "
@@ -91,17 +91,17 @@ class Annotations:
             ) from error
 
     def __len__(self) -> int:
-        """Count the annotated frames."""
+        """Return the number of annotated frames."""
         return sum(len(frames) for frames in self.people.values())
 
-    def without_sources_of(self, other: Annotations) -> Annotations:
-        """Leave out the files that `other` names, and clips cut from the same videos as one of them."""
-        known = {source_of(file) for file in other.people}
-        kept = {file: frames for file, frames in self.people.items() if source_of(file) not in known}
+    def exclude_sources_of(self, other: Annotations) -> Annotations:
+        """Return the annotations without the files in `other` and without clips cut from the same videos."""
+        known = {source_video(file) for file in other.people}
+        kept = {file: frames for file, frames in self.people.items() if source_video(file) not in known}
         return Annotations(self.folder, kept)
 
-    def frames(self, every: int = 1) -> Iterator[AnnotatedFrame]:
-        """Yield the frames in order of file and index: of each file the first and every `every`-th after it.
+    def read_frames(self, every: int = 1) -> Iterator[AnnotatedFrame]:
+        """Yield the frames in order of file and index: the first of each file and every `every`-th after it.
 
         InputError when a file is missing, cannot be decoded or is shorter than its annotation.
         """
@@ -120,8 +120,8 @@ class Annotations:
                 raise InputError(f"{self.folder / file} has no frame {wanted[-1]}, which is annotated")
 
 
-def source_of(file: str) -> str:
-    """Name of the video that a clip was cut from, for names of the HMDB and JHMDB kind; else the name without suffix.
+def source_video(file: str) -> str:
+    """Return the name of the video that an HMDB or JHMDB clip was cut from; for other names the name without suffix.
 
     "Flaming_B52_Shot_Drink_pour_u_nm_np1_fr_med_0.avi" gives "Flaming_B52_Shot_Drink".
     """
@@ -130,7 +130,9 @@ def source_of(file: str) -> str:
     return match[1] if match else stem
 
 
-def _of_images(images: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, dict[int, tuple[AnnotatedPerson, ...]]]:
+def _parse_images(
+    images: Mapping[str, Any], names: tuple[str, ...]
+) -> dict[str, dict[int, tuple[AnnotatedPerson, ...]]]:
     people: dict[str, dict[int, tuple[AnnotatedPerson, ...]]] = {}
     for key, entries in images.items():
         file, mark, index = key.rpartition("#")
@@ -138,7 +140,9 @@ def _of_images(images: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, d
             file, index = key, "0"
         persons = (
             AnnotatedPerson(
-                _keypoints(entry["joints"], names, HIDDEN), entry.get("gender", "neutral"), VIEWS.get(entry.get("view"))
+                _parse_keypoints(entry["joints"], names, HIDDEN_CONFIDENCE),
+                entry.get("gender", "neutral"),
+                VIEWS.get(entry.get("view")),
             )
             for entry in entries
         )
@@ -146,19 +150,21 @@ def _of_images(images: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, d
     return people
 
 
-def _of_clips(clips: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, dict[int, tuple[AnnotatedPerson, ...]]]:
+def _parse_clips(clips: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, dict[int, tuple[AnnotatedPerson, ...]]]:
     people: dict[str, dict[int, tuple[AnnotatedPerson, ...]]] = {}
     for file, clip in clips.items():
         rows = clip["joints"] if isinstance(clip, dict) else clip
         people[file] = {
-            index: (AnnotatedPerson(_keypoints(row, names, 0.0), "neutral", None),)
+            index: (AnnotatedPerson(_parse_keypoints(row, names, 0.0), "neutral", None),)
             for index, row in enumerate(rows)
             if row is not None
         }
     return people
 
 
-def _keypoints(joints: Sequence[Sequence[float | None]], names: tuple[str, ...], hidden: float) -> Keypoints:
+def _parse_keypoints(
+    joints: Sequence[Sequence[float | None]], names: tuple[str, ...], hidden_confidence: float
+) -> Keypoints:
     rows = np.array([[*joint, 1.0][:3] for joint in joints], np.float64).reshape(-1, 3)
     known = np.isfinite(rows).all(axis=1)
-    return Keypoints(names, rows[:, :2], np.where(known, np.maximum(rows[:, 2], hidden), 0.0))
+    return Keypoints(names, rows[:, :2], np.where(known, np.maximum(rows[:, 2], hidden_confidence), 0.0))

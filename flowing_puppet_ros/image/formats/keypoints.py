@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keypoints of any detector, and the puppet joints that they stand for.
+"""Keypoints of any detector, and the puppet joints that correspond to them.
 
 Accepted names: COCO and MediaPipe ("left_shoulder", "nose"), OpenPose BODY_25 and BODY_25B ("LShoulder", "MidHip",
 "UpperNeck", "LBigToe"), HRI ("l_shoulder"), and the puppet's own ("belly", "face"), in any case. Left is the person's.
@@ -40,15 +40,15 @@ PAIRED = {
     "eye": ("eye",),
     "ear": ("ear",),
 }
-# Puppets that people posed on 31 annotated JHMDB clips, against a detector's joints on the same images:
-TRUNK_LOWERED = 0.06  # shoulders and hips lie lower, share of the trunk's length
-SHOULDER_OUTWARDS = 0.04  # each shoulder lies further out, share of their distance
-EARS_HEIGHT = 0.54  # of the head's centre on the way from the neck to the top of the head, in the learned model
-FARTHEST = 1e5  # px; no camera sees a keypoint beyond
+# Puppets that people posed on 31 annotated JHMDB clips, compared with a detector's joints on the same images:
+TRUNK_DROP = 0.06  # shoulders and hips lie lower by this share of the trunk's length
+SHOULDER_SPREAD = 0.04  # each shoulder lies further out by this share of their distance
+EAR_HEIGHT = 0.54  # of the head's centre, as a share of the way from neck to top of the head, in the learned model
+MAX_COORDINATE_PX = 1e5  # no camera sees a keypoint beyond
 
 
 class JointModel(Protocol):
-    """What this module needs of a 2D body model."""
+    """The part of a 2D body model that this module needs."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -56,20 +56,20 @@ class JointModel(Protocol):
         ...
 
     def mean_joints(self) -> F64:
-        """Joints (J, 2) of the average person seen from the front, metres, x right, y down."""
+        """Return the joints (J, 2) of the average person seen from the front, metres, x right, y down."""
         ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keypoints:
-    """One detected person: `names` (K), `xy` (K, 2) px with NaN where unknown, `confidence` (K,) in [0, 1]."""
+    """One detected person: `names` (K,), `xy` (K, 2) px with NaN where unknown, `confidence` (K,) in [0, 1]."""
 
     names: tuple[str, ...]
     xy: F64
     confidence: F64
 
     def __post_init__(self) -> None:
-        """Convert to float64; refuse arrays whose lengths disagree."""
+        """Convert to float64; InputError when the lengths disagree."""
         xy, confidence = np.asarray(self.xy, dtype=np.float64), np.asarray(self.confidence, dtype=np.float64)
         if xy.shape != (len(self.names), 2) or confidence.shape != (len(self.names),):
             raise InputError(
@@ -79,22 +79,22 @@ class Keypoints:
         object.__setattr__(self, "xy", xy)
         object.__setattr__(self, "confidence", confidence)
 
-    def usable(self) -> dict[str, Point]:
-        """The keypoints of known name with finite coordinates and positive confidence: {name: (x, y, confidence)}."""
+    def select_usable(self) -> dict[str, Point]:
+        """Return {name: (x, y, confidence)} of keypoints with known names, finite places and positive confidence."""
         found: dict[str, Point] = {}
         for name, (x, y), confidence in zip(self.names, self.xy, self.confidence, strict=True):
             known = normalise_name(name)
-            if known is None or not (abs(x) < FARTHEST and abs(y) < FARTHEST and confidence > 0):
+            if known is None or not (abs(x) < MAX_COORDINATE_PX and abs(y) < MAX_COORDINATE_PX and confidence > 0):
                 continue
-            # Detectors without a score send large counts or visibilities: anything over 1 is certain.
+            # Detectors without a score send large counts or visibilities; anything over 1 is certain.
             candidate = (float(x), float(y), min(1.0, float(confidence)))
             if known not in found or candidate[2] > found[known][2]:
                 found[known] = candidate
         return found
 
 
-def _spellings() -> dict[str, str]:
-    """Every spelling we read, lower case and without separators: {"lshoulder": "left_shoulder", ...}."""
+def _list_spellings() -> dict[str, str]:
+    """Return every accepted spelling, lower case, without separators: {"lshoulder": "left_shoulder", ...}."""
     table = {spelling: name for name, spellings in MIDLINE.items() for spelling in spellings}
     for name, spellings in PAIRED.items():
         for spelling in spellings:
@@ -104,50 +104,58 @@ def _spellings() -> dict[str, str]:
     return table
 
 
-SPELLINGS = _spellings()
+SPELLINGS = _list_spellings()
 
 
 def normalise_name(name: str) -> str | None:
-    """Our name of a detector's keypoint ("LShoulder" gives "left_shoulder"); None when it is not one we know."""
+    """Return our name for a detector's keypoint ("LShoulder" gives "left_shoulder"); None for an unknown one."""
     return SPELLINGS.get(re.sub("[^a-z0-9]", "", name.lower()))
 
 
 def joints_from_keypoints(model: JointModel, keypoints: Keypoints) -> tuple[F64, F64]:
-    """Puppet joints (J, 2) px, NaN where nothing tells them, and their confidence (J,), 0 where unknown.
+    """Return the puppet joints (J, 2) px, NaN where unknown, and their confidence (J,), 0 where unknown.
 
-    A skeleton that has a belly is taken as it is: its joints are a puppet's own. Detectors have none; of theirs,
-    elbows, wrists, knees and ankles are the puppet's, shoulders and hips are moved to where people put them who pose
-    puppets on images, and neck, belly and face (the head's centre, midway between the ears) are derived.
+    By the kind of skeleton:
+        with a belly         a puppet's own joints, taken as they are
+        a detector's         elbows, wrists, knees and ankles are taken as they are, shoulders and hips are moved to
+                             where annotators place them on puppets, and neck, belly and face (the head's centre, midway
+                             between the ears) are derived
     """
-    found = keypoints.usable()
-    if "belly" not in found:
-        _place_face(found)
-        _place_trunk(found, dict(zip(model.joint_names, model.mean_joints(), strict=True)))
+    usable = keypoints.select_usable()
+    if "belly" not in usable:
+        _place_face(usable)
+        _place_trunk(usable, dict(zip(model.joint_names, model.mean_joints(), strict=True)))
     joints, confidence = np.full((len(model.joint_names), 2), np.nan), np.zeros(len(model.joint_names))
     for index, name in enumerate(model.joint_names):
-        if name in found:
-            joints[index] = found[name][:2]
-            confidence[index] = found[name][2]
+        if name in usable:
+            joints[index] = usable[name][:2]
+            confidence[index] = usable[name][2]
     return joints, confidence
 
 
-def _mix(a: Point, b: Point, share: float) -> Point:
-    """The point `share` of the way from a to b (beyond them outside [0, 1]), with the lower confidence."""
+def _interpolate(a: Point, b: Point, share: float) -> Point:
+    """Return the point `share` of the way from a to b (beyond them outside [0, 1]), with the lower confidence."""
     return a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), min(a[2], b[2])
 
 
 def _place_face(found: dict[str, Point]) -> None:
-    """Between upper neck and top of the head; else the surer of the ears' and the eyes' middles, the nose or an ear.
+    """Add the face to `found` unless it is there.
 
-    In profile one of a pair is a guess, and its confidence says so.
+    The first of these that is known serves:
+    1. upper neck and top of the head
+    2. the middle of the ears or of the eyes, whichever is more confident (in profile one of a pair is a guess, and its
+       confidence says so)
+    3. the nose or one ear
     """
     if "face" in found:
         return
     if "upper_neck" in found and "head_top" in found:
-        found["face"] = _mix(found["upper_neck"], found["head_top"], EARS_HEIGHT)
+        found["face"] = _interpolate(found["upper_neck"], found["head_top"], EAR_HEIGHT)
         return
     pairs = [(f"left_{name}", f"right_{name}") for name in ("ear", "eye")]
-    middles = [_mix(found[left], found[right], 0.5) for left, right in pairs if left in found and right in found]
+    middles = [
+        _interpolate(found[left], found[right], 0.5) for left, right in pairs if left in found and right in found
+    ]
     singles = [found[name] for name in ("nose", "left_ear", "right_ear") if name in found]
     if middles:
         found["face"] = max(middles, key=lambda point: point[2])
@@ -158,20 +166,20 @@ def _place_face(found: dict[str, Point]) -> None:
 def _place_trunk(found: dict[str, Point], mean: dict[str, F64]) -> None:
     """Move shoulders and hips, and put neck and belly on the line from mid-hip to mid-shoulder as in the mean puppet.
 
-    A detector's neck is the middle of its shoulders, which tells nothing; an upper neck is the puppet's neck.
+    A detector's neck is the middle of its shoulders and adds nothing; an upper neck is the puppet's neck.
     """
     found.pop("neck", None)
     sides = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
     if all(name in found for name in sides):
         left, right, left_hip, right_hip = (found[name] for name in sides)
-        shoulders, pelvis = _mix(left, right, 0.5), _mix(left_hip, right_hip, 0.5)
-        down = TRUNK_LOWERED * (pelvis[0] - shoulders[0]), TRUNK_LOWERED * (pelvis[1] - shoulders[1])
-        found["left_shoulder"] = _mix(left, right, -SHOULDER_OUTWARDS)
-        found["right_shoulder"] = _mix(right, left, -SHOULDER_OUTWARDS)
+        shoulders, pelvis = _interpolate(left, right, 0.5), _interpolate(left_hip, right_hip, 0.5)
+        down = TRUNK_DROP * (pelvis[0] - shoulders[0]), TRUNK_DROP * (pelvis[1] - shoulders[1])
+        found["left_shoulder"] = _interpolate(left, right, -SHOULDER_SPREAD)
+        found["right_shoulder"] = _interpolate(right, left, -SHOULDER_SPREAD)
         shoulder_y, hip_y = ((mean["left" + end][1] + mean["right" + end][1]) / 2 for end in ("_shoulder", "_hip"))
         for name in ("neck", "belly"):
             share = (mean[name][1] - hip_y) / (shoulder_y - hip_y)
-            found[name] = _mix(pelvis, shoulders, float(share))
+            found[name] = _interpolate(pelvis, shoulders, float(share))
         for name in (*sides, "neck", "belly"):
             x, y, confidence = found[name]
             found[name] = x + down[0], y + down[1], confidence

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The JSON files of the command line: keypoints that start and re-anchor people, and the tracks that come out.
+"""JSON files of the command line: keypoints that start and re-anchor people, and the resulting tracks.
 
-    keypoints.json  {"joint_names": [...], "frames": {"0": [[[x, y, confidence], ...], ...]}}   people of a frame
+    keypoints.json  {"joint_names": [...], "frames": {"0": [[[x, y, confidence], ...], ...]}}   people per frame
     tracks.json     {"joint_names": [...], "fps": f, "frames": [{"index", "path", "stamp_ns", "puppets": [...]}]}
 
 Pixels of the input, person's left and right; NaN is written as null.
@@ -27,11 +27,11 @@ from flowing_puppet_ros.model.ds.shape import View
 from flowing_puppet_ros.model.tree import PartTree
 
 DECIMALS = 2  # of a pixel
-MOST_DIGITS = 18  # of a frame's index
+MAX_INDEX_DIGITS = 18  # of a frame's index; longer ones are refused
 
 
 class PuppetLike(Protocol):
-    """What the files say of one person in one image, see `tracker.TrackedPuppet`."""
+    """The fields of one person in one image that the files hold, see `tracker.TrackedPuppet`."""
 
     @property
     def id(self) -> str:
@@ -70,19 +70,19 @@ class PuppetLike(Protocol):
 
     @property
     def depth(self) -> tuple[int, ...]:
-        """Paint order of each part, 0 farthest."""
+        """Paint order of each part, 0 is farthest."""
         ...
 
 
 def read_keypoints(path: str | Path) -> dict[int, list[Keypoints]]:
-    """Read keypoints.json, or sticks.txt: {frame index: people}. A frame that is not listed had no detector run on it.
+    """Read keypoints.json or sticks.txt: {frame index: people}. No detector ran on a frame that is not listed.
 
-    Sticks become the puppets that stand in their place, see `stick_figures`.
+    Sticks are converted to puppets, see `stick_regression`. InputError, naming the entry, for any other file.
     """
     if Path(path).suffix.lower() == ".txt":
         regression = StickRegression(DeformableStructures.load())
         return {
-            number: [regression.keypoints(sticks) for sticks in people]
+            number: [regression.to_keypoints(sticks) for sticks in people]
             for number, people in read_sticks(Path(path)).items()
         }
     try:
@@ -90,55 +90,55 @@ def read_keypoints(path: str | Path) -> dict[int, list[Keypoints]]:
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is no JSON file: {error}") from error
+        raise InputError(f"{path} is not a JSON file: {error}") from error
     if not isinstance(data, dict) or not isinstance(data.get("frames"), dict):
         raise InputError(f'{path} needs "joint_names" and "frames": {{"0": [[[x, y, confidence], ...], ...]}}')
     names = data.get("joint_names")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f'{path} needs "joint_names", a list of strings')
     if not any(normalise_name(name) for name in names):
-        raise InputError(f"{path} has no joint name that is known here; {names[:3]} are not")
+        raise InputError(f"{path} has no known joint name, only {names[:3]} and the like")
     frames: dict[int, list[Keypoints]] = {}
     for key, people in data["frames"].items():
-        if not key.isdecimal() or len(key) > MOST_DIGITS or not isinstance(people, list):
-            raise InputError(f"{path}: frame {key[:MOST_DIGITS]!r} must be an index with a list of people")
-        frames[int(key)] = [_person(tuple(names), rows, f"{path}, frame {key}") for rows in people]
+        if not key.isdecimal() or len(key) > MAX_INDEX_DIGITS or not isinstance(people, list):
+            raise InputError(f"{path}: frame {key[:MAX_INDEX_DIGITS]!r} must be an index with a list of people")
+        frames[int(key)] = [_parse_person(tuple(names), rows, f"{path}, frame {key}") for rows in people]
     if not any(frames.values()):
         raise InputError(f"{path} has no person in any frame")
     return frames
 
 
-def _person(names: tuple[str, ...], rows: Any, where: str) -> Keypoints:
+def _parse_person(names: tuple[str, ...], rows: Any, where: str) -> Keypoints:
     try:
         # null, the JSON for an unknown number, becomes NaN.
         values = np.array(rows, dtype=np.float64)
     except (TypeError, ValueError):
         values = np.empty(0)
     if values.shape != (len(names), 3):
-        raise InputError(f"{where}: a person needs {len(names)} entries [x, y, confidence], one a joint name")
+        raise InputError(f"{where}: a person needs {len(names)} entries [x, y, confidence], one per joint name")
     return Keypoints(names, values[:, :2], np.nan_to_num(values[:, 2]))
 
 
-def puppet_entry(puppet: PuppetLike, tree: PartTree) -> dict[str, Any]:
-    """The JSON object of one puppet."""
+def puppet_to_json(puppet: PuppetLike, tree: PartTree) -> dict[str, Any]:
+    """Convert a puppet to its JSON object."""
     joints = [
-        [_number(x), _number(y), _number(confidence, 3)]
+        [_round_or_null(x), _round_or_null(y), _round_or_null(confidence, 3)]
         for (x, y), confidence in zip(puppet.joints, puppet.confidence, strict=True)
     ]
     parts = [
-        {"name": name, "contour": [[_number(x), _number(y)] for x, y in contour], "depth": depth}
+        {"name": name, "contour": [[_round_or_null(x), _round_or_null(y)] for x, y in contour], "depth": depth}
         for name, contour, depth in zip(tree.names, puppet.contours, puppet.depth, strict=True)
     ]
-    scale, energy = _number(puppet.scale), _number(puppet.energy, 4)
+    scale, energy = _round_or_null(puppet.scale), _round_or_null(puppet.energy, 4)
     return {"id": puppet.id, "view": puppet.view, "scale": scale, "energy": energy, "joints": joints, "parts": parts}
 
 
-def _number(value: float, decimals: int = DECIMALS) -> float | None:
+def _round_or_null(value: float, decimals: int = DECIMALS) -> float | None:
     return round(float(value), decimals) if math.isfinite(value) else None
 
 
 def write_tracks(path: str | Path, joint_names: tuple[str, ...], fps: float, frames: Iterable[dict[str, Any]]) -> None:
-    """Write tracks.json frame by frame, and put it in place when it is whole; InputError when it cannot be written."""
+    """Write tracks.json frame by frame and move it into place once complete; InputError when it cannot be written."""
     place = Path(path)
     draft = place.with_name(f".{place.name}.part")
     try:

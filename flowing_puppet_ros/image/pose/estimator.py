@@ -2,7 +2,7 @@
 """Pose of the people in one image: joints, part contours and diverse hypotheses of the arms.
 
 Thesis, chapter "Human Pose Estimation from Single Images with the Deformable Structures Model". The detector, or
-keypoints that the user has, say where people are; the particle search does the rest.
+keypoints that the user supplies, locate the people; the particle search estimates their poses.
 """
 
 from __future__ import annotations
@@ -15,39 +15,40 @@ import cv2
 import numpy as np
 
 from flowing_puppet_ros.arrays import Array
-from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.pose.evidence import KeypointPerson, LikelihoodLike, PersonHypotheses, PersonWindow
-from flowing_puppet_ros.image.pose.modes import extract_modes, joint_confidence, searched_parts
+from flowing_puppet_ros.image.pose.modes import extract_modes, joint_confidence, select_parts
 from flowing_puppet_ros.image.pose.particle_search import PoseSearch, SearchTarget
-from flowing_puppet_ros.image.pose.particles import Particles, clip_shape, particles_of
-from flowing_puppet_ros.image.pose.result import PosedPuppet, SearchResult, ViewHypothesis, completed
+from flowing_puppet_ros.image.pose.particles import PartParticles, clip_shape, particles_from_puppets
+from flowing_puppet_ros.image.pose.result import PosedPuppet, PoseSearchResult, ViewHypothesis, complete_puppet
 from flowing_puppet_ros.image.pose.settings import PoseSettings
+from flowing_puppet_ros.images import as_image, as_rgb
 from flowing_puppet_ros.model.ds.multiview import VIEW_HEADINGS, VIEW_NAMES, MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
+from flowing_puppet_ros.threads import one_blas_thread
 
-SURELY_SIDEWAYS = 0.97
-"""Probability of not facing the camera from which a model of another view is taken."""
+MIN_SIDE_PROBABILITY = 0.97
+"""Probability of a side view from which the model of that view is used instead of the frontal one."""
 
-DETECTION_TRUST = 0.3
-"""Factor of the confidence of detected joints when they tell the view: detectors err more than the model's noise."""
+VIEW_CONFIDENCE_FACTOR = 0.3
+"""Factor on the confidence of detected joints when the view is estimated: detectors err more than the model."""
 
-LEAST_KEYPOINTS = 3
+MIN_KEYPOINTS = 3  # joints that keypoints must give for a person to be estimated
 
 
 class PoseDetectorLike(Protocol):
-    """What finds people in an image (H,W,3) RGB uint8, the surest first."""
+    """A detector of people in an image (H, W, 3) RGB uint8."""
 
     def detect(self, image: Array) -> Sequence[PersonHypotheses]:
-        """The people."""
+        """Return the people, most confident first."""
         ...
 
 
 class PoseEstimator:
-    """Finds the people of an image and their poses; one instance serves any number of images."""
+    """Estimator of the poses of the people in an image; one instance serves any number of images."""
 
     def __init__(
         self,
@@ -55,59 +56,60 @@ class PoseEstimator:
         detector: PoseDetectorLike | None,
         likelihood: LikelihoodLike | None,
         settings: PoseSettings | None = None,
-        sides: Sequence[MultiViewStructures] = (),
-        drawn: Sequence[MultiViewStructures] = (),
+        side_models: Sequence[MultiViewStructures] = (),
+        drawing_models: Sequence[MultiViewStructures] = (),
     ) -> None:
         """Prepare the search.
 
         Args:
-            models: puppets of one number of parts; the search uses the first and the answer is the most probable one.
+            models: puppets with the same number of parts; the first is searched, the most probable one is returned.
             detector: needed for images without keypoints.
-            likelihood: contour and colour; None judges by the detector and the body model alone.
+            likelihood: contour and colour; None scores by the detector and the body model alone.
             settings: the defaults when None.
-            sides: for each of `models` the one of nine views, which takes its place for people seen from the side.
-            drawn: for each of `models` one with more parts, such as hands and feet, that draws the answer.
+            side_models: for each of `models` its nine views, used for people seen from the side.
+            drawing_models: for each of `models` one with more parts, such as hands and feet, to draw the result with.
         """
         self._front = tuple(models)
-        self._sides = tuple(sides)
-        self._drawn = tuple(drawn)
+        self._side_models = tuple(side_models)
+        self._drawing_models = tuple(drawing_models)
         self._detector = detector
         self._likelihood = likelihood
         self._settings = settings or PoseSettings()
         self._searches: dict[tuple[DeformableStructures, tuple[int, ...]], PoseSearch] = {}
 
     def estimate(self, image: Array, keypoints: Sequence[Keypoints] | None = None) -> list[PosedPuppet]:
-        """The people in an image (H,W,3) RGB or (H,W) grey uint8, in its pixels.
+        """Estimate the poses of the people in an image (H, W, 3) RGB or (H, W) grey uint8, in its pixels.
 
-        `keypoints` of people, where they are known, stand in for the detector. An empty list when nobody is found.
-        InputError when the array is no image, or without both keypoints and detector.
+        `keypoints` of people, if given, replace the detector. The list is empty when no one is found. InputError when
+        the array is not an image, or when there are neither keypoints nor a detector.
         """
-        if image.dtype != np.uint8 or image.ndim not in (2, 3) or 0 in image.shape or image.shape[2:] not in ((), (3,)):
-            raise InputError(f"an image must be (H,W) or (H,W,3) uint8, this one is {image.shape} {image.dtype}")
+        image = as_image(image)
         if keypoints is None and self._detector is None:
-            raise InputError("without a detector the pose needs keypoints of the people")
-        factor = min(1.0, self._settings.longest_side / max(image.shape[:2]))
+            raise InputError("without a detector the pose needs keypoints of the people; pass one of them")
+        factor = min(1.0, self._settings.max_side / max(image.shape[:2]))
         if factor < 1.0:
             height, width = np.maximum(np.rint(np.array(image.shape[:2]) * factor), 1).astype(int)
             image = cv2.resize(image, (int(width), int(height)), interpolation=cv2.INTER_AREA)
-        colour = np.repeat(image[..., None], 3, axis=2) if image.ndim == 2 else image
+        colour = as_rgb(image)
         # Sums of several BLAS threads would differ in their last bits.
         with one_blas_thread():
-            found = self._found(colour, keypoints, factor)
-            posed = [self._pose(colour, one, index, factor) for index, one in enumerate(found)]
+            found = self._find_people(colour, keypoints, factor)
+            posed = [self._estimate_person(colour, one, index, factor) for index, one in enumerate(found)]
         return [one for one in posed if one is not None]
 
-    def _found(self, image: Array, keypoints: Sequence[Keypoints] | None, factor: float) -> Sequence[PersonHypotheses]:
+    def _find_people(
+        self, image: Array, keypoints: Sequence[Keypoints] | None, factor: float
+    ) -> Sequence[PersonHypotheses]:
         if keypoints is None:
             assert self._detector is not None
-            found = self._detector.detect(np.ascontiguousarray(image))
+            found = self._detector.detect(image)
             return [one for turn, one in enumerate(found) if turn == 0 or one.confidence >= self._settings.others]
         model = self._front[0]
         people: list[PersonHypotheses] = []
         for one in keypoints:
-            placed = replace(one, xy=(one.xy + 0.5) * factor - 0.5)
-            joints, confidence = joints_from_keypoints(model, placed)
-            if np.isfinite(joints).all(axis=1).sum() < LEAST_KEYPOINTS:
+            scaled = replace(one, xy=(one.xy + 0.5) * factor - 0.5)
+            joints, confidence = joints_from_keypoints(model, scaled)
+            if np.isfinite(joints).all(axis=1).sum() < MIN_KEYPOINTS:
                 continue
             try:
                 scale = model.estimate_scale(joints, confidence)
@@ -118,100 +120,109 @@ class PoseEstimator:
             )
         return people
 
-    def _pose(self, image: Array, found: PersonHypotheses, index: int, factor: float) -> PosedPuppet | None:
-        """The pose of one person, or None when the detection tells no scale; `factor` is that of the shrunk image."""
+    def _estimate_person(self, image: Array, found: PersonHypotheses, index: int, factor: float) -> PosedPuppet | None:
+        """Estimate one person's pose; None when the joints give no scale. `factor` is that of the reduced image."""
         rng = np.random.default_rng([self._settings.seed, index])
         try:
             joints, confidence = joints_from_keypoints(self._front[0], found.keypoints)
             view = self._front[0].estimate_view(joints, confidence)
-            models, side = self._turned(joints, confidence, view)
+            models, side = self._choose_view(joints, confidence, view)
             scale = models[0].estimate_scale(joints, confidence)
         except InputError:
             return None
         model = models[0]
-        scene = None if self._likelihood is None else PersonWindow.around(self._likelihood, image, joints, scale)
-        person = SearchTarget(scene, found, scale, np.array([1.0 if view == "front" else -1.0, 1.0]))
+        window = None if self._likelihood is None else PersonWindow.around(self._likelihood, image, joints, scale)
+        target = SearchTarget(window, found, scale, np.array([1.0 if view == "front" else -1.0, 1.0]))
         heading = 0.0 if side is None else VIEW_HEADINGS[side]
-        seen = ViewHypothesis(models, view, heading, side, searched_parts(model, np.isfinite(joints).all(axis=1)))
-        search = self._search(model, seen.parts)
-        start = self._start(model, search, person, view, rng)
-        person = self._coloured(search, start, person)
-        judged, result = search.run(start, person, rng)
-        solutions = extract_modes(model, search, judged, person, self._settings.solutions)
-        sure = joint_confidence(model, search, judged, result, person, solutions[0].joints)
-        outcome = SearchResult(solutions, sure, person, seen, (image.shape[1], image.shape[0]), factor)
-        return self._answer(outcome, letters_of_seed(self._settings.seed) + str(index + 1))
+        parts = select_parts(model, np.isfinite(joints).all(axis=1))
+        view_hypothesis = ViewHypothesis(models, view, heading, side, parts)
+        search = self._search_for(model, parts)
+        start = self._initialise_particles(model, search, target, view, rng)
+        target = self._add_colour_evidence(search, start, target)
+        scored, marginals = search.run(start, target, rng)
+        solutions = extract_modes(model, search, scored, target, self._settings.solutions)
+        confidences = joint_confidence(model, search, scored, marginals, target, solutions[0].joints)
+        result = PoseSearchResult(
+            solutions, confidences, target, view_hypothesis, (image.shape[1], image.shape[0]), factor
+        )
+        return self._draw_result(result, letters_of_seed(self._settings.seed) + str(index + 1))
 
-    def _answer(self, outcome: SearchResult, identity: str) -> PosedPuppet:
-        """The puppet of the most probable gender."""
-        seen = outcome.seen
-        probability = self._genders(outcome)
+    def _draw_result(self, result: PoseSearchResult, identity: str) -> PosedPuppet:
+        """Return the puppet of the most probable gender."""
+        view = result.view_hypothesis
+        probability = self._gender_probabilities(result)
         chosen = int(probability.argmax())
-        drawing = seen.models[chosen]
-        if self._drawn:
-            drawing = self._drawn[chosen].views[len(VIEW_NAMES) // 2 if seen.side is None else seen.side]
-        genders = {one.gender: float(value) for one, value in zip(seen.models, probability, strict=True)}
-        return outcome.drawn(identity, drawing, genders)
+        drawing = view.models[chosen]
+        if self._drawing_models:
+            drawing = self._drawing_models[chosen].views[len(VIEW_NAMES) // 2 if view.side is None else view.side]
+        genders = {one.gender: float(value) for one, value in zip(view.models, probability, strict=True)}
+        return result.draw(identity, drawing, genders)
 
-    def _genders(self, outcome: SearchResult) -> Array:
-        """Probability of each model, by the energy of its puppet on the best pose."""
-        seen, person = outcome.seen, outcome.person
-        energies = np.zeros(len(seen.models))
-        for row, model in enumerate(seen.models if len(seen.models) > 1 else ()):
-            particles = particles_of([outcome.puppet(model, outcome.solutions[0])], model.bone, person.mirror)
-            energies[row] = self._search(model, seen.parts).energy(particles, person)
+    def _gender_probabilities(self, result: PoseSearchResult) -> Array:
+        """Return the probability of each model, by the energy of its puppet on the best pose."""
+        view, target = result.view_hypothesis, result.target
+        energies = np.zeros(len(view.models))
+        for row, model in enumerate(view.models if len(view.models) > 1 else ()):
+            particles = particles_from_puppets(
+                [result.make_puppet(model, result.solutions[0])], model.bone, target.mirror
+            )
+            energies[row] = self._search_for(model, view.parts).energy(particles, target)
         weight = np.exp(energies.min() - energies)
         return np.asarray(weight / weight.sum())
 
-    def _turned(
+    def _choose_view(
         self, joints: Array, confidence: Array, view: View
     ) -> tuple[tuple[DeformableStructures, ...], int | None]:
-        """The models for the side from which a person is seen, and the index of the view.
+        """Return the models for the side from which a person is seen, and the index of the view.
 
-        The models near the front and None, unless the joints (J,2) are far more probable from a side.
+        The frontal models and None, unless the joints (J, 2) are far more probable from a side.
         """
-        if not self._sides:
+        if not self._side_models:
             return self._front, None
         mirror = np.array([1.0 if view == "front" else -1.0, 1.0])
-        probability = self._sides[0].posterior(joints * mirror, confidence * DETECTION_TRUST)
+        probability = self._side_models[0].posterior(joints * mirror, confidence * VIEW_CONFIDENCE_FACTOR)
         best = int(probability.argmax())
         middle = len(probability) // 2
-        if probability[middle - 1 : middle + 2].sum() > 1.0 - SURELY_SIDEWAYS:
+        if probability[middle - 1 : middle + 2].sum() > 1.0 - MIN_SIDE_PROBABILITY:
             return self._front, None
-        return tuple(side.views[best] for side in self._sides), best
+        return tuple(side.views[best] for side in self._side_models), best
 
-    def _search(self, model: DeformableStructures, parts: tuple[int, ...]) -> PoseSearch:
+    def _search_for(self, model: DeformableStructures, parts: tuple[int, ...]) -> PoseSearch:
         key = model, parts
         if key not in self._searches:
             self._searches[key] = PoseSearch(model, parts, self._settings)
         return self._searches[key]
 
-    def _start(
+    def _initialise_particles(
         self,
         model: DeformableStructures,
         search: PoseSearch,
-        person: SearchTarget,
+        target: SearchTarget,
         view: View,
         rng: np.random.Generator,
-    ) -> list[Particles]:
-        """First particles: the detector's poses with their likely shapes, and copies of them with random shapes."""
+    ) -> list[PartParticles]:
+        """Return the first particles: the detector's poses with their likely shapes, and copies with random shapes."""
         puppets = []
-        for keypoints, _ in person.found.modes(self._settings.modes):
+        for keypoints, _ in target.hypotheses.modes(self._settings.modes):
             joints, confidence = joints_from_keypoints(model, keypoints)
-            puppets.append(completed(model, joints, confidence, person.scale, view))
-        everything = particles_of(puppets, model.bone, person.mirror)
+            puppets.append(complete_puppet(model, joints, confidence, target.scale, view))
+        particles = particles_from_puppets(puppets, model.bone, target.mirror)
         groups = []
         for part in search.parts:
-            likely = everything[part]
-            likely = Particles(likely.center, likely.angle, likely.scale, clip_shape(likely.shape))
+            likely = particles[part]
+            likely = PartParticles(likely.center, likely.angle, likely.scale, clip_shape(likely.shape))
             copies = likely.take(rng.integers(len(likely), size=self._settings.particles))
-            drawn = clip_shape(copies.shape + 0.5 * rng.standard_normal(copies.shape.shape))
-            groups.append(Particles.join([likely, Particles(copies.center, copies.angle, copies.scale, drawn)]))
+            shapes = clip_shape(copies.shape + 0.5 * rng.standard_normal(copies.shape.shape))
+            groups.append(
+                PartParticles.join([likely, PartParticles(copies.center, copies.angle, copies.scale, shapes)])
+            )
         return groups
 
-    def _coloured(self, search: PoseSearch, start: list[Particles], person: SearchTarget) -> SearchTarget:
-        """The person whose evidence also knows the colours of the torso and the head that a first max-product finds."""
-        if person.scene is None or "head" not in search.tree.names or not self._settings.likelihood:
-            return person
-        torso, head = search.best_contours(start, person, ("torso", "head"))
-        return replace(person, scene=person.scene.with_torso(torso, head))
+    def _add_colour_evidence(
+        self, search: PoseSearch, start: list[PartParticles], target: SearchTarget
+    ) -> SearchTarget:
+        """Add the colours of the torso and the head that a first max-product finds to the person's evidence."""
+        if target.window is None or "head" not in search.tree.names or not self._settings.likelihood:
+            return target
+        torso, head = search.find_best_contours(start, target, ("torso", "head"))
+        return replace(target, window=target.window.with_torso(torso, head))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From the last particles to answers: the best pose, others that differ in their arms, and how sure each joint is."""
+"""From the last particles to results: the best pose, others that differ in the arms, and each joint's confidence."""
 
 from __future__ import annotations
 
@@ -8,29 +8,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.arrays import Array
-from flowing_puppet_ros.image.pose.particle_search import PoseSearch, ScoredParticles, SearchTarget
+from flowing_puppet_ros.image.pose.particle_search import PoseSearch, ScoredPartParticles, SearchTarget
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product
 from flowing_puppet_ros.model.ds.joints import PART_JOINTS
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
-APART = 0.15
-"""Distance in metres at which two hypotheses of a wrist are different ones."""
+WRIST_SD_M = 0.15
+"""Standard deviation of the kernel in which hypotheses of a wrist count as the same."""
 
-NEAR = 0.1
-"""Metres within which other particles agree with a joint."""
+AGREEMENT_RADIUS_M = 0.1
+"""Distance within which other particles agree with a joint."""
 
-EVENNESS = 15.0
-"""Cost difference at which a hypothesis counts 1/e of the best one when diverse ones are chosen."""
+MODE_TEMPERATURE = 15.0
+"""Cost difference in nats at which a hypothesis weighs 1/e of the best one when diverse ones are chosen."""
 
-DOUBT = 15.0
-"""Cost difference at which a particle counts 1/e of the best one in a joint's confidence."""
+CONFIDENCE_TEMPERATURE = 15.0
+"""Cost difference in nats at which a particle weighs 1/e of the best one in a joint's confidence."""
 
-_FORBIDDEN = 1e9
+_FORBIDDEN_COST = 1e9  # of particles other than the pinned one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseMode:
-    """One pose: joints (J,2) px, NaN where nothing was searched, its energy in nats, and scale px/m."""
+    """One pose: `joints` (J, 2) px, NaN where nothing was searched, its energy in nats, and scale px/m."""
 
     joints: Array
     energy: float
@@ -38,54 +38,57 @@ class PoseMode:
 
 
 def extract_modes(
-    model: DeformableStructures, search: PoseSearch, judged: list[ScoredParticles], person: SearchTarget, count: int
+    model: DeformableStructures, search: PoseSearch, scored: list[ScoredPartParticles], target: SearchTarget, count: int
 ) -> list[PoseMode]:
-    """Up to `count` poses that differ in their arms: the best of all first, then in the order of their energy.
+    """Return up to `count` poses that differ in their arms: the best of all first, then by increasing energy.
 
     The k-th hypothesis of the right wrist goes with the k-th of the left one; the rest is the best for both.
     """
-    result, edges = search.solve(judged)
+    result, edges = search.solve(scored)
     arms = [k for k, name in enumerate(search.tree.names) if name.endswith("lower_arm")]
-    choices = {k: _hypotheses(search, k, judged[k], result, person, count) for k in arms}
-    solutions = [_solution(model, search, judged, result.assignment, result.cost, person)]
-    for turn in range(1, max((len(chosen) for chosen in choices.values()), default=0)):
-        costs = [group.cost.copy() for group in judged]
+    choices = {k: _select_diverse_wrists(search, k, scored[k], result, target, count) for k in arms}
+    solutions = [_make_mode(model, search, scored, result.assignment, result.cost, target)]
+    for rank in range(1, max((len(chosen) for chosen in choices.values()), default=0)):
+        costs = [group.cost.copy() for group in scored]
         for k, chosen in choices.items():
-            pinned = chosen[min(turn, len(chosen) - 1)]
-            costs[k] += _FORBIDDEN
-            costs[k][pinned] -= _FORBIDDEN
+            pinned = chosen[min(rank, len(chosen) - 1)]
+            costs[k] += _FORBIDDEN_COST
+            costs[k][pinned] -= _FORBIDDEN_COST
         other = max_product(search.tree, costs, edges)
-        solutions.append(_solution(model, search, judged, other.assignment, other.cost, person))
+        solutions.append(_make_mode(model, search, scored, other.assignment, other.cost, target))
     return [solutions[0], *sorted(solutions[1:], key=lambda one: one.energy)]
 
 
 def joint_confidence(
     model: DeformableStructures,
     search: PoseSearch,
-    judged: list[ScoredParticles],
+    scored: list[ScoredPartParticles],
     result: MaxProduct,
-    person: SearchTarget,
-    at: Array,
+    target: SearchTarget,
+    joints: Array,
 ) -> Array:
-    """Share (J,) of the particles' weight, by max-marginal, whose joint lies near that of `at` (J,2); 0 unsearched."""
+    """Return the share (J,) of the particles' weight, by max-marginal, whose joint is near that of `joints` (J, 2).
+
+    0 for joints that were not searched.
+    """
     confidence = np.zeros(len(model.joint_names))
     for k, part in enumerate(search.parts):
-        weight = np.exp((result.marginals[k].min() - result.marginals[k]) / DOUBT)
-        places = search.joints(k, judged[k].particles, person.mirror)
-        own = model.part_joints[part]
-        for index, joint in list(enumerate(own))[0 if k == 0 else 1 :]:
-            apart = np.hypot(*(places[:, index] - at[joint]).T)
-            confidence[joint] = weight[apart <= NEAR * person.scale].sum() / weight.sum()
+        weight = np.exp((result.marginals[k].min() - result.marginals[k]) / CONFIDENCE_TEMPERATURE)
+        places = search.joint_points(k, scored[k].particles, target.mirror)
+        part_joints = model.part_joints[part]
+        for index, joint in list(enumerate(part_joints))[0 if k == 0 else 1 :]:
+            distance = np.hypot(*(places[:, index] - joints[joint]).T)
+            confidence[joint] = weight[distance <= AGREEMENT_RADIUS_M * target.scale].sum() / weight.sum()
     return confidence
 
 
-def _hypotheses(
-    search: PoseSearch, k: int, judged: ScoredParticles, result: MaxProduct, person: SearchTarget, count: int
+def _select_diverse_wrists(
+    search: PoseSearch, k: int, scored: ScoredPartParticles, result: MaxProduct, target: SearchTarget, count: int
 ) -> list[int]:
-    """Particles of a lower arm whose wrists together lie near most of the weight; that of the best pose first."""
-    wrist = search.joints(k, judged.particles, person.mirror)[:, 1]
-    weight = np.exp((result.marginals[k].min() - result.marginals[k]) / EVENNESS)
-    squared = ((wrist[:, None] - wrist[None]) ** 2).sum(axis=2) / (APART * person.scale) ** 2
+    """Select particles of a lower arm whose wrists together are near most of the weight, the best pose's first."""
+    wrist = search.joint_points(k, scored.particles, target.mirror)[:, 1]
+    weight = np.exp((result.marginals[k].min() - result.marginals[k]) / MODE_TEMPERATURE)
+    squared = ((wrist[:, None] - wrist[None]) ** 2).sum(axis=2) / (WRIST_SD_M * target.scale) ** 2
     near = np.exp(-0.5 * squared)
     chosen = [int(result.assignment[k])]
     covered = near[chosen[0]].copy()
@@ -97,30 +100,30 @@ def _hypotheses(
     return chosen
 
 
-def _solution(
+def _make_mode(
     model: DeformableStructures,
     search: PoseSearch,
-    judged: list[ScoredParticles],
+    scored: list[ScoredPartParticles],
     assignment: Array,
     cost: float,
-    person: SearchTarget,
+    target: SearchTarget,
 ) -> PoseMode:
-    """Joints of the chosen particles; where two parts meet, the middle of their ends."""
+    """Return the joints of the chosen particles; where two parts meet, the middle of their ends."""
     total, count = np.zeros((len(model.joint_names), 2)), np.zeros(len(model.joint_names))
     scales = []
     for k, part in enumerate(search.parts):
-        chosen = judged[k].particles.take(assignment[k : k + 1])
-        own = list(model.part_joints[part])
-        total[own] += search.joints(k, chosen, person.mirror)[0]
-        count[own] += 1
+        chosen = scored[k].particles.take(assignment[k : k + 1])
+        part_joints = list(model.part_joints[part])
+        total[part_joints] += search.joint_points(k, chosen, target.mirror)[0]
+        count[part_joints] += 1
         scales.append(float(chosen.scale[0]))
     joints = np.full_like(total, np.nan)
     joints[count > 0] = total[count > 0] / count[count > 0, None]
     return PoseMode(joints, cost, float(np.exp(np.mean(np.log(scales)))))
 
 
-def searched_parts(model: DeformableStructures, known: Array) -> tuple[int, ...]:
-    """Parts whose far joint is known (J,), with all that they hang from; the torso in any case."""
+def select_parts(model: DeformableStructures, known: Array) -> tuple[int, ...]:
+    """Return the parts whose far joint is `known` (J,), with all their ancestors; the torso in any case."""
     wanted = {0}
     for part, name in enumerate(model.tree.names):
         if known[model.joint_names.index(PART_JOINTS[name][1])]:

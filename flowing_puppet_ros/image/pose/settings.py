@@ -29,4 +29,4 @@ class PoseSettings(Settings):
     spring: float = setting(0.04, "looseness of the joints between parts", unit="m", low=0.001, high=0.5)
     scale_deviation: float = setting(0.1, "how far the scales of neighbours differ, as a share", low=0.001, high=1.0)
     temperature: float = setting(2.0, "cost difference that matters in the diverse selection", low=0.01, high=100.0)
-    longest_side: int = setting(1280, "images are shrunk to this longer side first", unit="px", low=64, high=8192)
+    max_side: int = setting(1280, "images are shrunk to this longer side first", unit="px", low=64, high=8192)

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The affine motions of the parts of many puppets at once, by sums over the regions of their contours.
+"""Affine motions of the parts of many puppets at once, by sums over the regions of their contours.
 
-The same motion as `flow.affine` fits to one puppet's visible pixels, without its iterations: the least squares of a
-region need twelve sums, which prefix sums along the rows give for any contour. What the iterations do there is done
-once for all puppets here: a pixel weighs less where the flow does not return, and where it moves as the background.
+They are the motions that `flow.affine` fits to one puppet's visible pixels, without its iterations: the least squares
+of a region need twelve sums, which prefix sums along the rows give for any contour. What the iterations do there is
+done once for all puppets here: a pixel weighs less where the flow does not return, or is that of the background.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from numba import njit
 
 from flowing_puppet_ros.arrays import F32, F64
 from flowing_puppet_ros.flow.affine import (
-    BACKGROUND_SHARE,
-    CORRELATED_PIXELS,
-    DEFORMATION,
-    LEAST_FOR_TRANSLATION,
+    BACKGROUND_WEIGHT,
+    LINEAR_PRIOR_SD,
+    MIN_TRANSLATION_SAMPLES,
+    PIXELS_PER_OBSERVATION,
     fit_regions,
     round_trip_weight,
 )
@@ -32,7 +32,7 @@ SUMS = 12
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlowMoments:
-    """Sums of one flow field around a person: `along` (h,w+1,12) from pixel `corner` (x, y) of the flow's grid on."""
+    """Sums of one flow field around a person: `along` (h, w+1, 12) from pixel `corner` (x, y) of the flow's grid on."""
 
     along: F64
     corner: F64
@@ -40,17 +40,17 @@ class FlowMoments:
 
     @classmethod
     def of(cls, flow: FlowPair, grid: ImageScale, low: F64, high: F64) -> Self:
-        """Of the flow (there, back) on the working grid, within image pixels `low` to `high` (2,)."""
+        """Sum the `flow` (there, back) on the working grid, within image pixels `low` to `high` (2,)."""
         first = np.clip(np.floor(grid.to_work(low)), 0, np.array(grid.work) - 1).astype(int)
         last = np.clip(np.ceil(grid.to_work(high)), first + 1, grid.work).astype(int)
         there, back = (np.ascontiguousarray(field, np.float32) for field in flow)
         background = fit_regions(np.zeros(there.shape[:2], np.uint16), 1, there, back).affine[0]
         return cls(_prepare(there, back, background, *first, *last), first.astype(np.float64), grid)
 
-    def affine(self, contours: F64) -> tuple[F64, F64]:
-        """Motions (P,2,3) of regions with contours (P,K,2), in image pixels, and the weight (P,) of their pixels.
+    def fit_affine(self, contours: F64) -> tuple[F64, F64]:
+        """Fit the motions (P, 2, 3) of regions with `contours` (P, K, 2) px of the image; return them and weights (P,).
 
-        Regions that weigh next to nothing stay where they are.
+        Regions of little weight stay where they are.
         """
         local = np.ascontiguousarray(self.grid.to_work(contours) - self.corner, np.float64)
         sums = np.zeros((len(contours), SUMS))
@@ -63,19 +63,19 @@ class FlowMoments:
         spread[:, 0, 1] = spread[:, 1, 0] = sums[:, 4] - weight * mean[:, 0] * mean[:, 1]
         flow = sums[:, 6:8] / weight[:, None]
         cross = sums[:, 8:12].reshape(-1, 2, 2) - weight[:, None, None] * flow[:, :, None] * mean[:, None, :]
-        stiff = CORRELATED_PIXELS / DEFORMATION**2 * np.eye(2)
+        stiff = PIXELS_PER_OBSERVATION / LINEAR_PRIOR_SD**2 * np.eye(2)
         linear = np.linalg.solve(spread + stiff, np.swapaxes(cross, 1, 2)).swapaxes(1, 2)
-        known = weight >= LEAST_FOR_TRANSLATION
+        known = weight >= MIN_TRANSLATION_SAMPLES
         linear[~known], flow[~known] = 0.0, 0.0
-        return self._enlarged(linear, flow, mean), np.where(known, weight, 0.0)
+        return self._to_image_motion(linear, flow, mean), np.where(known, weight, 0.0)
 
-    def _enlarged(self, linear: F64, flow: F64, mean: F64) -> F64:
-        """Motions of the grid around `mean`, relative to the corner, as motions of the image."""
+    def _to_image_motion(self, linear: F64, flow: F64, mean: F64) -> F64:
+        """Convert motions of the grid around `mean`, relative to the corner, to motions of the image."""
         center = self.grid.to_image(mean + self.corner)
         ratio = self.grid.factor
-        turned = linear * ratio[None, None, :] / ratio[None, :, None] + np.eye(2)
-        shift = flow / ratio + center - np.einsum("pij,pj->pi", turned, center)
-        return np.concatenate([turned, shift[:, :, None]], axis=2)
+        matrix = linear * ratio[None, None, :] / ratio[None, :, None] + np.eye(2)
+        shift = flow / ratio + center - np.einsum("pij,pj->pi", matrix, center)
+        return np.concatenate([matrix, shift[:, :, None]], axis=2)
 
 
 @njit(cache=True, nogil=True)
@@ -96,7 +96,7 @@ def _prepare(
             misfit_x = a[0, 0] * at_x + a[0, 1] * at_y + a[0, 2] - at_x - u
             misfit_y = a[1, 0] * at_x + a[1, 1] * at_y + a[1, 2] - at_y - v
             square = misfit_x * misfit_x + misfit_y * misfit_y
-            w = round_trip_weight(at_x, at_y, u, v, back) * (BACKGROUND_SHARE + square) / (1.0 + square)
+            w = round_trip_weight(at_x, at_y, u, v, back) * (BACKGROUND_WEIGHT + square) / (1.0 + square)
             sums = along[y, x + 1]
             sums[0] += w
             sums[1] += w * x

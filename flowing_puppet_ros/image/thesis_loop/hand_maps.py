@@ -15,21 +15,21 @@ from flowing_puppet_ros.image.pose.evidence import PersonWindow
 from flowing_puppet_ros.image.tracking.propagation import ImageScale
 
 
-def hand_maps(
+def make_hand_maps(
     detectors: HandDetectors, window: PersonWindow, flows: Sequence[Flow], grid: ImageScale, scale: float
 ) -> HandMaps | None:
-    """Maps of the hands of a person of `scale` px/m; places are asked for in pixels of the image.
+    """Make the maps of the hands of a person of `scale` px/m, to be queried in pixels of the image.
 
-    `flows` lead away from the image, on the working grid of `grid`. None where the window's evidence knows no skin.
+    `flows` lead away from the image, on the working grid of `grid`. None if the window's evidence has no skin map.
     """
-    scene = window.scene
-    if not isinstance(scene, ImageEvidence):
+    evidence = window.evidence
+    if not isinstance(evidence, ImageEvidence):
         return None
-    size = np.array(scene.features.image.shape[1::-1])
+    size = np.array(evidence.features.image.shape[1::-1])
     low = np.clip(np.rint(grid.to_work(window.corner)), 0, np.array(grid.work) - 1).astype(int)
     high = np.clip(np.rint(grid.to_work(window.corner + size / window.factor)), low + 1, grid.work).astype(int)
     width, height = (int(side) for side in size)
-    pieces = [
+    crops = [
         resize_flow(np.ascontiguousarray(flow[low[1] : high[1], low[0] : high[0]]), (width, height)) for flow in flows
     ]
-    return HandMaps.of(detectors, scene, pieces, scale * window.factor, window.corner, window.factor)
+    return HandMaps.of(detectors, evidence, crops, scale * window.factor, window.corner, window.factor)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which detection belongs to which tracked person."""
+"""Association of detections with tracks, by distance and appearance."""
 
 from __future__ import annotations
 
@@ -14,69 +14,72 @@ from flowing_puppet_ros.image.tracking.track import Track
 
 type Detection = tuple[F64, F64]  # joints (J, 2) px with NaN unknown, confidence (J,)
 
-APPEARANCE = 0.6  # m; joints this far off count as much as clothes that have nothing in common
-SAME, OTHERS = 0.45, 0.15  # unlikeness of the clothes that a person is known by, and how much more that of others is
-AGAIN = 3.0  # times the distance to which somebody is looked for whom another person hid
+APPEARANCE_WEIGHT_M = 0.6  # distance of joints that costs as much as the maximum appearance distance
+MAX_SAME_DISTANCE = 0.45  # appearance distance up to which a lost person is recognised ...
+MIN_OTHER_MARGIN = 0.15  # ... if all others differ by so much more
+REIDENTIFY_FACTOR = 3.0  # search radius for a person after an occlusion, in match distances
 
 
-def joint_distance(person: Track, detection: Detection) -> float:
-    """Median distance in metres over the joints that both know; infinite when they share fewer than three."""
-    both = np.isfinite(detection[0]).all(axis=1) & ~person.unknown
+def joint_distance(track: Track, detection: Detection) -> float:
+    """Return the median distance in metres over the joints known to both; infinite if those are fewer than three."""
+    both = np.isfinite(detection[0]).all(axis=1) & ~track.unknown
     if np.count_nonzero(both) < 3:
         return np.inf
-    apart = detection[0][both] - person.mean[both]
-    return float(np.median(np.hypot(apart[:, 0], apart[:, 1]))) / person.scale
+    offset = detection[0][both] - track.mean[both]
+    return float(np.median(np.hypot(offset[:, 0], offset[:, 1]))) / track.scale
 
 
 def associate(
-    people: Sequence[Track],
+    tracks: Sequence[Track],
     detections: Sequence[Detection],
     limit: float,
     appearances: Sequence[TorsoAppearance | None] | None = None,
 ) -> tuple[dict[int, int], list[int]]:
-    """Match people and detections one to one: the joints are near, none beyond `limit` metres, and the clothes alike.
+    """Match tracks and detections one to one, by joint distance (at most `limit` metres) and appearance.
 
-    `worn` is what each detected person wears. Who was matched with none, and has met somebody who may have hidden and
-    dragged them along, is found again at AGAIN times the distance by clothes that no other person wears.
+    `appearances` are those of the detected people. A track without a match that has overlapped with another, and may
+    have been occluded by it, is re-identified by an appearance that no other track has, within REIDENTIFY_FACTOR times
+    the limit.
 
-    Returns {person: detection} and the detections that are nobody's: a second detection of a matched person
-    (within `limit`) is not among them.
+    Returns {track: detection} and the unmatched detections; a second detection of a matched track (within `limit`) is
+    not among them.
     """
-    if not people or not detections:
+    if not tracks or not detections:
         return {}, list(range(len(detections)))
-    apart = np.array([[joint_distance(person, detection) for detection in detections] for person in people])
-    cost = np.minimum(apart, 1e3 * limit)
-    strange = _appearance_cost(people, appearances, apart.shape)
-    rows, columns = linear_sum_assignment(cost + APPEARANCE * strange)
-    matched = {int(row): int(column) for row, column in zip(rows, columns, strict=True) if apart[row, column] <= limit}
-    matched |= _reidentify(people, apart, strange, matched, AGAIN * limit)
+    distance = np.array([[joint_distance(track, detection) for detection in detections] for track in tracks])
+    cost = np.minimum(distance, 1e3 * limit)
+    dissimilarity = _appearance_distance(tracks, appearances, distance.shape)
+    rows, columns = linear_sum_assignment(cost + APPEARANCE_WEIGHT_M * dissimilarity)
+    pairs = zip(rows, columns, strict=True)
+    matched = {int(row): int(column) for row, column in pairs if distance[row, column] <= limit}
+    matched |= _reidentify(tracks, distance, dissimilarity, matched, REIDENTIFY_FACTOR * limit)
     taken = set(matched.values())
-    free = [k for k in range(len(detections)) if k not in taken and not (apart[list(matched), k] <= limit).any()]
+    free = [k for k in range(len(detections)) if k not in taken and not (distance[list(matched), k] <= limit).any()]
     return matched, free
 
 
-def _appearance_cost(
-    people: Sequence[Track], worn: Sequence[TorsoAppearance | None] | None, shape: tuple[int, int]
+def _appearance_distance(
+    tracks: Sequence[Track], appearances: Sequence[TorsoAppearance | None] | None, shape: tuple[int, int]
 ) -> F64:
-    """How unlike (people, detections) the clothes are; 0.5 where they are not known."""
-    strange = np.full(shape, 0.5)
-    for row, person in enumerate(people):
-        for column, clothes in enumerate(worn or ()):
-            if person.appearance is not None and clothes is not None:
-                strange[row, column] = hellinger_distance(person.appearance, clothes.colours)
-    return strange
+    """Return the appearance distances (tracks, detections) in [0, 1]; 0.5 where one is not known."""
+    distance = np.full(shape, 0.5)
+    for row, track in enumerate(tracks):
+        for column, appearance in enumerate(appearances or ()):
+            if track.appearance is not None and appearance is not None:
+                distance[row, column] = hellinger_distance(track.appearance, appearance.colours)
+    return distance
 
 
 def _reidentify(
-    people: Sequence[Track], apart: F64, strange: F64, matched: dict[int, int], limit: float
+    tracks: Sequence[Track], distance: F64, dissimilarity: F64, matched: dict[int, int], limit: float
 ) -> dict[int, int]:
-    """People who have met others, and the detections that are theirs by the clothes, the likest first."""
-    rows = [k for k, person in enumerate(people) if k not in matched and person.overlapped]
-    columns = [k for k in range(apart.shape[1]) if k not in matched.values()]
+    """Match unmatched tracks that have overlapped with others by appearance, the most similar first."""
+    rows = [k for k, track in enumerate(tracks) if k not in matched and track.overlapped]
+    columns = [k for k in range(distance.shape[1]) if k not in matched.values()]
     found: dict[int, int] = {}
-    for row, column in sorted(((r, c) for r in rows for c in columns), key=lambda pair: float(strange[pair])):
-        others = min((strange[k, column] for k in range(len(people)) if k != row), default=1.0)
-        known = strange[row, column] <= min(SAME, others - OTHERS)
-        if known and apart[row, column] <= limit and row not in found and column not in found.values():
+    for row, column in sorted(((r, c) for r in rows for c in columns), key=lambda pair: float(dissimilarity[pair])):
+        others = min((dissimilarity[k, column] for k in range(len(tracks)) if k != row), default=1.0)
+        same = dissimilarity[row, column] <= min(MAX_SAME_DISTANCE, others - MIN_OTHER_MARGIN)
+        if same and distance[row, column] <= limit and row not in found and column not in found.values():
             found[row] = column
     return found

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flowing-puppet tracker: people as 2D puppets, carried by optical flow and re-anchored by detections.
+"""Flowing-puppet tracker: people as 2D puppets, propagated by optical flow and corrected by detections.
 
 Causal: each image is used once, with the flow from the one before it (thesis, flowing puppets, sections 1 and 2). The
-state of a person is the location of the joints, a scale and a view; the puppet follows from them (section 4).
+state of a person is the joints, a scale and a view; the puppet follows from them (section 4).
 """
 
 from __future__ import annotations
@@ -15,38 +15,40 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64, U8, Bools
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import (
+    MIN_SIDE_PX,
     FlowPair,
     FlowSettings,
     OpticalFlow,
-    as_image,
     resize_flow,
     working_size,
 )
 from flowing_puppet_ros.flow.puppet_flow import PuppetFlow
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
-from flowing_puppet_ros.image.tracking.appearance import find_overlapping, torso_appearances
+from flowing_puppet_ros.image.tracking.appearance import TorsoAppearance, find_overlapping, torso_appearances
 from flowing_puppet_ros.image.tracking.association import Detection, associate, joint_distance
 from flowing_puppet_ros.image.tracking.propagation import ImageScale, Propagation, propagate_tracks, render_label_map
 from flowing_puppet_ros.image.tracking.shot_boundary import colour_histogram, is_cut
 from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
+from flowing_puppet_ros.images import as_image
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order
 from flowing_puppet_ros.model.ds.shape import PuppetShape, View
 
-LEAST_KNOWN = 3  # a person of whom fewer joints are known is lost
-HIDDEN, OUTSIDE = 0.3, 0.1  # share of the confidence that is left of a joint behind somebody nearer, out of the image
+MIN_KNOWN_JOINTS = 3  # of a live track
+HIDDEN_CONFIDENCE = 0.3  # share of the confidence that a joint behind a nearer person keeps ...
+OUTSIDE_CONFIDENCE = 0.1  # ... and one outside of the image
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackedPuppet:
-    """One person in one image, pixels of the image.
+    """One person in one image, in pixels of the image.
 
-    `joints` (J, 2) in the order of the model's joint_names, `confidence` (J,) in [0, 1], in which the share `visible`
-    (J,) is contained that joints outside of the image or behind somebody keep, `scale` px/m, `view` front or back,
-    `contours` one (K_i, 2) a part, `depth` (P,) paint order of each part, 0 farthest, `energy` the negative log of the
-    body prior, the flow's misfit and the distance of the detection (up to a constant; lower is better), `detected`
-    (J, 3) what this image's detection says, x, y and confidence, or None, and `detection` its index.
+    `joints` (J, 2) are in the order of the model's joint_names. `confidence` (J,) in [0, 1] is already multiplied by
+    `visible` (J,), which is below 1 for joints that are occluded or outside the image. `scale` is in px/m, `view` front
+    or back; `contours` (K_i, 2) per part, `depth` (P,) the drawing order of each part, 0 farthest. `energy` is the
+    negative log of the body prior plus the flow's misfit and the distance of the detection, up to a constant; lower is
+    better. `detected` (J, 3) is this image's detection as x, y and confidence, and `detection` its index, or None.
     """
 
     id: str
@@ -66,10 +68,10 @@ class TrackedPuppet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackResult:
-    """What one step found: `puppets` in the order of their ids, `flow` (forward, backward) at working scale, or None.
+    """Result of one step: `puppets` in the order of their ids, and `flow` (forward, backward) at working scale.
 
-    `flow` leads from the previous image to this one; it is None for the first image and when nobody was tracked.
-    `restarted`: everybody before this image was forgotten, because of a cut, a stamp that went back or another size.
+    `flow` leads from the previous image to this one; it is None for the first image and if nobody was tracked.
+    `restarted` is set if all earlier tracks were dropped: at a cut, a stamp that went back or a new image size.
     """
 
     puppets: list[TrackedPuppet]
@@ -80,8 +82,8 @@ class TrackResult:
     _propagation: Propagation | None
     restarted: bool = False
 
-    def labels(self, shape: tuple[int, int] | None = None) -> U8:
-        """Part labels (H, W) uint8 of all people, part index + 1, 0 background; `shape` is the image's if not given."""
+    def render_part_labels(self, shape: tuple[int, int] | None = None) -> U8:
+        """Draw the part labels (H, W) of all people: part index + 1, 0 background; `shape` as the image by default."""
         height, width = shape or (self.grid.image[1], self.grid.image[0])
         grid = ImageScale(self.grid.image, (width, height))
         labels = render_label_map(self._model, [puppet.shape for puppet in self.puppets], grid)
@@ -89,13 +91,13 @@ class TrackResult:
         return np.where(labels > 0, (labels - 1) % parts + 1, 0).astype(np.uint8)
 
     def puppet_flow(self) -> PuppetFlow | None:
-        """The puppet flow from the previous image to this one, on the grid of `flow`; None where that is None."""
+        """Return the puppet flow from the previous image, on the grid of `flow`; None if that is None."""
         return self._propagation.puppet_flow() if self._propagation else None
 
 
 @dataclass(slots=True, eq=False)
-class _Previous:
-    """What the next step needs of an image: its stamp, the grid, the small grey picture and its colours."""
+class _Frame:
+    """Data of an image that the next step needs: its stamp, the grid, the small grey image and its colours."""
 
     stamp_ns: int
     grid: ImageScale
@@ -104,7 +106,11 @@ class _Previous:
 
 
 class FlowingPuppetTracker:
-    """Tracks people through the images of one camera; every step takes the next image."""
+    """Tracker of people through the images of one camera.
+
+    Every step takes the next image: propagate the tracks by the flow, unless there is a cut; associate the detections;
+    fuse the matched ones; start tracks at the others; drop lost tracks.
+    """
 
     def __init__(
         self,
@@ -115,13 +121,13 @@ class FlowingPuppetTracker:
         self.model = model
         self.settings = settings or TrackerSettings()
         self.optical_flow = OpticalFlow(flow_settings)
-        self.people: list[Track] = []
-        self._previous: _Previous | None = None
+        self.tracks: list[Track] = []
+        self._previous: _Frame | None = None
         self._started = 0
 
     def reset(self) -> None:
-        """Forget everybody and the previous image; ids go on, so that none is used twice in a run."""
-        self.people = []
+        """Drop all tracks and the previous image; ids continue, so that none is used twice in a run."""
+        self.tracks = []
         self._previous = None
 
     def step(
@@ -130,172 +136,196 @@ class FlowingPuppetTracker:
         stamp_ns: int,
         detections: Sequence[Keypoints] | None = None,
         flow: FlowPair | None = None,
-        looked_for: Collection[str] | None = None,
+        searched_ids: Collection[str] | None = None,
     ) -> TrackResult:
-        """Take the next `image` (H, W, 3) RGB or (H, W) grey, uint8, and say who is where in it.
+        """Track the people into the next `image` (H, W, 3) RGB or (H, W) grey, uint8.
 
-        `detections` are the people a detector found in this image; None when none ran, empty when it found nobody. Who
-        is not among them is missed, of those with ids in `looked_for` where only some were looked for.
+        `detections` are the people a detector found in this image; None if none ran, empty if it found nobody. Tracks
+        without a detection count as missed; if the detector searched for some people only, give their `searched_ids`.
         `flow` is (forward from the previous image, backward to it), each (h, w, 2) in pixels of its own grid of any
-        resolution, NaN unknown; computed here when not given. A stamp before the previous one, an image of another size
-        and a cut between shots restart the tracker with a warning. InputError for what is no image.
+        resolution, NaN unknown; computed here if not given. A stamp before the previous one, an image of another size
+        or a cut between shots restarts the tracker with a warning. InputError if `image` is not an image.
         """
-        image = as_image(image)
-        size = (image.shape[1], image.shape[0])
-        grid = ImageScale(size, working_size(image.shape, self.optical_flow.settings.max_side))
-        began = self._previous is not None
-        warnings = self._restart_if_broken(stamp_ns, size)
-        previous = self._previous
-        self._previous = _Previous(stamp_ns, grid, self.optical_flow.prepare(image), colour_histogram(image))
-        carriage, pair, restarted = None, None, began and previous is None
-        if previous is not None and self.people:
-            pair = self._flow(previous, flow, warnings)
-            if is_cut(previous.colours, self._previous.colours, pair):
-                warnings.append("the picture changes as at a cut between shots: tracking starts anew")
-                self.people, pair, restarted = [], None, True
+        image = as_image(image, MIN_SIDE_PX)
+        frame = self._prepare(image, stamp_ns)
+        warnings: list[str] = []
+        restarted = self._restart_if_broken(frame, warnings)
+        previous, self._previous = self._previous, frame
+        pair, propagation = None, None
+        if previous is not None and self.tracks:
+            pair = self._choose_flow(previous, frame, flow, warnings)
+            if is_cut(previous.colours, frame.colours, pair):
+                warnings.append("the picture changes as at a cut between shots: tracking restarts")
+                self.tracks, pair, restarted = [], None, True
             else:
-                carriage = propagate_tracks(self.model, self.people, pair, grid, self.settings)
-        self._fuse_detections(image, detections, looked_for, warnings)
-        self.people = [person for person in self.people if self._is_alive(person, size)]
-        for person in self.people:
-            person.complete_and_redraw(self.model)
-        return TrackResult(self._puppets(grid), pair, warnings, self.model, grid, carriage, restarted)
+                propagation = propagate_tracks(self.model, self.tracks, pair, frame.grid, self.settings)
+        self._count_image()
+        if detections is not None:
+            found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
+            appearances = self._measure_appearances(image, found)
+            matched, unmatched = associate(self.tracks, found, self.settings.match_distance, appearances)
+            self._fuse_detections(found, appearances, matched, searched_ids)
+            self._start_tracks(found, unmatched, warnings)
+        self.tracks = [track for track in self.tracks if self._is_alive(track, frame.grid.image)]
+        for track in self.tracks:
+            track.complete_and_redraw(self.model)
+        return TrackResult(
+            puppets=self._make_puppets(frame.grid),
+            flow=pair,
+            warnings=warnings,
+            grid=frame.grid,
+            restarted=restarted,
+            _model=self.model,
+            _propagation=propagation,
+        )
 
     def override_joints(
         self, result: TrackResult, places: Mapping[str, Mapping[int, tuple[F64, float]]]
     ) -> TrackResult:
-        """The last result with some joints moved: by id and joint the place (2,) px and how sure it is (0 to 1)."""
-        for person in self.people:
-            for joint, (place, confidence) in places.get(person.id, {}).items():
-                person.override_joint(joint, place, confidence, self.settings)
-            if places.get(person.id):
-                person.complete_and_redraw(self.model)
-        return replace(result, puppets=self._puppets(result.grid))
+        """Return the last result with some joints moved: by id and joint, the position (2,) px and its confidence."""
+        for track in self.tracks:
+            for joint, (place, confidence) in places.get(track.id, {}).items():
+                track.override_joint(joint, place, confidence, self.settings)
+            if places.get(track.id):
+                track.complete_and_redraw(self.model)
+        return replace(result, puppets=self._make_puppets(result.grid))
 
-    def _restart_if_broken(self, stamp_ns: int, size: tuple[int, int]) -> list[str]:
+    def _prepare(self, image: U8, stamp_ns: int) -> _Frame:
+        grid = ImageScale(
+            (image.shape[1], image.shape[0]), working_size(image.shape, self.optical_flow.settings.max_side)
+        )
+        return _Frame(stamp_ns, grid, self.optical_flow.prepare(image), colour_histogram(image))
+
+    def _restart_if_broken(self, frame: _Frame, warnings: list[str]) -> bool:
+        """Reset, and return True, if `frame` cannot follow the previous one."""
         previous = self._previous
         if previous is None:
-            return []
-        if stamp_ns < previous.stamp_ns:
-            self.reset()
-            return [f"the stamp went back from {previous.stamp_ns} to {stamp_ns} ns: tracking starts anew"]
-        if size != previous.grid.image:
-            self.reset()
-            return [f"the image size changed from {previous.grid.image} to {size}: tracking starts anew"]
-        if stamp_ns == previous.stamp_ns:
-            return [f"two images have the stamp {stamp_ns} ns: both are used, in the order they came"]
-        return []
+            return False
+        size, before = frame.grid.image, previous.grid.image
+        if frame.stamp_ns < previous.stamp_ns:
+            warnings.append(f"the stamp went back from {previous.stamp_ns} to {frame.stamp_ns} ns: tracking restarts")
+        elif size != before:
+            warnings.append(f"the image size changed from {before} to {size}: tracking restarts")
+        else:
+            if frame.stamp_ns == previous.stamp_ns:
+                warnings.append(f"two images have the stamp {frame.stamp_ns} ns: both are used, in order of arrival")
+            return False
+        self.reset()
+        return True
 
-    def _flow(self, previous: _Previous, given: FlowPair | None, warnings: list[str]) -> FlowPair:
+    def _choose_flow(self, previous: _Frame, frame: _Frame, given: FlowPair | None, warnings: list[str]) -> FlowPair:
+        """Return the given flow on the working grid; compute it if there is none or it cannot be used."""
         if given is not None:
             if all(part.ndim == 3 and part.shape[2] == 2 and min(part.shape[:2]) > 1 for part in given):
                 work = previous.grid.work
                 return resize_flow(given[0], work), resize_flow(given[1], work)
-            warnings.append(f"flow of shape {given[0].shape} is no (h, w, 2) field: it is computed here instead")
-        assert self._previous is not None
-        return self.optical_flow.between(previous.grey, self._previous.grey)
+            warnings.append(f"flow of shape {given[0].shape} is not an (h, w, 2) field: it is computed here instead")
+        return self.optical_flow.estimate_prepared(previous.grey, frame.grey)
+
+    def _count_image(self) -> None:
+        """Start a new image: no track has a detection in it yet, and some may overlap."""
+        overlapping = find_overlapping(self.model.joint_names, [track.mean for track in self.tracks])
+        for track, overlaps in zip(self.tracks, overlapping, strict=True):
+            track.unseen += 1
+            track.detection_energy = 0.0
+            track.detected = track.detection = None
+            track.overlapped |= overlaps
+
+    def _measure_appearances(self, image: U8, found: Sequence[Detection]) -> list[TorsoAppearance | None] | None:
+        """Return the appearance of each detection; None if a single person leaves nothing to tell apart."""
+        if max(len(self.tracks), len(found)) <= 1:
+            return None
+        return torso_appearances(self.model.joint_names, image, [joints for joints, _ in found])
 
     def _fuse_detections(
         self,
-        image: U8,
-        detections: Sequence[Keypoints] | None,
-        looked_for: Collection[str] | None,
-        warnings: list[str],
+        found: Sequence[Detection],
+        appearances: Sequence[TorsoAppearance | None] | None,
+        matched: Mapping[int, int],
+        searched_ids: Collection[str] | None,
     ) -> None:
-        """Fuse the detections into the people they belong to and start new people at the rest."""
-        for person in self.people:
-            person.unseen += 1
-            person.detection_energy = 0.0
-            person.detected = person.detection = None
-        met = find_overlapping(self.model.joint_names, [person.mean for person in self.people])
-        for person, meets in zip(self.people, met, strict=True):
-            person.overlapped |= meets
-        if detections is None:
-            return
-        found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
-        several = max(len(self.people), len(found)) > 1
-        worn = torso_appearances(self.model.joint_names, image, [joints for joints, _ in found]) if several else None
-        matched, free = associate(self.people, found, self.settings.match_distance, worn)
-        for index, person in enumerate(self.people):
-            person.missed += looked_for is None or person.id in looked_for
-            if index in matched:
-                if joint_distance(person, found[matched[index]]) > self.settings.match_distance:
-                    person.reset_gate()
-                person.fuse(*found[matched[index]], self.settings)
-                person.update_scale_and_view(self.model)
-                person.unseen = person.missed = 0
-                person.detection, person.overlapped = matched[index], False
-                if worn and (clothes := worn[matched[index]]) is not None and clothes.alone:
-                    person.update_appearance(clothes.colours)
-        # The surest new person comes first: it gets the lower id, and a place when there is only one left.
-        for index in sorted(free, key=lambda k: -found[k][1].sum()):
-            self._start(index, found[index], warnings)
+        """Fuse each matched detection into its track; count a miss for the other tracks that were searched for."""
+        for index, track in enumerate(self.tracks):
+            track.missed += searched_ids is None or track.id in searched_ids
+            if index not in matched:
+                continue
+            detection = found[matched[index]]
+            if joint_distance(track, detection) > self.settings.match_distance:
+                track.reset_gate()
+            track.fuse(*detection, self.settings)
+            track.update_scale_and_view(self.model)
+            track.unseen = track.missed = 0
+            track.detection, track.overlapped = matched[index], False
+            appearance = appearances[matched[index]] if appearances else None
+            if appearance is not None and appearance.isolated:
+                track.update_appearance(appearance.colours)
 
-    def _start(self, index: int, detection: Detection, warnings: list[str]) -> None:
-        joints, confidence = detection
-        known = np.count_nonzero(np.isfinite(joints).all(axis=1))
-        if known < self.settings.least_joints:
-            least = self.settings.least_joints
-            warnings.append(f"a detected person is left out: {known} joints can be used, least_joints is {least}")
-            return
-        if len(self.people) >= self.settings.most_people:
-            warnings.append(f"more than {self.settings.most_people} people: the others are left out")
-            return
-        identity = letters_of_seed(self.settings.seed) + str(self._started + 1)
-        try:
-            self.people.append(Track.start(identity, self.model, joints, confidence, self.settings))
-        except InputError as error:
-            warnings.append(f"a detected person is left out: {error}")
-            return
-        self.people[-1].detection = index
-        self._started += 1
+    def _start_tracks(self, found: Sequence[Detection], unmatched: Sequence[int], warnings: list[str]) -> None:
+        """Start tracks at the unmatched detections, the most certain first: it gets the lower id and the last slot."""
+        for index in sorted(unmatched, key=lambda k: -found[k][1].sum()):
+            joints, confidence = found[index]
+            known = np.count_nonzero(np.isfinite(joints).all(axis=1))
+            if known < self.settings.min_joints:
+                limit = self.settings.min_joints
+                warnings.append(f"a detected person is left out: {known} joints can be used, min_joints is {limit}")
+                continue
+            if len(self.tracks) >= self.settings.max_people:
+                warnings.append(f"more than {self.settings.max_people} people: the others are left out (max_people)")
+                continue
+            identity = letters_of_seed(self.settings.seed) + str(self._started + 1)
+            try:
+                self.tracks.append(Track.start(identity, self.model, joints, confidence, self.settings))
+            except InputError as error:
+                warnings.append(f"a detected person is left out: {error}")
+                continue
+            self.tracks[-1].detection = index
+            self._started += 1
 
-    def _is_alive(self, person: Track, size: tuple[int, int]) -> bool:
-        if person.unseen > self.settings.unseen_images or person.missed > self.settings.missed_detections:
+    def _is_alive(self, track: Track, size: tuple[int, int]) -> bool:
+        """Return whether a track was seen recently enough and is still inside the image (width, height)."""
+        if track.unseen > self.settings.max_unmatched_images or track.missed > self.settings.max_missed_detections:
             return False
-        known = person.mean[~person.unknown]
-        if len(known) < LEAST_KNOWN:
+        known = track.mean[~track.unknown]
+        if len(known) < MIN_KNOWN_JOINTS:
             return False
         low, high = known.min(axis=0), known.max(axis=0)
         return not ((high < 0).any() or (low > np.array(size) - 1).any())
 
-    def _puppets(self, grid: ImageScale) -> list[TrackedPuppet]:
-        hidden = find_hidden_joints(self.model, self.people, grid)
-        return [self._puppet(one, grid.image, covered) for one, covered in zip(self.people, hidden, strict=True)]
+    def _make_puppets(self, grid: ImageScale) -> list[TrackedPuppet]:
+        hidden = find_hidden_joints(self.model, self.tracks, grid)
+        return [self._make_puppet(*pair, grid.image) for pair in zip(self.tracks, hidden, strict=True)]
 
-    def _puppet(self, person: Track, size: tuple[int, int], hidden: Bools) -> TrackedPuppet:
-        shape = person.shape
+    def _make_puppet(self, track: Track, hidden: Bools, size: tuple[int, int]) -> TrackedPuppet:
+        shape = track.shape
         assert shape is not None
-        order = depth_order(self.model, person.view)
-        depth = tuple(int(rank) for rank in np.argsort(order))
-        energy = self.model.energy(shape) + person.flow_energy + person.detection_energy
-        visible = np.where(hidden, HIDDEN, 1.0) * np.where(person.outside(size), OUTSIDE, 1.0)
+        depth = np.argsort(depth_order(self.model, track.view))
+        visible = np.where(hidden, HIDDEN_CONFIDENCE, 1.0) * np.where(track.find_outside(size), OUTSIDE_CONFIDENCE, 1.0)
         return TrackedPuppet(
-            person.id,
-            self.model.name,
-            person.mean.copy(),
-            person.confidence * visible,
-            visible,
-            person.scale,
-            person.view,
-            float(energy),
-            shape.contours,
-            depth,
-            shape,
-            person.detected,
-            person.detection,
+            id=track.id,
+            model=self.model.name,
+            joints=track.mean.copy(),
+            confidence=track.confidence * visible,
+            visible=visible,
+            scale=track.scale,
+            view=track.view,
+            energy=float(self.model.energy(shape) + track.flow_energy + track.detection_energy),
+            contours=shape.contours,
+            depth=tuple(int(rank) for rank in depth),
+            shape=shape,
+            detected=track.detected,
+            detection=track.detection,
         )
 
 
-def find_hidden_joints(model: DeformableStructures, people: Sequence[Track], grid: ImageScale) -> list[Bools]:
-    """Which joints (J,) of each person lie behind the puppet of somebody nearer."""
-    if len(people) < 2:
-        return [np.zeros(len(model.joint_names), dtype=bool) for _ in people]
-    labels = render_label_map(model, [person.shape for person in people if person.shape is not None], grid)
+def find_hidden_joints(model: DeformableStructures, tracks: Sequence[Track], grid: ImageScale) -> list[Bools]:
+    """Return which joints (J,) of each track lie behind the puppet of a nearer person."""
+    if len(tracks) < 2:
+        return [np.zeros(len(model.joint_names), dtype=bool) for _ in tracks]
+    labels = render_label_map(model, [track.shape for track in tracks if track.shape is not None], grid)
     height, width = labels.shape
     hidden = []
-    for k, person in enumerate(people):
-        x, y = np.rint(grid.to_work(person.mean)).astype(np.int64).T
+    for k, track in enumerate(tracks):
+        x, y = np.rint(grid.to_work(track.mean)).astype(np.int64).T
         inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
         owner = (labels[np.where(inside, y, 0), np.where(inside, x, 0)].astype(np.int64) - 1) // len(model.tree)
         hidden.append(inside & (owner >= 0) & (owner != k))

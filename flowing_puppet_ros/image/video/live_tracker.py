@@ -1,170 +1,154 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When the detector looks at an image of a live stream, and what its answer says of a later image.
+"""The tracker of a live stream, with asynchronous detection beside tracking.
 
-A look takes longer than an image may wait, so it runs beside the tracking and its answer is used at a fixed age,
-carried there along the flow. Searches of the whole image are rare; glances at the known people are quick and many. When
-an answer is used follows from the stamps alone: a replay, where each look is finished at once, gives the same puppets
-as the live node.
+A detector run takes longer than an image may wait. It runs beside the tracking, and its result is used at a fixed age,
+propagated along the flow to the image that is tracked then. Full-frame detections, which find everybody, are rare;
+re-detections in the regions (ROIs) of known people are fast and frequent. When a result is used follows from the stamps
+alone: a replay, where each run finishes at once, gives the same puppets as the live node.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 
-import cv2
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, Flow, Image
+from flowing_puppet_ros.arrays import Flow, Image
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arms.evidence import ArmEvidenceModel
 from flowing_puppet_ros.image.arms.hypotheses import ArmFilter
-from flowing_puppet_ros.image.arms.viterbi import PathSettings
+from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
 from flowing_puppet_ros.image.detector.detection import PersonCandidate
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
-from flowing_puppet_ros.image.video.detection_jobs import DetectedPerson, DetectionWorker, match_to_tracks
-from flowing_puppet_ros.image.video.detection_memory import KnownPeople
+from flowing_puppet_ros.image.video.detection_worker import DetectedPerson, DetectionWorker, match_to_tracks
+from flowing_puppet_ros.image.video.flow_history import propagate_points, reduce_flow
+from flowing_puppet_ros.image.video.known_people import KnownPeople
+from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.image.video.tracklets import TrackletLinker
-from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.units import NANOSECONDS
 
 FRAME_NS = NANOSECONDS // 30
-"""What is taken to have passed when a stamp does not go on (drivers that stamp nothing)."""
+"""Assumed time between images whose stamps do not increase (drivers that stamp nothing)."""
 MAX_GAP_NS = 10 * NANOSECONDS
-"""What is counted at most between two images."""
-BESIDE = 3.0
-"""How much longer a search may take while people are tracked and glanced at beside it."""
-COARSE = 2
-"""Flow is kept at this share of its resolution: a keypoint moves with its surroundings, and less memory is taken."""
-
-
-@dataclass(frozen=True)
-class LiveTrackerSettings(Settings):
-    """When the detector looks for people."""
-
-    detect: bool = setting(True, "find people by itself when nobody publishes detections")
-    detect_interval: float = setting(
-        2.0, "time from one search for people to the next while some are known", unit="s", low=0.05, high=3600.0
-    )
-    search_interval: float = setting(0.7, "the same while nobody is known", unit="s", low=0.05, high=3600.0)
-    detect_delay: float = setting(
-        0.4, "age at which the answer of a search is used; thrice that while people are tracked", unit="s", low=0.0,
-        high=10.0,
-    )  # fmt: skip
-    glance_interval: float = setting(
-        0.2, "time from one glance at the known people to the next, for each of them", unit="s", low=0.0, high=3600.0
-    )
-    glance_delay: float = setting(
-        0.13, "age at which the answer of a glance is used, for each person in it", unit="s", low=0.0, high=10.0
-    )
-    least_person: float = setting(0.3, "probability from which a detected person is tracked", low=0.0, high=1.0)
+"""Maximum time that is counted between two images."""
+BUSY_FACTOR = 3.0
+"""How much longer a full-frame detection may take while people are tracked and re-detected beside it."""
+MAX_PEOPLE = 80
+"""Maximum number of people that a detector run looks for."""
 
 
 @dataclass(slots=True, eq=False)
 class _PendingDetection:
-    """An image that is being looked at, when its answer is due, and the flow since then (None: broken off).
+    """A detector run, the image it is on, when its result is due, and the flow since then (None: interrupted).
 
-    `glanced` are the places of a glance by whom they belong to, and of people who are new; empty for a search.
+    `rois` are the candidates of an ROI re-detection by the ids of the people, and of new ones; empty for a full frame.
     """
 
     image: Image
     stamp_ns: int
     due_ns: int
-    seen: Future[list[DetectedPerson]]
-    roi: dict[str, PersonCandidate] = field(default_factory=dict)
+    people: Future[list[DetectedPerson]]
+    rois: dict[str, PersonCandidate] = field(default_factory=dict)
     flows: list[Flow] | None = field(default_factory=list)
 
     def record(self, flow: FlowPair | None) -> None:
-        """Take the flow to the next image."""
+        """Append the flow to the next image."""
         if flow is None:
             self.flows = None
         elif self.flows is not None:
-            self.flows.append(_coarse(flow[0]))
+            self.flows.append(reduce_flow(flow[0]))
 
 
 class LiveTracker:
-    """Has the detector look at some of the images that are tracked, and the tracker told whom it saw."""
+    """Runs the detector on some of the images that are tracked, and gives the tracker what it finds."""
 
     def __init__(
         self,
-        settings: LiveTrackerSettings,
         tracker: FlowingPuppetTracker,
-        counters: Counter[str],
-        looker: DetectionWorker | None = None,
+        settings: LiveDetectionSettings,
+        counters: Counter[str] | None = None,
+        worker: DetectionWorker | None = None,
     ) -> None:
-        """Without a `looker` load none yet: whoever publishes detections needs no detector."""
-        self._looker = looker
+        """Track with `tracker`; without a `worker` the package's detector is loaded at its first run."""
         self._tracker = tracker
         self._settings = settings
-        self._counters = counters
+        self._counters: Counter[str] = Counter() if counters is None else counters
+        self._worker = worker
         self.reset()
 
-    def reconfigure(self, settings: LiveTrackerSettings) -> None:
-        """Go on with these settings."""
+    def reconfigure(self, settings: LiveDetectionSettings) -> None:
+        """Go on with other settings."""
         self._settings = settings
-        self._watch.searches.least, self._watch.searches.most = self._limits()
+        linker = self._known.linker
+        linker.min_probability, linker.max_people = self._limits()
 
     def warm_up(self, image: Image, puppet: TrackedPuppet) -> None:
-        """Load the detector and have it look at an image of no interest, if it will ever look at any."""
-        if self._settings.detect:
+        """Load the detector and run it on an image of no interest, if it is ever going to run."""
+        if self._settings.source != "none":
             neck, face = (puppet.joints[self._tracker.model.joint_names.index(name)] for name in ("neck", "face"))
             place = PersonCandidate(neck, face, puppet.scale * self._tracker.model.shoulder_width, 0.0)
-            arms = {puppet.id: ArmFilter(PathSettings())}
-            self._detect_full_frame(image, self._forget_people(), 0)
-            for _look in range(2):
-                self._detect_in_rois(image, [place], [puppet], arms)
+            arms = {puppet.id: ArmFilter(ArmPathSettings())}
+            self._load_worker().detect_full_frame(image, self._know_nobody(), 0)
+            for _run in range(2):
+                self._load_worker().detect_in_rois(image, [place], [puppet], arms)
 
     def reset(self) -> None:
-        """Forget the images; the next one is looked at."""
+        """Forget the images; the detector runs on the next one."""
         self._now_ns = 0
-        self._searches = 0
+        self._full_frames = 0
         self._previous: tuple[int, Image] | None = None
-        self._forget()
+        self._forget_people()
 
-    def _forget(self) -> None:
-        """Know nobody, and look for people in the next image."""
-        self._watch = self._forget_people()
+    def _forget_people(self) -> None:
+        self._known = self._know_nobody()
         self._arms: dict[str, ArmFilter] = {}
         self._new: list[PersonCandidate] = []
-        self._search_look: _PendingDetection | None = None
-        self._glance_look: _PendingDetection | None = None
-        self._searched_ns: int | None = None
-        self._glanced_ns: int | None = None
+        self._full_frame: _PendingDetection | None = None
+        self._roi: _PendingDetection | None = None
+        self._full_frame_ns: int | None = None
+        self._roi_ns: int | None = None
 
-    def _forget_people(self) -> KnownPeople:
+    def _know_nobody(self) -> KnownPeople:
         return KnownPeople(TrackletLinker(*self._limits(), 1))
 
     def _limits(self) -> tuple[float, int]:
-        return self._settings.least_person, min(self._tracker.settings.most_people, 80)
+        return self._settings.min_probability, min(self._tracker.settings.max_people, MAX_PEOPLE)
 
-    def step(self, image: Image, stamp_ns: int, flow: FlowPair | None, beside: Executor | None) -> TrackResult:
-        """Track the next `image` (H, W, 3) RGB, with what the looks saw whose answers are due.
+    def step(
+        self, image: Image, stamp_ns: int, flow: FlowPair | None = None, executor: Executor | None = None
+    ) -> TrackResult:
+        """Track the next `image` (H, W, 3) RGB, with the results of the detector runs that are due.
 
-        `flow` is as `FlowingPuppetTracker.step` takes it; a look runs on the executor `beside`, or at once.
+        `flow` is as `FlowingPuppetTracker.step` takes it. Detector runs go to the `executor`, or finish at once.
+
+            full frame due | people tracked | what is done
+            yes            | no             | start tracks in its image, track from there to this one
+            yes            | yes            | track; update the known people, re-detect the new ones next
+            no             |                | track, with the ROI re-detection that is due, if any
         """
-        self._pass_time(image, stamp_ns)
-        search, glance = self._due(self._search_look), self._due(self._glance_look)
-        if search is not None:
-            self._search_look = None
-            self._counters["searches with people"] += bool(search.seen.result())
-        if search is not None and not self._tracker.people:
-            result = self._start_from_search(search, image, stamp_ns)
+        self._advance_clock(image, stamp_ns)
+        full_frame, roi = self._take_due_full_frame(), self._roi if self._is_due(self._roi) else None
+        if full_frame is not None and not self._tracker.tracks:
+            result = self._start_tracks(full_frame, image, stamp_ns)
         else:
-            result = self._track_with_detections(glance, image, stamp_ns, flow)
-            if search is not None and not result.restarted:
-                self._learn(search, result)
+            result = self._track(roi, image, stamp_ns, flow)
+            if full_frame is not None and not result.restarted:
+                self._update_known_people(full_frame, result)
         self._previous = stamp_ns, image
-        if self._search_look is None:
-            self._search_look = self._next_full_frame(image, stamp_ns, result, beside)
-        if self._glance_look is None:
-            self._glance_look = self._next_roi(image, stamp_ns, result, beside)
+        if self._full_frame is None:
+            self._full_frame = self._run_full_frame(image, stamp_ns, result, executor)
+            if not self._tracker.tracks and (full_frame := self._take_due_full_frame()) is not None:
+                result = self._start_tracks(full_frame, image, stamp_ns, result)
+        if self._roi is None:
+            self._roi = self._run_roi(image, stamp_ns, result, executor)
         return result
 
-    def _pass_time(self, image: Image, stamp_ns: int) -> None:
+    def _advance_clock(self, image: Image, stamp_ns: int) -> None:
         previous = self._previous
         if previous is not None and (stamp_ns < previous[0] or image.shape != previous[1].shape):
             self.reset()
@@ -172,162 +156,154 @@ class LiveTracker:
             passed = stamp_ns - previous[0]
             self._now_ns += min(passed, MAX_GAP_NS) if passed > 0 else FRAME_NS
 
-    def _due(self, look: _PendingDetection | None) -> _PendingDetection | None:
-        return look if look is not None and self._previous is not None and self._now_ns >= look.due_ns else None
+    def _is_due(self, run: _PendingDetection | None) -> bool:
+        return run is not None and self._now_ns >= run.due_ns
 
-    def _start_from_search(self, search: _PendingDetection, image: Image, stamp_ns: int) -> TrackResult:
-        """Begin tracks in the image that was searched; one long flow leads from there to this one."""
-        self._glance_look, self._arms, warnings = None, {}, []
-        if found := search.seen.result():
+    def _take_due_full_frame(self) -> _PendingDetection | None:
+        if not self._is_due(self._full_frame):
+            return None
+        run, self._full_frame = self._full_frame, None
+        assert run is not None
+        self._counters["full frames with people"] += bool(run.people.result())
+        return run
+
+    def _start_tracks(
+        self, run: _PendingDetection, image: Image, stamp_ns: int, result: TrackResult | None = None
+    ) -> TrackResult:
+        """Start tracks in the image of a full-frame detection; one long flow leads from there to `image`.
+
+        Where `image` itself was detected in, its `result` so far, without anybody, is given.
+        """
+        self._roi, self._arms = None, {}
+        warnings = [] if result is None else result.warnings
+        restarted = result is not None and result.restarted
+        if people := run.people.result():
             self._tracker.reset()
-            begun = self._tracker.step(search.image, search.stamp_ns, [person.keypoints for person in found])
-            warnings = begun.warnings
-            self._watch.update({p.id: found[p.detection].candidate for p in begun.puppets if p.detection is not None})
+            started = self._tracker.step(run.image, run.stamp_ns, [person.keypoints for person in people])
+            warnings = [*warnings, *started.warnings]
+            self._known.update(
+                {p.id: people[p.detection].candidate for p in started.puppets if p.detection is not None}
+            )
+            if result is not None:
+                return replace(started, warnings=warnings, restarted=restarted)
+        if result is not None:
+            return result
         result = self._record_flow(self._tracker.step(image, stamp_ns))
         return replace(result, warnings=[*warnings, *result.warnings])
 
-    def _track_with_detections(
-        self, glance: _PendingDetection | None, image: Image, stamp_ns: int, flow: FlowPair | None
-    ) -> TrackResult:
-        """Track an image, with the answer of a glance where one is due."""
-        if glance is None or not self._tracker.people or glance.flows is None:
-            if glance is not None:
-                self._glance_look, self._arms = None, {}
+    def _track(self, run: _PendingDetection | None, image: Image, stamp_ns: int, flow: FlowPair | None) -> TrackResult:
+        """Track an image, with the result of an ROI re-detection where one is due."""
+        if run is None or not self._tracker.tracks or run.flows is None:
+            if run is not None:
+                self._roi, self._arms = None, {}
             return self._record_flow(self._tracker.step(image, stamp_ns, None, flow))
         assert self._previous is not None
-        self._glance_look = None
-        self._counters["glances"] += 1
-        flow = flow or self._tracker.optical_flow.at_working_scale(self._previous[1], image)
+        self._roi = None
+        self._counters["ROI re-detections"] += 1
+        flow = flow or self._tracker.optical_flow.estimate_at_working_scale(self._previous[1], image)
         size = image.shape[1], image.shape[0]
-        move = partial(propagate_points, flows=[*glance.flows, _coarse(flow[0])], size=size)
-        # The arms are the glance's until it has ended.
-        seen = [person.move(move) for person in glance.seen.result()]
+        move = partial(propagate_points, flows=[*run.flows, reduce_flow(flow[0])], size=size)
+        # The arms belong to the detector run until it has finished.
+        people = [person.move(move) for person in run.people.result()]
         for arms in self._arms.values():
-            arms.predict(partial(propagate_points, flows=glance.flows, size=size, keep=True), len(glance.flows))
-        keypoints = [person.keypoints for person in seen]
-        result = self._record_flow(self._tracker.step(image, stamp_ns, keypoints, flow, glance.roi))
+            arms.predict(partial(propagate_points, flows=run.flows, size=size, keep=True), len(run.flows))
+        keypoints = [person.keypoints for person in people]
+        result = self._record_flow(self._tracker.step(image, stamp_ns, keypoints, flow, run.rois))
         if result.restarted:
             self._tracker.reset()
             empty = self._tracker.step(image, stamp_ns)
             return replace(empty, warnings=result.warnings, restarted=True)
-        owned = {puppet.id: seen[puppet.detection] for puppet in result.puppets if puppet.detection is not None}
-        self._watch.add({identity: person.candidate for identity, person in owned.items()})
-        arms_seen = {identity: person.arms for identity, person in owned.items() if person.identity == identity}
+        matched = {puppet.id: people[puppet.detection] for puppet in result.puppets if puppet.detection is not None}
+        self._known.add({identity: person.candidate for identity, person in matched.items()})
+        arms_seen = {identity: person.arms for identity, person in matched.items() if person.identity == identity}
         return self._tracker.override_joints(result, arms_seen)
 
     def _record_flow(self, result: TrackResult) -> TrackResult:
-        """The same result; what is known of the image before is carried to its image."""
+        """Return the result; propagate what is pending, and the hypotheses of the arms, to its image."""
         if result.restarted:
-            # Nobody stands any more where they stood before a cut.
-            self._forget()
-        if self._search_look is not None:
-            self._search_look.record(result.flow)
-        if self._glance_look is not None:
-            self._glance_look.record(result.flow)
+            # After a cut nobody is where they were before.
+            self._forget_people()
+        if self._full_frame is not None:
+            self._full_frame.record(result.flow)
+        if self._roi is not None:
+            self._roi.record(result.flow)
         else:
             for arms in self._arms.values():
                 arms.propagate(result.flow, result.grid)
         return result
 
-    def _learn(self, search: _PendingDetection, result: TrackResult) -> None:
-        """Take the places of a search: those where nobody is tracked are glanced at next."""
+    def _update_known_people(self, run: _PendingDetection, result: TrackResult) -> None:
+        """Take the places of a full-frame detection; those without a track are re-detected next."""
         self._new = []
-        if search.flows is None or result.flow is None:
+        if run.flows is None or result.flow is None:
             return
-        search.record(result.flow)
-        places = [
-            person.move(partial(propagate_points, flows=search.flows, size=result.grid.image)).candidate
-            for person in search.seen.result()
-        ]
+        run.record(result.flow)
+        move = partial(propagate_points, flows=run.flows, size=result.grid.image)
+        places = [person.move(move).candidate for person in run.people.result()]
         owners = match_to_tracks(places, result.puppets, self._tracker.model)
-        self._watch.update({puppet.id: places[index] for index, puppet in owners.items()})
+        self._known.update({puppet.id: places[index] for index, puppet in owners.items()})
         self._new = [
             place
             for index, place in enumerate(places)
             if index not in owners and np.isfinite([*place.neck, *place.face]).all()
         ]
 
-    def _next_full_frame(
-        self, image: Image, stamp_ns: int, result: TrackResult, beside: Executor | None
+    def _run_full_frame(
+        self, image: Image, stamp_ns: int, result: TrackResult, executor: Executor | None
     ) -> _PendingDetection | None:
-        """Begin to search the image that was just tracked, where it is time for it."""
+        """Start a full-frame detection on the image that was just tracked, if it is time for one."""
         settings, people = self._settings, [puppet.id for puppet in result.puppets]
-        known = self._watch.known(people)
-        interval = settings.detect_interval if known else settings.search_interval
-        if self._searched_ns is not None and self._now_ns - self._searched_ns < _ns(interval):
+        interval = settings.full_frame_interval if self._known.contains(people) else settings.empty_interval
+        if self._full_frame_ns is not None and self._now_ns - self._full_frame_ns < _to_ns(interval):
             return None
-        self._searched_ns = self._now_ns
-        self._searches += 1
-        look = partial(self._detect_full_frame, image, self._watch, self._searches)
-        delay = settings.detect_delay * (BESIDE if people else 1.0)
-        return _PendingDetection(image, stamp_ns, self._now_ns + _ns(delay), _done(look, beside))
+        self._full_frame_ns = self._now_ns
+        self._full_frames += 1
+        run = partial(self._detect_full_frame, image, self._known, self._full_frames)
+        delay = settings.full_frame_delay * (BUSY_FACTOR if people else 1.0)
+        return _PendingDetection(image, stamp_ns, self._now_ns + _to_ns(delay), _submit(run, executor))
 
-    def _next_roi(
-        self, image: Image, stamp_ns: int, result: TrackResult, beside: Executor | None
+    def _run_roi(
+        self, image: Image, stamp_ns: int, result: TrackResult, executor: Executor | None
     ) -> _PendingDetection | None:
-        """Begin to glance at the known people of the image that was just tracked, where it is time for it."""
+        """Start a re-detection of the known people in the image that was just tracked, if it is time for one."""
         joints = {puppet.id: puppet.joints for puppet in result.puppets}
-        glanced = self._watch.places(self._tracker.model.joint_names, joints)
-        glanced |= {f"new {number}": place for number, place in enumerate(self._new)}
-        since = None if self._glanced_ns is None else self._now_ns - self._glanced_ns
-        if not glanced or (since is not None and since < _ns(self._settings.glance_interval * len(glanced))):
+        rois = self._known.candidates(self._tracker.model.joint_names, joints)
+        rois |= {f"new {number}": place for number, place in enumerate(self._new)}
+        since = None if self._roi_ns is None else self._now_ns - self._roi_ns
+        if not rois or (since is not None and since < _to_ns(self._settings.roi_interval * len(rois))):
             return None
-        self._new, self._glanced_ns = [], self._now_ns
-        self._arms = {identity: self._arms.get(identity, ArmFilter(PathSettings())) for identity in joints}
-        look = partial(self._detect_in_rois, image, list(glanced.values()), result.puppets, self._arms)
-        due_ns = self._now_ns + _ns(self._settings.glance_delay * len(glanced))
-        return _PendingDetection(image, stamp_ns, due_ns, _done(look, beside), glanced)
+        self._new, self._roi_ns = [], self._now_ns
+        self._arms = {identity: self._arms.get(identity, ArmFilter(ArmPathSettings())) for identity in joints}
+        run = partial(self._detect_in_rois, image, list(rois.values()), result.puppets, self._arms)
+        due_ns = self._now_ns + _to_ns(self._settings.roi_delay * len(rois))
+        return _PendingDetection(image, stamp_ns, due_ns, _submit(run, executor), rois)
 
-    def _detect_full_frame(self, image: Image, watch: KnownPeople, number: int) -> list[DetectedPerson]:
-        return self._load().detect_full_frame(image, watch, number)
+    # The detector is loaded where it runs: not in the thread that tracks.
+    def _detect_full_frame(self, image: Image, known: KnownPeople, number: int) -> list[DetectedPerson]:
+        return self._load_worker().detect_full_frame(image, known, number)
 
     def _detect_in_rois(
         self,
         image: Image,
-        places: Sequence[PersonCandidate],
-        puppets: Sequence[TrackedPuppet],
-        arms: Mapping[str, ArmFilter],
+        places: list[PersonCandidate],
+        puppets: list[TrackedPuppet],
+        arms: dict[str, ArmFilter],
     ) -> list[DetectedPerson]:
-        return self._load().detect_in_rois(image, places, puppets, arms)
+        return self._load_worker().detect_in_rois(image, places, puppets, arms)
 
-    def _load(self) -> DetectionWorker:
-        if self._looker is None:
-            self._looker = DetectionWorker(PartDetector.load(), ArmEvidenceModel.load(self._tracker.model.gender))
-        return self._looker
+    def _load_worker(self) -> DetectionWorker:
+        if self._worker is None:
+            self._worker = DetectionWorker(PartDetector.load(), ArmEvidenceModel.load(self._tracker.model.gender))
+        return self._worker
 
 
-def _ns(seconds: float) -> int:
+def _to_ns(seconds: float) -> int:
     return round(seconds * NANOSECONDS)
 
 
-def _done(look: Callable[[], list[DetectedPerson]], beside: Executor | None) -> Future[list[DetectedPerson]]:
-    if beside is not None:
-        return beside.submit(look)
-    seen: Future[list[DetectedPerson]] = Future()
-    seen.set_result(look())
-    return seen
-
-
-def propagate_points(places: F64, flows: Sequence[Flow], size: tuple[int, int], keep: bool = False) -> F64:
-    """Return places (..., 2) px that moved along forward flows, one image after the other.
-
-    `flows` are (h, w, 2), displacements as shares of the image's width and height; `size` is (width, height) of the
-    image that the places are in. Where the flow is unknown so is the place, or it is what it was, to `keep` it.
-    """
-    if not places.size:
-        return places
-    shares = (places.reshape(-1, 2) + 0.5) / size
-    for flow in flows:
-        at = (shares * (flow.shape[1], flow.shape[0]) - 0.5).astype(np.float32)
-        moved = cv2.remap(flow, at[:, None, :], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        step = np.where(np.isfinite(at), moved[:, 0], np.nan)
-        shares = shares + (np.nan_to_num(step) if keep else step)
-    return np.asarray(shares * size - 0.5).reshape(places.shape)
-
-
-def _coarse(flow: Flow) -> Flow:
-    """A flow field (h, w, 2) in pixels at a share of its resolution, as shares of its width and height."""
-    height, width = flow.shape[:2]
-    small = max(1, width // COARSE), max(1, height // COARSE)
-    shares = np.array([1 / width, 1 / height], np.float32)
-    return np.asarray(cv2.resize(flow, small, interpolation=cv2.INTER_AREA) * shares, np.float32)
+def _submit(run: Callable[[], list[DetectedPerson]], executor: Executor | None) -> Future[list[DetectedPerson]]:
+    if executor is not None:
+        return executor.submit(run)
+    done: Future[list[DetectedPerson]] = Future()
+    done.set_result(run())
+    return done

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole clip at once: the tracker runs through it, then every person's joints are smoothed along the flow.
+"""Smooth the joints of every person of a clip along the flow, after the tracker has run through it.
 
-Where a detector offers several hypotheses of the arms, the path that the flow agrees with is taken first.
-
-The images are seen once; what is kept of an image is some hundred numbers a person, however large the image is.
+Where a detector offers several hypotheses of the arms, the best path through them is taken first. Each image is seen
+once; a few hundred numbers per person are kept of it, however large it is.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.image.arms.evidence import ARM_JOINTS, ArmEvidence
 from flowing_puppet_ros.image.arms.hypotheses import ArmSmoother
-from flowing_puppet_ros.image.arms.viterbi import PathSettings
+from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
 from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings, flow_at_joints, smooth_joints
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -27,7 +26,7 @@ DETECTOR_TRUST = 1 / 8
 
 
 @dataclass(slots=True, eq=False)
-class _Observation:
+class _PuppetObservation:
     """A person in one image: the tracked `puppet` without its outlines, and its motion from the image before."""
 
     image: int
@@ -43,9 +42,9 @@ class OfflineSmoother:
 
     model: DeformableStructures
     settings: SmoothingSettings
-    path: PathSettings = field(default_factory=PathSettings)
+    path: ArmPathSettings = field(default_factory=ArmPathSettings)
     images: int = 0
-    _tracks: dict[str, list[_Observation]] = field(default_factory=lambda: defaultdict(list))
+    _tracks: dict[str, list[_PuppetObservation]] = field(default_factory=lambda: defaultdict(list))
     _arms: dict[str, ArmSmoother] = field(default_factory=dict)
 
     def add(self, result: TrackResult, sights: Mapping[str, ArmEvidence] | None = None) -> None:
@@ -62,7 +61,7 @@ class OfflineSmoother:
                 history.add(sights[puppet.id], result.flow if track else None, result.grid)
             energy = self.model.energy(puppet.shape)
             bare = replace(puppet, contours=(), shape=replace(puppet.shape, contours=()))
-            track.append(_Observation(self.images, bare, energy, motion, trust))
+            track.append(_PuppetObservation(self.images, bare, energy, motion, trust))
         self.images += 1
 
     def people(self) -> Iterator[list[TrackedPuppet]]:
@@ -79,7 +78,7 @@ class OfflineSmoother:
                     at[identity] = k + 1
             yield found
 
-    def _smoothed(self, identity: str, track: list[_Observation]) -> tuple[F64, F64]:
+    def _smoothed(self, identity: str, track: list[_PuppetObservation]) -> tuple[F64, F64]:
         """Joints (T, J, 2) of one person, whose images are consecutive, and how probably (T, J) each is right.
 
         NaN where the tracker knows it best.
@@ -109,12 +108,12 @@ class OfflineSmoother:
             for k, name in enumerate(ARM_JOINTS):
                 joint = self.model.joint_names.index(f"{side}_{name}")
                 detected[:, joint, :2] = arm.places[:, k]
-                detected[:, joint, 2] = arm.sure
-                right[:, joint] = arm.right[:, k]
+                detected[:, joint, 2] = arm.certainty
+                right[:, joint] = arm.correctness[:, k]
                 if len(motion):
                     motion[:, joint] = arm.motion[:-1, k]
 
-    def _puppet(self, moment: _Observation, joints: F64, right: F64) -> TrackedPuppet:
+    def _puppet(self, moment: _PuppetObservation, joints: F64, right: F64) -> TrackedPuppet:
         puppet = moment.puppet
         confidence = np.where(np.isfinite(right), right * puppet.visible, puppet.confidence)
         shape = self.model.puppet_from_joints(joints, puppet.scale, puppet.view)

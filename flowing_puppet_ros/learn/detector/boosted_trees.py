@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learn the second look at candidates: trees that tell people from what the rigid filters take for people."""
+"""Learn the trees that rescore candidates: they separate people from false positives of the rigid filters."""
 
 from __future__ import annotations
 
@@ -10,52 +10,59 @@ import numpy as np
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.image.detector.boosted_trees import BoostedTrees, quantise_features
 from flowing_puppet_ros.image.detector.proposals import propose
-from flowing_puppet_ros.image.detector.root_filters import COLUMNS, PAD, ROWS, STEP, RootFilters, make_level
+from flowing_puppet_ros.image.detector.root_filters import (
+    COLUMNS,
+    LEVEL_FACTOR,
+    PAD_CELLS,
+    ROWS,
+    RootFilters,
+    make_level,
+)
 from flowing_puppet_ros.learn.detector.boosting import boost
-from flowing_puppet_ros.learn.detector.data import Example, center_of, close_to, varied
+from flowing_puppet_ros.learn.detector.data import Example, augment, is_close, window_center
 
-VARIANTS = 3  # of a true window: mirrored, blurred, brighter, off by half a cell and half a level
-NEGATIVES = 15  # candidates of an example that show nobody
-SEARCHED = 2  # of so many examples one is searched for candidates
-TRUE_CENTER, TRUE_SCALE = 0.25, 1.2  # units of S and ratio: a candidate this close is a further positive
+VARIANTS_PER_EXAMPLE = 3  # of true windows: mirrored, blurred, brightened, shifted by up to half a cell and level
+MAX_NEGATIVES = 15  # per example: candidates that show no person
+SEARCH_EVERY = 2  # one example in so many is searched for candidates
+MAX_TRUE_OFFSET, MAX_TRUE_SCALE_RATIO = 0.25, 1.2  # units of S, and ratio: a candidate this close is positive, too
 
 
-def learn_forest(
+def learn_boosted_trees(
     examples: Sequence[Example], root: RootFilters, trees: int, seed: int, report: Callable[[str], None]
 ) -> BoostedTrees:
-    """Trees from the examples' true windows and from the candidates that the rigid filters find on them."""
+    """Learn trees from the examples' true windows and from the candidates that the rigid filters find on them."""
     rng = np.random.default_rng(seed)
     codes: list[Array] = []
     positive: list[bool] = []
     for index, example in enumerate(examples):
-        for _ in range(VARIANTS):
-            shown = varied(example, rng)
-            codes.append(_true_window(shown, rng))
+        for _ in range(VARIANTS_PER_EXAMPLE):
+            variant = augment(example, rng)
+            codes.append(_quantise_true_window(variant, rng))
             positive.append(True)
-        if index % SEARCHED == 0:
-            for window, right in _candidates(shown, root):
+        if index % SEARCH_EVERY == 0:
+            for window, right in _collect_candidates(variant, root):
                 codes.append(window)
                 positive.append(right)
     labels = np.array(positive)
-    report(f"second look: {labels.sum()} positive, {(~labels).sum()} negative windows")
+    report(f"rescoring: {labels.sum()} positive, {(~labels).sum()} negative windows")
     return boost(np.array(codes), labels, np.ones(len(labels)), rng, trees)
 
 
-def _true_window(example: Example, rng: np.random.Generator) -> Array:
-    at = make_level(example.image, example.scale * STEP ** rng.uniform(-0.5, 0.5))
-    x, y = center_of(example) + 0.5
-    row, column = round(y / at.cell - ROWS / 2) + PAD, round(x / at.cell - COLUMNS / 2) + PAD
+def _quantise_true_window(example: Example, rng: np.random.Generator) -> Array:
+    at = make_level(example.image, example.scale * LEVEL_FACTOR ** rng.uniform(-0.5, 0.5))
+    x, y = window_center(example) + 0.5
+    row, column = round(y / at.cell - ROWS / 2) + PAD_CELLS, round(x / at.cell - COLUMNS / 2) + PAD_CELLS
     return quantise_features(at.features, at.colours, row, column)
 
 
-def _candidates(example: Example, root: RootFilters) -> list[tuple[Array, bool]]:
-    """Codes of candidates that surely show the person, and of those that surely do not, at most NEGATIVES."""
+def _collect_candidates(example: Example, root: RootFilters) -> list[tuple[Array, bool]]:
+    """Return the codes of clear positives among the candidates, and of at most MAX_NEGATIVES clear negatives."""
     found: list[tuple[Array, bool]] = []
     wrong = 0
-    for one in propose(example.image, root, max(10.0, max(example.image.shape[:2]) / 20)):
-        if close_to(example, one.center, one.scale, TRUE_CENTER, TRUE_SCALE):
-            found.append((one.codes, True))
-        elif wrong < NEGATIVES and not close_to(example, one.center, one.scale):
-            found.append((one.codes, False))
+    for candidate in propose(example.image, root, max(10.0, max(example.image.shape[:2]) / 20)):
+        if is_close(example, candidate.center, candidate.scale, MAX_TRUE_OFFSET, MAX_TRUE_SCALE_RATIO):
+            found.append((candidate.codes, True))
+        elif wrong < MAX_NEGATIVES and not is_close(example, candidate.center, candidate.scale):
+            found.append((candidate.codes, False))
             wrong += 1
     return found

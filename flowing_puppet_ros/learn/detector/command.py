@@ -13,15 +13,20 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.image.formats.annotations import Annotations
-from flowing_puppet_ros.learn.detector.data import examples_of
-from flowing_puppet_ros.learn.detector.training import RANKED, LearnDetectorSettings, Learned, learn
+from flowing_puppet_ros.learn.detector.data import make_examples
+from flowing_puppet_ros.learn.detector.training import (
+    CALIBRATION_PEOPLE,
+    LearnDetectorSettings,
+    LearnedDetector,
+    learn_detector,
+)
 from flowing_puppet_ros.settings import make_out_folder
+from flowing_puppet_ros.threads import one_blas_thread
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of `learn detector`."""
+    """Add the flags of `learn detector`."""
     parser.add_argument("annotations", type=Path, help="JSON file with the joints of people")
     parser.add_argument("--media", type=Path, help="folder of the images or videos [that of the annotations]")
     parser.add_argument(
@@ -38,24 +43,24 @@ def run(arguments: argparse.Namespace) -> int:
     make_out_folder(arguments.out)
     annotations = Annotations.load(arguments.annotations, arguments.media)
     if arguments.leave_out is not None:
-        annotations = annotations.without_sources_of(Annotations.load(arguments.leave_out, arguments.media))
+        annotations = annotations.exclude_sources_of(Annotations.load(arguments.leave_out, arguments.media))
     began = time.process_time()
-    # Sums of several BLAS threads depend on how many there are; with one the weights are the same everywhere.
+    # Sums depend on the number of BLAS threads; with one thread the weights are the same on every machine.
     with one_blas_thread():
-        examples = examples_of(annotations.frames(settings.every))
-        learned = learn(examples, settings, lambda step: print(step, file=sys.stderr))
+        examples = make_examples(annotations.read_frames(settings.every))
+        learned = learn_detector(examples, settings, lambda step: print(step, file=sys.stderr))
     path = arguments.out / f"detector_{arguments.name}.npz"
     np.savez_compressed(path, **learned.detector.to_arrays())  # type: ignore[arg-type]
-    card = model_card(arguments, settings, learned, len(annotations.people), time.process_time() - began)
+    card = format_card(arguments, settings, learned, len(annotations.people), time.process_time() - began)
     path.with_suffix(".md").write_text(card, encoding="utf-8")
     print(path)
     return 0
 
 
-def model_card(
-    arguments: argparse.Namespace, settings: LearnDetectorSettings, learned: Learned, files: int, seconds: float
+def format_card(
+    arguments: argparse.Namespace, settings: LearnDetectorSettings, learned: LearnedDetector, files: int, seconds: float
 ) -> str:
-    """What the detector is, from what it was learned, how well it finds people, and what it cannot."""
+    """Describe the detector, its training data, its accuracy and its limits."""
     left_out = f" --leave-out {arguments.leave_out.name}" if arguments.leave_out else ""
     return _CARD.format(
         name=arguments.name,
@@ -66,10 +71,10 @@ def model_card(
         "--out FOLDER",
         minutes=seconds / 60,
         held_out=learned.held_out,
-        ranked=min(RANKED, learned.held_out),
+        ranked=min(CALIBRATION_PEOPLE, learned.held_out),
         found=100 * learned.found,
         filters=len(learned.detector.parts.filters),
-        trees=len(learned.detector.forest.leaves),
+        trees=len(learned.detector.trees.leaves),
     )
 
 

@@ -14,12 +14,12 @@ from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.image.detector.part_filters import CELLS_PER_SCALE, PARENTS, PARTS
 from flowing_puppet_ros.image.detector.pictorial_structure import FilterTree
 from flowing_puppet_ros.learn.detector.data import JOINTS, Example
+from flowing_puppet_ros.model.tree import mirrored_name
 
-SPRING_SHARE = 0.1  # of the negative log-likelihood of a Gaussian, in units of the margin
-LEAST_DEVIATION = 0.7  # cells
-LARGEST_DEVIATION = 4.0
-# Type count, and the vectors (from, to) whose directions and lengths tell the type; of pairs, for the left side.
-DESCRIPTION: dict[str, tuple[int, tuple[tuple[str, str], ...]]] = {
+SPRING_WEIGHT = 0.1  # weight of a Gaussian's negative log-likelihood, in units of the margin
+MIN_DEVIATION_CELLS, MAX_DEVIATION_CELLS = 0.7, 4.0  # of a part from its anchor
+# Number of types, and the vectors (from, to) that determine the type; for paired parts, those of the left side.
+TYPE_VECTORS: dict[str, tuple[int, tuple[tuple[str, str], ...]]] = {
     "neck": (4, (("neck", "face"), ("neck", "right_shoulder"), ("neck", "left_shoulder"))),
     "face": (4, (("neck", "face"), ("neck", "right_shoulder"), ("neck", "left_shoulder"))),
     "belly": (3, (("neck", "belly"),)),
@@ -32,8 +32,8 @@ DESCRIPTION: dict[str, tuple[int, tuple[tuple[str, str], ...]]] = {
 }
 
 
-def nodes_of(example: Example) -> tuple[Array, Array]:
-    """Positions (P, 2) px of the parts and whether they were seen (P,)."""
+def locate_parts(example: Example) -> tuple[Array, Array]:
+    """Return the positions (P, 2) px of the parts and whether they were seen (P,) bool."""
     joints = dict(zip(JOINTS, example.joints, strict=True))
     seen = dict(zip(JOINTS, example.seen.tolist(), strict=True))
     for side in ("right", "left"):
@@ -46,61 +46,59 @@ def nodes_of(example: Example) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartTypes:
-    """For every part the centres (T, 2 * vectors) of its types; and the tree with its springs, biases 0."""
+    """Types of the parts: cluster `centers` (T, 2 * vectors) of each, and the `tree` with springs and zero biases."""
 
     centers: tuple[Array, ...]
     tree: FilterTree
 
     @classmethod
     def learn(cls, examples: Sequence[Example], rng: np.random.Generator) -> Self:
-        """Cluster the people and their mirror images; right types are the left ones mirrored."""
-        both = [*examples, *(example.mirrored() for example in examples)]
-        nodes, seen = (np.stack(arrays) for arrays in zip(*(nodes_of(example) for example in both), strict=True))
+        """Cluster the people and their mirror images; types of right parts mirror those of left parts."""
+        both = [*examples, *(example.mirror() for example in examples)]
+        nodes, seen = (np.stack(arrays) for arrays in zip(*(locate_parts(example) for example in both), strict=True))
         nodes = nodes / np.array([example.scale for example in both])[:, None, None]
         left: dict[str, Array] = {}
-        for name, (count, vectors) in DESCRIPTION.items():
+        for name, (count, vectors) in TYPE_VECTORS.items():
             known = np.all([seen[:, PARTS.index(end)] for pair in vectors for end in pair], axis=0)
             left[name] = _cluster(_describe(nodes[known], vectors), count, rng)
-        centers = tuple(_centers(name, left) for name in PARTS)
-        layers = np.stack([_nearest(_describe(nodes, _vectors(n)), c) for n, c in zip(PARTS, centers, strict=True)], 1)
-        return cls(centers, _springs(nodes * CELLS_PER_SCALE, seen, layers, centers))
+        centers = tuple(_centers_of_part(name, left) for name in PARTS)
+        layers = np.stack(
+            [_assign_nearest(_describe(nodes, _select_vectors(n)), c) for n, c in zip(PARTS, centers, strict=True)], 1
+        )
+        return cls(centers, _fit_springs(nodes * CELLS_PER_SCALE, seen, layers, centers))
 
-    def layers_of(self, nodes: Array) -> Array:
-        """Layer (P,) of every part for positions (P, 2) in units of S."""
-        types = [_nearest(_describe(nodes[None], _vectors(n)), c)[0] for n, c in zip(PARTS, self.centers, strict=True)]
+    def assign_layers(self, nodes: Array) -> Array:
+        """Return the layer (P,) of each part, given positions `nodes` (P, 2) in units of S."""
+        types = [
+            _assign_nearest(_describe(nodes[None], _select_vectors(n)), c)[0]
+            for n, c in zip(PARTS, self.centers, strict=True)
+        ]
         return np.array(types) + self.tree.first[:-1]
 
 
-def _vectors(name: str) -> tuple[tuple[str, str], ...]:
-    """The vectors that tell the type of a part."""
+def _select_vectors(name: str) -> tuple[tuple[str, str], ...]:
+    """Return the vectors that determine the type of a part."""
     if not name.startswith("right_"):
-        return DESCRIPTION[name][1]
-    mirrored = DESCRIPTION[name.replace("right_", "left_")][1]
-    return tuple((_other_side(a), _other_side(b)) for a, b in mirrored)
-
-
-def _other_side(name: str) -> str:
-    """The name of the same joint on the other side."""
-    if name.startswith("left_"):
-        return name.replace("left_", "right_")
-    return name.replace("right_", "left_")
+        return TYPE_VECTORS[name][1]
+    mirrored = TYPE_VECTORS[name.replace("right_", "left_")][1]
+    return tuple((mirrored_name(a), mirrored_name(b)) for a, b in mirrored)
 
 
 def _describe(nodes: Array, vectors: tuple[tuple[str, str], ...]) -> Array:
-    """The vectors (N, 2 * vectors) of positions (N, P, 2)."""
+    """Return the stacked vectors (N, 2 * vectors) of positions (N, P, 2)."""
     return np.concatenate([nodes[:, PARTS.index(b)] - nodes[:, PARTS.index(a)] for a, b in vectors], axis=1)
 
 
 def _cluster(vectors: Array, count: int, rng: np.random.Generator) -> Array:
-    """Centres (count, D), fewer when there are not enough vectors."""
+    """Return cluster centres (count, D); one, their mean, if there are too few vectors."""
     if len(vectors) < 10 * count:
         return vectors.mean(axis=0, keepdims=True) if len(vectors) else np.zeros((1, vectors.shape[1]))
     centers, labels = kmeans2(vectors, count, minit="++", seed=rng, iter=60)
     return np.asarray(centers[np.bincount(labels, minlength=count) > 0])
 
 
-def _centers(name: str, left: dict[str, Array]) -> Array:
-    """The types of any part from those of the left ones."""
+def _centers_of_part(name: str, left: dict[str, Array]) -> Array:
+    """Return the type centres of a part, mirrored from the left side if need be."""
     if name in left:
         return left[name]
     mirrored = left[name.replace("right_", "left_")].copy()
@@ -108,13 +106,13 @@ def _centers(name: str, left: dict[str, Array]) -> Array:
     return mirrored
 
 
-def _nearest(vectors: Array, centers: Array) -> Array:
+def _assign_nearest(vectors: Array, centers: Array) -> Array:
     nearest: Array = np.square(vectors[:, None] - centers[None]).sum(axis=2).argmin(axis=1)
     return nearest
 
 
-def _springs(nodes: Array, seen: Array, types: Array, centers: tuple[Array, ...]) -> FilterTree:
-    """Mean and deviation of the step from the parent for every type; positions (N, P, 2) in cells."""
+def _fit_springs(nodes: Array, seen: Array, types: Array, centers: tuple[Array, ...]) -> FilterTree:
+    """Fit mean and deviation of the step from the parent for every type; `nodes` (N, P, 2) in cells."""
     first = np.cumsum([0, *(len(c) for c in centers)])
     anchor, spring = np.zeros((first[-1], 2), np.float32), np.ones((first[-1], 2), np.float32)
     for part in range(1, len(PARTS)):
@@ -124,8 +122,8 @@ def _springs(nodes: Array, seen: Array, types: Array, centers: tuple[Array, ...]
             mine = steps[known & (types[:, part] == kind)]
             if not len(mine):
                 mine = steps
-            deviation = np.clip(mine.std(axis=0), LEAST_DEVIATION, LARGEST_DEVIATION)
+            deviation = np.clip(mine.std(axis=0), MIN_DEVIATION_CELLS, MAX_DEVIATION_CELLS)
             anchor[first[part] + kind] = mine.mean(axis=0)
-            spring[first[part] + kind] = SPRING_SHARE * 0.5 / deviation**2
+            spring[first[part] + kind] = SPRING_WEIGHT * 0.5 / deviation**2
     bias = np.zeros((first[-1], max(len(c) for c in centers)), np.float32)
     return FilterTree(np.array(PARENTS), first, anchor, spring, bias)

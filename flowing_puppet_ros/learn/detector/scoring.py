@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learn to choose among poses: scores by a conditional logit, their scale and how probable they are by regression."""
+"""Learn to score poses: a conditional logit ranks them, regressions correct their scale and calibrate confidence."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from sklearn.preprocessing import StandardScaler
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.detector.detection import PoseHypothesis
-from flowing_puppet_ros.image.detector.scoring import PoseScorer, agree_on_scale, length_ratios, suppress_duplicates
+from flowing_puppet_ros.image.detector.scoring import PoseScorer, agree_on_scale, log_length_ratios, suppress_duplicates
 from flowing_puppet_ros.learn.detector.data import Example
 
-FOUND_NECK, FOUND_SCALE = 0.5, 1.25  # units of S and ratio: a pose this close to the person has found them
-SCALE_DEVIATION = 0.15  # of the logarithm: how much the choice among poses at the right place minds their scale
-LEAST_TARGET = 0.05
-RIDGE, SCALE_RIDGE = 3.0, 1.0
+MAX_NECK_OFFSET, MAX_SCALE_RATIO = 0.5, 1.25  # in S, and a ratio: a pose this close to the person is correct
+LOG_SCALE_DEVIATION = 0.15  # tolerance of scale among poses at the right place
+MIN_TARGET_SUM = 0.05  # of an image's target weights; images below it teach nothing
+RIDGE, SCALE_RIDGE = 3.0, 1.0  # L2 penalties of the logit and of the scale correction
 
 
-def learn_ranking(found: Sequence[tuple[Example, list[PoseHypothesis]]]) -> tuple[PoseScorer, float]:
-    """The ranking of the poses found on each example's image, and the share of people whom the best ones find.
+def learn_pose_scorer(found: Sequence[tuple[Example, list[PoseHypothesis]]]) -> tuple[PoseScorer, float]:
+    """Learn a scorer from the poses found in each example's image; also return the share of correct best poses.
 
-    InputError when hardly any or nearly all poses are right: then there is nothing to tell.
+    InputError if no person was found.
     """
     found = [(example, poses) for example, poses in found if poses]
-    weight = _conditional_logit(found)
+    weight = _fit_conditional_logit(found)
     ranking = PoseScorer(weight, np.zeros(4), np.zeros(2))
     rows, corrections, picked = [], [], []
     for example, poses in found:
-        scores = ranking.scores(poses)
+        scores = ranking.score(poses)
         for order, index in enumerate(suppress_duplicates(poses, scores)):
             scale = agree_on_scale(poses, scores, index)
             picked.append((example, poses[index], scale, float(scores[index])))
-            if order == 0 and _at_place(example, poses[index]):
-                rows.append(length_ratios(poses[index], scale))
+            if order == 0 and _is_at_neck(example, poses[index]):
+                rows.append(log_length_ratios(poses[index], scale))
                 corrections.append(np.log(example.scale / scale))
     if not rows:
         raise InputError("no annotated person of the held-out images was found; annotate more images")
@@ -45,18 +45,18 @@ def learn_ranking(found: Sequence[tuple[Example, list[PoseHypothesis]]]) -> tupl
     normal = design.T @ design + np.diag([SCALE_RIDGE] * 3 + [1e-6])
     ranking = PoseScorer(weight, np.linalg.solve(normal, design.T @ np.array(corrections)), np.zeros(2))
     right = np.array(
-        [_right(example, pose, ranking.corrected_scale(pose, scale)) for example, pose, scale, _ in picked]
+        [_is_correct(example, pose, ranking.correct_scale(pose, scale)) for example, pose, scale, _ in picked]
     )
     values = np.array([score for *_, score in picked])
-    slope, offset = logistic(values[:, None], right)
+    slope, offset = fit_logistic(values[:, None], right)
     first = {id(example): correct for (example, *_), correct in reversed(list(zip(picked, right, strict=True)))}
     return PoseScorer(weight, ranking.scale, np.array([slope[0], offset])), float(np.mean(list(first.values())))
 
 
-def logistic(features: Array, right: Array, ridge: float = 1.0) -> tuple[Array, float]:
+def fit_logistic(features: Array, right: Array, ridge: float = 1.0) -> tuple[Array, float]:
     """Return weights (D,) and bias of the log-odds that samples `features` (N, D) are `right` (N,).
 
-    The ridge acts on weights of standardised features; the mean prediction equals the share that is right.
+    The ridge acts on the weights of standardised features; the mean prediction equals the share of right samples.
     """
     scaler = StandardScaler().fit(features)
     fitted = LogisticRegression(C=1 / ridge, tol=1e-8, max_iter=1000).fit(scaler.transform(features), right)
@@ -64,25 +64,25 @@ def logistic(features: Array, right: Array, ridge: float = 1.0) -> tuple[Array, 
     return weight, float(fitted.intercept_[0] - weight @ scaler.mean_)
 
 
-def _at_place(example: Example, pose: PoseHypothesis) -> bool:
+def _is_at_neck(example: Example, pose: PoseHypothesis) -> bool:
     distance = float(np.linalg.norm(pose.points[0] - example.joint("neck")))
-    return distance < FOUND_NECK * example.scale
+    return distance < MAX_NECK_OFFSET * example.scale
 
 
-def _right(example: Example, pose: PoseHypothesis, scale: float) -> bool:
-    return _at_place(example, pose) and 1 / FOUND_SCALE < scale / example.scale < FOUND_SCALE
+def _is_correct(example: Example, pose: PoseHypothesis, scale: float) -> bool:
+    return _is_at_neck(example, pose) and 1 / MAX_SCALE_RATIO < scale / example.scale < MAX_SCALE_RATIO
 
 
-def _conditional_logit(found: Sequence[tuple[Example, list[PoseHypothesis]]]) -> Array:
-    """Weights (MEASURES,) under which softmax over an image's poses agrees best with how well they fit the person."""
+def _fit_conditional_logit(found: Sequence[tuple[Example, list[PoseHypothesis]]]) -> Array:
+    """Fit weights (FEATURES,) whose softmax over an image's poses agrees best with how well they fit the person."""
     measures = [np.stack([pose.features for pose in poses]) for _, poses in found]
     every = np.concatenate(measures)
     mean, deviation = every.mean(axis=0), np.maximum(every.std(axis=0), 1e-9)
     images = []
     for (example, poses), values in zip(found, measures, strict=True):
-        misfit = np.log([pose.scale / example.scale for pose in poses]) / SCALE_DEVIATION
-        target = np.array([_at_place(example, pose) for pose in poses]) * np.exp(-0.5 * misfit**2)
-        if target.sum() > LEAST_TARGET:
+        misfit = np.log([pose.scale / example.scale for pose in poses]) / LOG_SCALE_DEVIATION
+        target = np.array([_is_at_neck(example, pose) for pose in poses]) * np.exp(-0.5 * misfit**2)
+        if target.sum() > MIN_TARGET_SUM:
             images.append(((values - mean) / deviation, target / target.sum()))
 
     def loss(weight: Array) -> tuple[float, Array]:

@@ -9,32 +9,32 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.learn.anny.body import GENDERS
-from flowing_puppet_ros.learn.ds.fit import COMPONENTS, fit
+from flowing_puppet_ros.learn.ds.fit import COMPONENTS, fit_puppet
 from flowing_puppet_ros.learn.ds.multiview import fit_views
-from flowing_puppet_ros.learn.ds.samples import People, make_training_set, make_view_sets
+from flowing_puppet_ros.learn.ds.samples import BodySampler, make_training_set, make_view_sets
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 from flowing_puppet_ros.model.ds.multiview import VIEW_NAMES
 from flowing_puppet_ros.settings import make_out_folder
+from flowing_puppet_ros.threads import one_blas_thread
 
-POSES = 3000
-POSES_A_VIEW = 600
-MOST_COMPONENTS = 30
+POSES = 3000  # of the front view
+POSES_PER_VIEW = 600  # of each of the nine views
+MAX_COMPONENTS = 30  # of a part's shape
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of `learn ds`."""
+    """Add the flags of `learn ds`."""
     parser.add_argument("--gender", choices=GENDERS, default="neutral", help="whose body [%(default)s]")
     parser.add_argument("--parts", type=int, choices=tuple(JOINT_NAMES), default=10, help="parts [%(default)s]")
     views = "1: near the front; 9: a model that knows nine sides, from W to E [%(default)s]"
     parser.add_argument("--views", type=int, choices=(1, len(VIEW_NAMES)), default=1, help=views)
-    components = "shape coefficients a part; the thesis uses 4, 5 and 10 [%(default)s]"
+    components = "shape coefficients per part; the thesis uses 4, 5 and 10 [%(default)s]"
     parser.add_argument("--components", type=int, default=COMPONENTS, help=components)
     parser.add_argument("--out", type=Path, required=True, help="folder for ds_GENDER-PARTS.npz and its model card")
     parser.add_argument("--mocap", type=Path, help="motion capture, expmap_20hz.npz; without it joint limits alone")
-    poses = f"random poses, each also mirrored [{POSES}, or {POSES_A_VIEW} a view]"
+    poses = f"random poses, each also mirrored [{POSES}, or {POSES_PER_VIEW} per view]"
     parser.add_argument("--poses", type=int, default=None, help=poses)
     parser.add_argument("--seed", type=int, default=0, help="seed of poses and cameras [%(default)s]")
 
@@ -42,31 +42,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Learn one model and write it with its card."""
     several = arguments.views > 1
-    poses = arguments.poses if arguments.poses is not None else POSES_A_VIEW if several else POSES
-    if not 1 <= arguments.components <= MOST_COMPONENTS:
-        raise InputError(f"--components is {arguments.components}; choose 1 to {MOST_COMPONENTS}")
+    poses = arguments.poses if arguments.poses is not None else POSES_PER_VIEW if several else POSES
+    if not 1 <= arguments.components <= MAX_COMPONENTS:
+        raise InputError(f"--components is {arguments.components}; choose 1 to {MAX_COMPONENTS}")
     if poses < 2 * arguments.components:
         raise InputError(f"--poses is {poses}; a model needs at least {2 * arguments.components}")
     if arguments.seed < 0:
         raise InputError(f"--seed is {arguments.seed}; it must be 0 or more")
     make_out_folder(arguments.out)
     rng = np.random.default_rng(arguments.seed)
-    people = People(arguments.gender, arguments.parts, arguments.mocap)
-    # The same weights on every machine: sums of several BLAS threads differ in their last bits.
+    people = BodySampler(arguments.gender, arguments.parts, arguments.mocap)
+    # Sums depend on the number of BLAS threads; with one thread the weights are the same on every machine.
     with one_blas_thread():
         arrays: dict[str, np.ndarray[Any, Any]]
         if several:
             arrays = fit_views(make_view_sets(people, poses, rng), arguments.components)
         else:
-            arrays = fit(arguments.gender, make_training_set(people, poses, rng), arguments.components).to_arrays()
+            arrays = fit_puppet(
+                arguments.gender, make_training_set(people, poses, rng), arguments.components
+            ).to_arrays()
     path = arguments.out / f"ds_{arguments.gender}-{arguments.parts}{'-views' if several else ''}.npz"
     np.savez_compressed(path, **arrays)  # type: ignore[arg-type]
-    path.with_suffix(".md").write_text(_card(arguments, poses), encoding="utf-8")
+    path.with_suffix(".md").write_text(_format_card(arguments, poses), encoding="utf-8")
     print(path)
     return 0
 
 
-def _card(arguments: argparse.Namespace, count: int) -> str:
+def _format_card(arguments: argparse.Namespace, count: int) -> str:
     poses = "frames of the CMU motion capture with noise, and joint limits" if arguments.mocap else "joint limits"
     mocap = " --mocap expmap_20hz.npz" if arguments.mocap else ""
     several = arguments.views > 1

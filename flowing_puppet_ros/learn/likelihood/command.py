@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learn how people's parts look in images, from images on which people were annotated."""
+"""Learn the image likelihood of body parts from annotated images."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.contour import CELL_METRES, LEVELS
 from flowing_puppet_ros.evidence.image.likelihood import TERMS_OF
 from flowing_puppet_ros.image.formats.annotations import Annotations
-from flowing_puppet_ros.learn.likelihood.samples import posed_people
-from flowing_puppet_ros.learn.likelihood.training import Learned, LikelihoodSettings, learn
+from flowing_puppet_ros.learn.likelihood.samples import pose_people
+from flowing_puppet_ros.learn.likelihood.training import LearnedLikelihood, LikelihoodSettings, learn_likelihood
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import make_out_folder
+from flowing_puppet_ros.threads import one_blas_thread
 
 PARTS = 10
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of `learn likelihood`."""
-    parser.add_argument("annotations", type=Path, help="JSON of the annotation tool, or of joints a clip")
+    """Add the flags of `learn likelihood`."""
+    parser.add_argument("annotations", type=Path, help="JSON of the annotation tool, or of joints per clip")
     parser.add_argument("--media", type=Path, help="folder of the images or videos [where the JSON is, or its clips/]")
     parser.add_argument("--leave-out", type=Path, help="annotations whose files and source videos are not learned from")
     parser.add_argument("--out", type=Path, required=True, help="folder for likelihood_10.npz and its model card")
@@ -36,26 +36,28 @@ def run(arguments: argparse.Namespace) -> int:
     settings = LikelihoodSettings.from_arguments(arguments)
     annotations = Annotations.load(arguments.annotations, arguments.media)
     if arguments.leave_out is not None:
-        annotations = annotations.without_sources_of(Annotations.load(arguments.leave_out))
+        annotations = annotations.exclude_sources_of(Annotations.load(arguments.leave_out))
     make_out_folder(arguments.out)
     model = DeformableStructures.load("neutral", PARTS)
-    people = list(posed_people(annotations, model, settings.every))
+    people = list(pose_people(annotations, model, settings.every))
     if not people:
-        raise InputError(f"{arguments.annotations} has no person whose joints tell a scale; annotate some first")
-    # Sums of several BLAS threads depend on how many there are; with one the weights are the same everywhere.
+        raise InputError(f"{arguments.annotations} has no person whose joints determine a scale; annotate some first")
+    # Sums depend on the number of BLAS threads; with one thread the weights are the same on every machine.
     with one_blas_thread():
-        learned = learn(model, people, settings, lambda step: print(step, file=sys.stderr))
+        learned = learn_likelihood(model, people, settings, lambda step: print(step, file=sys.stderr))
     path = arguments.out / f"likelihood_{PARTS}.npz"
     np.savez_compressed(path, **learned.likelihood.to_arrays())  # type: ignore[arg-type]
     files = len({posed.file for posed in people})
-    card = model_card(settings, learned, len(people), files, arguments.leave_out is not None)
+    card = format_card(settings, learned, len(people), files, arguments.leave_out is not None)
     path.with_suffix(".md").write_text(card, encoding="utf-8")
     print(path)
     return 0
 
 
-def model_card(settings: LikelihoodSettings, learned: Learned, people: int, files: int, left_out: bool) -> str:
-    """What the likelihood is, how it was learned, from what and how its terms are weighed."""
+def format_card(
+    settings: LikelihoodSettings, learned: LearnedLikelihood, people: int, files: int, left_out: bool
+) -> str:
+    """Describe the likelihood, its training data and the weights of its terms."""
     rows = [
         f"| {kind} | {learned.counts[kind]} | "
         + ", ".join(f"{term} {weight:.2f}" for term, weight in zip(TERMS_OF[kind], weights, strict=True))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Right and wrong contours on annotated images: puppets that stand on the joints, and the same ones moved."""
+"""Right and wrong contours in annotated images: puppets on the annotated joints, and perturbed ones."""
 
 from __future__ import annotations
 
@@ -15,21 +15,24 @@ from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PuppetShape, rotate
 
-WRONG_METRES = 0.05
-"""A contour is wrong when its points are moved by more than this on average."""
+MIN_WRONG_DISTANCE_M = 0.05
+"""A contour is wrong if its points are displaced by more than this on average."""
 
-SUREST = 0.4
-"""Limbs whose joints have less confidence are not learned from."""
+MIN_CONFIDENCE = 0.4
+"""Limbs with joints below this confidence are not learned from."""
 
-_IN_IMAGE = 0.6  # of a contour's points; parts that show less are not learned from
+_MIN_SHARE_IN_IMAGE = 0.6  # of a contour's points; parts with less in the image are not learned from
 
 
 @dataclass(frozen=True, slots=True)
-class Moves:
-    """How right contours are moved to make wrong ones; standard deviations, metres and radians.
+class ContourPerturbation:
+    """How right contours are perturbed into wrong ones: standard deviations.
 
-    angle: of the turn around the proximal joint. shift: along each axis. stretch: of the logarithm of the length.
-    far: share that is put anywhere near the person at any angle instead.
+    Attributes:
+        angle: radians, of the rotation about the proximal joint.
+        shift: metres, along each axis.
+        stretch: of the logarithm of the length.
+        far: share of contours that are put anywhere near the person, at any angle, instead.
     """
 
     angle: float = np.deg2rad(35.0)
@@ -38,39 +41,44 @@ class Moves:
     far: float = 0.0
 
 
-FAR_METRES = 0.4  # standard deviation, along each axis, of contours put anywhere
+FAR_DEVIATION_M = 0.4  # along each axis, of contours put anywhere
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Posed:
-    """A person in an image (H,W,3) RGB uint8 of `file`: the puppet, and the confidence (J,) of its joints.
+class PosedPerson:
+    """A person in an image.
 
-    `before` is the image before it in the video, None of the first, of still images and where it is not wanted.
+    Attributes:
+        file: where the image is from.
+        image: (H, W, 3) uint8 RGB.
+        puppet: the puppet on the annotated joints.
+        confidence: (J,) of the joints.
+        previous_image: the image before it in the video; None for first images, for stills, and if not asked for.
     """
 
     file: str
     image: U8
     puppet: PuppetShape
     confidence: Array
-    before: U8 | None = None
+    previous_image: U8 | None = None
 
     def shows(self, model: DeformableStructures, part: int) -> bool:
-        """Tell whether a part is in the image and its joints are known well enough to learn from it."""
+        """Return whether a part is in the image and its joints are reliable enough to learn from."""
         height, width = self.image.shape[:2]
         inside = (self.puppet.contours[part] >= 0) & (self.puppet.contours[part] < (width, height))
-        sure = part == 0 or self.confidence[list(model.part_joints[part][:2])].min() >= SUREST
-        return bool(sure and inside.all(axis=1).mean() >= _IN_IMAGE)
+        sure = part == 0 or self.confidence[list(model.part_joints[part][:2])].min() >= MIN_CONFIDENCE
+        return bool(sure and inside.all(axis=1).mean() >= _MIN_SHARE_IN_IMAGE)
 
 
-def posed_people(
-    annotations: Annotations, model: DeformableStructures, every: int, with_before: bool = False
-) -> Iterator[Posed]:
-    """Yield the puppets of all people of whom a scale can be told, in the order of the frames."""
-    for frame in annotations.frames(every):
+def pose_people(
+    annotations: Annotations, model: DeformableStructures, every: int, with_previous: bool = False
+) -> Iterator[PosedPerson]:
+    """Yield the puppets of all people whose scale is known, in the order of the frames."""
+    for frame in annotations.read_frames(every):
         for person in frame.people:
             posed = _pose(model, person)
             if posed is not None:
-                yield Posed(frame.file, frame.image, *posed, frame.before if with_before else None)
+                yield PosedPerson(frame.file, frame.image, *posed, frame.previous if with_previous else None)
 
 
 def _pose(model: DeformableStructures, person: AnnotatedPerson) -> tuple[PuppetShape, Array] | None:
@@ -84,10 +92,15 @@ def _pose(model: DeformableStructures, person: AnnotatedPerson) -> tuple[PuppetS
     return model.puppet_from_joints(joints, scale, view), confidence
 
 
-def wrong_contours(
-    model: DeformableStructures, puppet: PuppetShape, part: int, count: int, moves: Moves, rng: np.random.Generator
+def perturb_contours(
+    model: DeformableStructures,
+    puppet: PuppetShape,
+    part: int,
+    count: int,
+    perturbation: ContourPerturbation,
+    rng: np.random.Generator,
 ) -> F64:
-    """Contours (count,K,2) px of a part that is turned, moved and stretched until it is wrong by WRONG_METRES."""
+    """Rotate, shift and stretch a part until it is wrong by MIN_WRONG_DISTANCE_M; return (count, K, 2) px."""
     contour, scale = puppet.contours[part], puppet.scale
     proximal, distal = puppet.joints[list(model.part_joints[part][:2])]
     length = max(float(np.hypot(*(distal - proximal))), np.finfo(float).tiny)
@@ -95,11 +108,11 @@ def wrong_contours(
     local = rotate(contour - proximal, -sine, cosine)
     found: list[Array] = []
     while len(found) < count:
-        far = rng.random() < moves.far
-        turn = rng.uniform(-np.pi, np.pi) if far else rng.normal(0.0, moves.angle)
-        shift = scale * rng.normal(0.0, FAR_METRES if far else moves.shift, 2)
-        stretch = np.exp(rng.normal(0.0, moves.stretch))
+        far = rng.random() < perturbation.far
+        turn = rng.uniform(-np.pi, np.pi) if far else rng.normal(0.0, perturbation.angle)
+        shift = scale * rng.normal(0.0, FAR_DEVIATION_M if far else perturbation.shift, 2)
+        stretch = np.exp(rng.normal(0.0, perturbation.stretch))
         moved = rotate(rotate(local * (stretch, 1.0), sine, cosine), np.sin(turn), np.cos(turn)) + proximal + shift
-        if np.hypot(*(moved - contour).T).mean() > WRONG_METRES * scale:
+        if np.hypot(*(moved - contour).T).mean() > MIN_WRONG_DISTANCE_M * scale:
             found.append(moved)
     return np.array(found)

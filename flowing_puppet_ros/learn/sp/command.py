@@ -9,16 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.learn.anny.body import GENDERS
 from flowing_puppet_ros.learn.sp.pose_spaces import TREE
-from flowing_puppet_ros.learn.sp.training import Learned, LearnSettings, learn
+from flowing_puppet_ros.learn.sp.training import LearnedPuppet, LearnSettings, learn_puppet
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import make_out_folder
+from flowing_puppet_ros.threads import one_blas_thread
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of `learn sp`."""
+    """Add the flags of `learn sp`."""
     parser.add_argument("--gender", choices=GENDERS, default="neutral", help="whose body [%(default)s]")
     parser.add_argument("--out", type=Path, required=True, help="folder for sp_GENDER.npz and its model card")
     parser.add_argument("--mocap", type=Path, help="motion capture, expmap_20hz.npz; without it joint limits alone")
@@ -29,19 +29,19 @@ def run(arguments: argparse.Namespace) -> int:
     """Learn one model, write it with its card and print its path; progress on stderr."""
     settings = LearnSettings.from_arguments(arguments)
     make_out_folder(arguments.out)
-    # Sums of several BLAS threads depend on how many there are; with one the weights are the same everywhere.
+    # Sums depend on the number of BLAS threads; with one thread the weights are the same on every machine.
     with one_blas_thread():
-        learned = learn(arguments.gender, settings, arguments.mocap, lambda step: print(step, file=sys.stderr))
+        learned = learn_puppet(arguments.gender, settings, arguments.mocap, lambda step: print(step, file=sys.stderr))
     path = arguments.out / f"sp_{arguments.gender}.npz"
     np.savez_compressed(path, **learned.arrays)  # type: ignore[arg-type]
-    card = model_card(arguments.gender, settings, arguments.mocap is not None, learned)
+    card = format_card(arguments.gender, settings, arguments.mocap is not None, learned)
     path.with_suffix(".md").write_text(card, encoding="utf-8")
     print(path)
     return 0
 
 
-def model_card(gender: str, settings: LearnSettings, mocap: bool, learned: Learned) -> str:
-    """What the model is, how it was learned, from what, under which terms and how much its spaces leave out."""
+def format_card(gender: str, settings: LearnSettings, mocap: bool, learned: LearnedPuppet) -> str:
+    """Describe the model, its training data and licence, and what its spaces leave out."""
     rows = [
         f"| {name} | {len(space.mean)} | {space.basis.shape[2]} "
         f"| {100 * space.share:.1f} | {1000 * space.residual:.1f} |"
@@ -65,12 +65,12 @@ def model_card(gender: str, settings: LearnSettings, mocap: bool, learned: Learn
         shape_residual=1000 * learned.shape_space.residual,
         rows="\n".join(rows),
         joints=joints,
-        samples=sample_report(StitchedPuppet.from_arrays(gender, learned.arrays)),
+        samples=describe_samples(StitchedPuppet.from_arrays(gender, learned.arrays)),
     )
 
 
-def sample_report(model: StitchedPuppet, count: int = 200) -> str:
-    """What `count` random bodies of a model look like: statures, volumes, and the gaps left where parts meet."""
+def describe_samples(model: StitchedPuppet, count: int = 200) -> str:
+    """Describe `count` random bodies of a model: statures, volumes, and the gaps where parts meet."""
     rng = np.random.default_rng(0)
     statures, volumes, gaps = [], [], []
     for _ in range(count):

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Coarser triangle meshes whose vertices are a subset of the fine mesh's: half-edge collapses, then edge flips.
 
-A collapse moves one vertex onto a neighbour under the link condition (Dey et al. 1999), so a manifold stays one and a
-boundary stays a boundary. Vertices keep their places: whatever poses and shapes the fine mesh does the same to the
-coarse one.
+A collapse moves one vertex onto a neighbour under the link condition (Dey et al. 1999), so a manifold stays a manifold
+and a boundary a boundary. Vertices keep their places, so poses and shapes of the fine mesh also fit the coarse one.
 """
 
 from __future__ import annotations
@@ -13,35 +12,41 @@ from numba import njit
 
 from flowing_puppet_ros.arrays import Array
 
-VALENCE_LIMIT = 60  # room in the table of faces about a vertex
-GOOD_VALENCE = 9
-SURFACE = 8.0  # what a distance from the fine surface costs, compared with the length of an edge
-LONGEST = 2.0  # times the wanted spacing
-STEEPEST_TURN = 0.5  # cosine: no face may turn by more than 60 degrees
-FLIP_TURN = 0.9  # cosine between the two faces of an edge that may be flipped
+MAX_VALENCE = 60  # size of the table of faces around a vertex
+MAX_GOOD_VALENCE = 9  # faces around a vertex after a collapse
+SURFACE_WEIGHT = 8.0  # cost of distance from the fine surface, relative to edge length
+MAX_EDGE_RATIO = 2.0  # of an edge, relative to the wanted spacing
+MIN_NORMAL_COSINE = 0.5  # between a face's normals before and after a collapse: at most 60 degrees
+MIN_FLIP_COSINE = 0.9  # between the normals of the two faces of an edge to flip
 
 
 def decimate(vertices: Array, faces: Array, spacing: Array, group: Array, inner: Array, count: int) -> Array:
-    """Faces (F',3) of a coarser mesh over about `count` of the `vertices` (V,3), which keep their numbers.
+    """Decimate a mesh to about `count` of its vertices, which keep their numbers; return the new faces (F', 3).
 
-    faces: (F,3) of an oriented manifold with or without boundary. spacing: (V,) wanted edge length, metres. group:
-    (V,), a vertex only collapses onto one of its own group. inner: (V,) bool, vertices that go first, whatever it costs
-    in quality (the inside of a mouth). Boundary vertices stay on the boundary, and no inner edge joins two of them, so
-    that two halves can be welded there. Fewer collapses happen where no more are possible.
+    Boundary vertices stay on the boundary, and no inner edge joins two of them, so that two halves can be welded there;
+    more vertices remain if no further collapse is possible.
+
+    Args:
+        vertices: (V, 3) m.
+        faces: (F, 3) of an oriented manifold with or without boundary.
+        spacing: (V,) m, wanted edge length.
+        group: (V,), a vertex only collapses onto a vertex of its group.
+        inner: (V,) bool, vertices to remove first, at any cost in quality (the inside of a mouth).
+        count: number of vertices to keep.
     """
     faces = np.ascontiguousarray(faces, dtype=np.int64).copy()
-    boundary = boundary_vertices(len(vertices), faces)
-    fan = _fans(len(vertices), faces)
+    boundary = find_boundary_vertices(len(vertices), faces)
+    fan = _make_fans(len(vertices), faces)
     alive = np.ones(len(faces), dtype=np.bool_)
     arguments = (np.ascontiguousarray(vertices, dtype=np.float64), faces, fan, alive, boundary)
-    _collapse(*arguments, spacing.astype(np.float64), group.astype(np.int64), inner.astype(np.bool_), count)
+    _collapse_edges(*arguments, spacing.astype(np.float64), group.astype(np.int64), inner.astype(np.bool_), count)
     kept = np.ascontiguousarray(faces[alive])
-    _flip(arguments[0], kept, boundary)
+    _flip_edges(arguments[0], kept, boundary)
     return kept
 
 
-def boundary_vertices(n_vertices: int, faces: Array) -> Array:
-    """Whether (V,) bool each vertex lies on an edge that only one of the faces (F,3) has."""
+def find_boundary_vertices(n_vertices: int, faces: Array) -> Array:
+    """Return a mask (V,) bool of the vertices on an edge that only one of the faces (F, 3) has."""
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     unique, counts = np.unique(edges, axis=0, return_counts=True)
     boundary = np.zeros(n_vertices, dtype=np.bool_)
@@ -49,9 +54,9 @@ def boundary_vertices(n_vertices: int, faces: Array) -> Array:
     return boundary
 
 
-def _fans(n_vertices: int, faces: Array) -> Array:
-    # Row v: number of faces about v, then their indices.
-    fan = np.full((n_vertices, VALENCE_LIMIT + 1), -1, dtype=np.int64)
+def _make_fans(n_vertices: int, faces: Array) -> Array:
+    # Row v: number of faces around v, then their indices.
+    fan = np.full((n_vertices, MAX_VALENCE + 1), -1, dtype=np.int64)
     fan[:, 0] = 0
     for index, face in enumerate(faces):
         for vertex in face:
@@ -61,7 +66,7 @@ def _fans(n_vertices: int, faces: Array) -> Array:
 
 
 @njit(cache=True)
-def _ring(vertex, faces, fan, out):  # type: ignore[no-untyped-def]
+def _collect_ring(vertex, faces, fan, out):  # type: ignore[no-untyped-def]
     count = 0
     for k in range(1, fan[vertex, 0] + 1):
         for corner in range(3):
@@ -81,7 +86,7 @@ def _ring(vertex, faces, fan, out):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _normal(vertices, a, b, c):  # type: ignore[no-untyped-def]
-    # Twice the area long, as a tuple: small arrays would cost more than the arithmetic.
+    # Its length is twice the area. A tuple, since small arrays would cost more than the arithmetic.
     p, q, r = vertices[a], vertices[b], vertices[c]
     ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
     vx, vy, vz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
@@ -146,8 +151,8 @@ def _plane_distance(quadric, point):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _collapse_cost(u, v, vertices, faces, fan, boundary, spacing, inner, quadric):  # type: ignore[no-untyped-def]
-    ring_u, ring_v = np.empty(4 * VALENCE_LIMIT, np.int64), np.empty(4 * VALENCE_LIMIT, np.int64)
-    n_u, n_v = _ring(u, faces, fan, ring_u), _ring(v, faces, fan, ring_v)
+    ring_u, ring_v = np.empty(4 * MAX_VALENCE, np.int64), np.empty(4 * MAX_VALENCE, np.int64)
+    n_u, n_v = _collect_ring(u, faces, fan, ring_u), _collect_ring(v, faces, fan, ring_v)
     shared_faces, common, longest, worst = 0, 0, 0.0, 1.0
     for k in range(1, fan[u, 0] + 1):
         face = faces[fan[u, k]]
@@ -157,7 +162,7 @@ def _collapse_cost(u, v, vertices, faces, fan, boundary, spacing, inner, quadric
         a, b, c = (v if face[0] == u else face[0]), (v if face[1] == u else face[1]), (v if face[2] == u else face[2])
         worst = min(worst, _shape(vertices, a, b, c))
         before, after = _normal(vertices, face[0], face[1], face[2]), _normal(vertices, a, b, c)
-        if not inner and _cosine(before, after) < STEEPEST_TURN:
+        if not inner and _cosine(before, after) < MIN_NORMAL_COSINE:
             return np.inf
     for i in range(n_u):
         near = False
@@ -173,20 +178,20 @@ def _collapse_cost(u, v, vertices, faces, fan, boundary, spacing, inner, quadric
     if common != shared_faces or (boundary[u] and not (boundary[v] and shared_faces == 1)):
         return np.inf
     valence = fan[u, 0] + fan[v, 0] - 2 * shared_faces
-    if valence >= VALENCE_LIMIT or (valence > GOOD_VALENCE and not inner):
+    if valence >= MAX_VALENCE or (valence > MAX_GOOD_VALENCE and not inner):
         return np.inf
-    if longest > LONGEST * spacing[u] and not inner:
+    if longest > MAX_EDGE_RATIO * spacing[u] and not inner:
         return np.inf
     error = _plane_distance(quadric, vertices[v])
-    cost = (longest + 0.5 * _distance(vertices, u, v) + SURFACE * error) / spacing[u] + 1.5 * (1.0 - worst)
+    cost = (longest + 0.5 * _distance(vertices, u, v) + SURFACE_WEIGHT * error) / spacing[u] + 1.5 * (1.0 - worst)
     return cost - 1e6 if inner else cost
 
 
 @njit(cache=True)
-def _best_collapse(u, vertices, faces, fan, boundary, spacing, group, inner, quadrics):  # type: ignore[no-untyped-def]
-    ring = np.empty(4 * VALENCE_LIMIT, np.int64)
+def _find_best_collapse(u, vertices, faces, fan, boundary, spacing, group, inner, quadrics):  # type: ignore[no-untyped-def]
+    ring = np.empty(4 * MAX_VALENCE, np.int64)
     best, target = np.inf, -1
-    for i in range(_ring(u, faces, fan, ring)):
+    for i in range(_collect_ring(u, faces, fan, ring)):
         if group[ring[i]] == group[u]:
             cost = _collapse_cost(u, ring[i], vertices, faces, fan, boundary, spacing, inner[u], quadrics[u])
             if cost < best:
@@ -195,7 +200,7 @@ def _best_collapse(u, vertices, faces, fan, boundary, spacing, group, inner, qua
 
 
 @njit(cache=True)
-def _drop(vertex, face, fan):  # type: ignore[no-untyped-def]
+def _remove_face(vertex, face, fan):  # type: ignore[no-untyped-def]
     for k in range(1, fan[vertex, 0] + 1):
         if fan[vertex, k] == face:
             fan[vertex, k] = fan[vertex, fan[vertex, 0]]
@@ -204,14 +209,14 @@ def _drop(vertex, face, fan):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _move(u, v, faces, fan, alive):  # type: ignore[no-untyped-def]
+def _collapse_edge(u, v, faces, fan, alive):  # type: ignore[no-untyped-def]
     for k in range(1, fan[u, 0] + 1):
         index = fan[u, k]
         if faces[index, 0] == v or faces[index, 1] == v or faces[index, 2] == v:
             alive[index] = False
             for corner in range(3):
                 if faces[index, corner] != u:
-                    _drop(faces[index, corner], index, fan)
+                    _remove_face(faces[index, corner], index, fan)
         else:
             for corner in range(3):
                 if faces[index, corner] == u:
@@ -222,35 +227,37 @@ def _move(u, v, faces, fan, alive):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _collapse(vertices, faces, fan, alive, boundary, spacing, group, inner, count):  # type: ignore[no-untyped-def]
+def _collapse_edges(vertices, faces, fan, alive, boundary, spacing, group, inner, count):  # type: ignore[no-untyped-def]
     n = len(vertices)
     costs, targets, remaining = np.full(n, np.inf), np.full(n, -1), 0
     quadrics = _quadrics(vertices, faces)
     for u in range(n):
         if fan[u, 0] > 0:
             remaining += 1
-            costs[u], targets[u] = _best_collapse(u, vertices, faces, fan, boundary, spacing, group, inner, quadrics)
-    first, second = np.empty(4 * VALENCE_LIMIT, np.int64), np.empty(4 * VALENCE_LIMIT, np.int64)
+            costs[u], targets[u] = _find_best_collapse(
+                u, vertices, faces, fan, boundary, spacing, group, inner, quadrics
+            )
+    first, second = np.empty(4 * MAX_VALENCE, np.int64), np.empty(4 * MAX_VALENCE, np.int64)
     while True:
         u = int(np.argmin(costs))
         if costs[u] == np.inf or (remaining <= count and costs[u] > -1e5):
             return
         v = targets[u]
-        _move(u, v, faces, fan, alive)
+        _collapse_edge(u, v, faces, fan, alive)
         if not inner[u]:
             quadrics[v] += quadrics[u]
         costs[u] = np.inf
         remaining -= 1
-        for i in range(_ring(v, faces, fan, first)):
-            for j in range(_ring(first[i], faces, fan, second)):
+        for i in range(_collect_ring(v, faces, fan, first)):
+            for j in range(_collect_ring(first[i], faces, fan, second)):
                 w = second[j]
-                costs[w], targets[w] = _best_collapse(
+                costs[w], targets[w] = _find_best_collapse(
                     w, vertices, faces, fan, boundary, spacing, group, inner, quadrics
                 )
 
 
-def _flip(vertices: Array, faces: Array, boundary: Array, rounds: int = 10) -> None:
-    # Flip inner edges, in place, where that makes the worse of the two triangles better and the surface stays.
+def _flip_edges(vertices: Array, faces: Array, boundary: Array, rounds: int = 10) -> None:
+    # Flip inner edges, in place, where that improves the worse of the two triangles and keeps the surface.
     for _ in range(rounds):
         wings: dict[tuple[int, int], list[int]] = {}
         for index, face in enumerate(faces):
@@ -265,7 +272,7 @@ def _flip(vertices: Array, faces: Array, boundary: Array, rounds: int = 10) -> N
             c, d = (int(next(x for x in faces[p] if x not in (a, b))) for p in pair)
             if (min(c, d), max(c, d)) in edges or (boundary[c] and boundary[d]):
                 continue
-            if _flip_helps(vertices, faces[pair[0]], faces[pair[1]], a, b, c, d):
+            if _flip_improves(vertices, faces[pair[0]], faces[pair[1]], a, b, c, d):
                 faces[pair[0]] = np.where(faces[pair[0]] == b, d, faces[pair[0]])
                 faces[pair[1]] = np.where(faces[pair[1]] == a, c, faces[pair[1]])
                 edges.add((min(c, d), max(c, d)))
@@ -275,17 +282,17 @@ def _flip(vertices: Array, faces: Array, boundary: Array, rounds: int = 10) -> N
 
 
 @njit(cache=True)
-def _flip_helps(vertices, first, second, a, b, c, d):  # type: ignore[no-untyped-def]
+def _flip_improves(vertices, first, second, a, b, c, d):  # type: ignore[no-untyped-def]
     first_old = _normal(vertices, first[0], first[1], first[2])
     second_old = _normal(vertices, second[0], second[1], second[2])
-    if _cosine(first_old, second_old) < FLIP_TURN:
+    if _cosine(first_old, second_old) < MIN_FLIP_COSINE:
         return False
     mean = first_old[0] + second_old[0], first_old[1] + second_old[1], first_old[2] + second_old[2]
     before, after = 1.0, 1.0
     for t in (first, second):
         before = min(before, _shape(vertices, t[0], t[1], t[2]))
     for t in (np.where(first == b, d, first), np.where(second == a, c, second)):
-        if _cosine(_normal(vertices, t[0], t[1], t[2]), mean) < FLIP_TURN:
+        if _cosine(_normal(vertices, t[0], t[1], t[2]), mean) < MIN_FLIP_COSINE:
             return False
         after = min(after, _shape(vertices, t[0], t[1], t[2]))
     return after > before + 1e-9

@@ -13,24 +13,28 @@ from scipy.sparse.csgraph import connected_components
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import PuppetError
 from flowing_puppet_ros.learn.anny.body import AnnyBody
-from flowing_puppet_ros.learn.anny.segmentation import part_of_vertex
+from flowing_puppet_ros.learn.anny.segmentation import assign_vertices_to_parts
 from flowing_puppet_ros.learn.sp.decimate import decimate
 from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
 
-VERTICES = 3800
-SPACING = 0.025  # metres between neighbouring vertices
-FINER = {"head": 0.6, "hand": 0.6, "foot": 0.75}  # of the spacing, by the last word of the part's name
-RAYS = 60  # directions in which a vertex of the head may see the outside
-OPEN = 0.1  # share of the directions that a vertex must see to belong to the outer surface; on a plane it is half
-MIDLINE = 1e-9  # metres
+TEMPLATE_VERTICES = 3800  # approximate number
+SPACING_M = 0.025  # between neighbouring vertices
+SPACING_FACTORS = {"head": 0.6, "hand": 0.6, "foot": 0.75}  # by the last word of the part's name
+RAY_COUNT = 60  # directions in which a vertex of the head may see the outside
+MIN_OPEN_SHARE = 0.1  # share of directions in which a vertex of the outer surface sees the outside; 0.5 on a plane
+MIDLINE_TOLERANCE_M = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Template:
     """The template's topology; coordinates come from the posed Anny body.
 
-    anny_vertex (V,): Anny's number of each vertex. faces (F,3) int32, outward. part_of_vertex (V,) uint8 and
-    part_of_face (F,) uint8 index SP_PARENTS. mirror_vertex (V,) is the vertex on the other side of the body.
+    Attributes:
+        anny_vertex: (V,) index of each vertex in Anny.
+        faces: (F, 3) int32, oriented outwards.
+        part_of_vertex: (V,) uint8, index into SP_PARENTS.
+        part_of_face: (F,) uint8, index into SP_PARENTS.
+        mirror_vertex: (V,) vertex on the other side of the body.
     """
 
     anny_vertex: Array
@@ -40,42 +44,42 @@ class Template:
     mirror_vertex: Array
 
 
-def make_template(body: AnnyBody, vertices: int = VERTICES) -> Template:
-    """Decimate the left half of the average body to half of about `vertices`, and join it with its mirror image."""
-    rest = body.rest(body.mean_phenotype()).vertices
-    part = part_of_vertex(body)
-    half = _left_half(rest, _skin(body.triangles, len(rest)))
+def make_template(body: AnnyBody, vertices: int = TEMPLATE_VERTICES) -> Template:
+    """Decimate the left half of the average body to about `vertices` / 2, and join it with its mirror image."""
+    rest = body.make_rest_body(body.mean_phenotype()).vertices
+    part = assign_vertices_to_parts(body)
+    half = _select_left_half(rest, _select_skin(body.triangles, len(rest)))
     head = half[(part[half] == tuple(SP_PARENTS).index("head")).all(axis=1)]
-    inner = _inside(rest, head)
+    inner = _find_inside(rest, head)
     words = [name.split("_")[-1] for name in SP_PARENTS]
-    spacing = SPACING * np.array([FINER.get(word, 1.0) for word in words])[part]
+    spacing = SPACING_M * np.array([SPACING_FACTORS.get(word, 1.0) for word in words])[part]
     coarse = decimate(rest, half, spacing, part, inner, vertices // 2)
-    template = _joined(rest, coarse, part, body.mirror_vertex)
+    template = _join_halves(rest, coarse, part, body.mirror_vertex)
     _check_contacts(template)
     return template
 
 
-def _skin(triangles: Array, n: int) -> Array:
-    # The largest connected surface: without eyeballs and tongue.
+def _select_skin(triangles: Array, n: int) -> Array:
+    # The largest connected surface, which leaves out eyeballs and tongue.
     edges = triangles[:, [0, 1, 1, 2]].reshape(-1, 2)
     labels = connected_components(coo_matrix((np.ones(len(edges)), edges.T), shape=(n, n)), directed=False)[1]
     return triangles[labels[triangles[:, 0]] == np.bincount(labels).argmax()]
 
 
-def _left_half(vertices: Array, triangles: Array) -> Array:
-    return triangles[vertices[triangles, 1].mean(axis=1) > MIDLINE]
+def _select_left_half(vertices: Array, triangles: Array) -> Array:
+    return triangles[vertices[triangles, 1].mean(axis=1) > MIDLINE_TOLERANCE_M]
 
 
-def _inside(vertices: Array, head: Array) -> Array:
-    """Whether (V,) bool each vertex of the left half head's faces sees (nearly) only the inside of the head."""
+def _find_inside(vertices: Array, head: Array) -> Array:
+    """Return a mask (V,) bool of vertices on the left half of the head that see (nearly) only its inside."""
     mirrored = vertices * [1.0, -1.0, 1.0]
     corners = np.concatenate([vertices[head], mirrored[head]])
-    index = np.arange(RAYS) + 0.5
-    polar, around = np.arccos(1 - 2 * index / RAYS), np.pi * (1 + 5**0.5) * index
+    index = np.arange(RAY_COUNT) + 0.5
+    polar, around = np.arccos(1 - 2 * index / RAY_COUNT), np.pi * (1 + 5**0.5) * index
     rays = np.stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], axis=1)
     ids = np.unique(head)
     inside = np.zeros(len(vertices), dtype=np.bool_)
-    inside[ids] = _open_share(vertices[ids], np.ascontiguousarray(corners), rays) < OPEN
+    inside[ids] = _open_share(vertices[ids], np.ascontiguousarray(corners), rays) < MIN_OPEN_SHARE
     return inside
 
 
@@ -109,9 +113,9 @@ def _open_share(points, corners, rays):  # type: ignore[no-untyped-def]
     return free / len(rays)
 
 
-def _joined(rest: Array, half: Array, part: Array, across: Array) -> Template:
+def _join_halves(rest: Array, half: Array, part: Array, across: Array) -> Template:
     left = np.unique(half)
-    middle = np.abs(rest[left, 1]) < MIDLINE
+    middle = np.abs(rest[left, 1]) < MIDLINE_TOLERANCE_M
     mirror = np.concatenate([np.zeros(len(left), np.int64), np.flatnonzero(~middle)])
     mirror[: len(left)] = np.where(middle, np.arange(len(left)), len(left) + np.cumsum(~middle) - 1)
     new_number = np.full(len(rest), -1, dtype=np.int64)
@@ -124,13 +128,13 @@ def _joined(rest: Array, half: Array, part: Array, across: Array) -> Template:
         anny_vertex=np.concatenate([left, across[left[~middle]]]),
         faces=faces.astype(np.int32),
         part_of_vertex=owner,
-        part_of_face=_part_of_face(owner[faces], np.array(tree.parents)),
+        part_of_face=_assign_faces(owner[faces], np.array(tree.parents)),
         mirror_vertex=mirror,
     )
 
 
-def _part_of_face(owners: Array, parents: Array) -> Array:
-    # The part that owns two corners; where three parts meet, the one that is the others' neighbour in the tree.
+def _assign_faces(owners: Array, parents: Array) -> Array:
+    # The part with two corners; where three parts meet, the neighbour of the other two in the tree.
     a, b, c = owners.T
     chosen = np.where(b == c, b, a)
     for face in np.flatnonzero((a != b) & (b != c) & (a != c)):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the thesis's loop needs besides: detectors of hands, and the weights of the energy of Eq. 35.
+"""Models of the thesis's loop: detectors of hands, and the weights of the energy of Eq. 35.
 
-Annotated clips come in; weights go out. Read `hands` and `energy_weights`; their commands stand beside them.
+Annotated clips come in; weights go out. Read `hands` and `energy_weights`; their commands are beside them.
 """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find the weights of the energy of flowing puppets on annotated videos; prints them and writes a model card."""
+"""Find the weights of the energy of flowing puppets on annotated videos; print them and write a model card."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import sys
 from pathlib import Path
 
 from flowing_puppet_ros.image.formats.annotations import Annotations
-from flowing_puppet_ros.learn.likelihood.samples import posed_people
-from flowing_puppet_ros.learn.thesis_loop.energy_weights import WeightSettings, gather, search
+from flowing_puppet_ros.learn.likelihood.samples import pose_people
+from flowing_puppet_ros.learn.thesis_loop.energy_weights import WeightSettings, gather_choices, search_weights
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import make_out_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of `learn flowing`."""
-    parser.add_argument("annotations", type=Path, help="JSON of joints a clip, or of the annotation tool")
+    """Add the flags of `learn flowing`."""
+    parser.add_argument("annotations", type=Path, help="JSON of joints per clip, or of the annotation tool")
     parser.add_argument("--media", type=Path, help="folder of the videos [where the JSON is, or its clips/]")
     parser.add_argument("--leave-out", type=Path, help="annotations whose files and source videos are not used")
     parser.add_argument("--out", type=Path, required=True, help="folder for the model card flowing_weights.md")
@@ -29,12 +29,12 @@ def run(arguments: argparse.Namespace) -> int:
     settings = WeightSettings.from_arguments(arguments)
     annotations = Annotations.load(arguments.annotations, arguments.media)
     if arguments.leave_out is not None:
-        annotations = annotations.without_sources_of(Annotations.load(arguments.leave_out))
+        annotations = annotations.exclude_sources_of(Annotations.load(arguments.leave_out))
     make_out_folder(arguments.out)
     model = DeformableStructures.load()
-    people = posed_people(annotations, model, settings.every, True)
-    choices = gather(model, people, settings, lambda step: print(step, file=sys.stderr))
-    figures = search(choices, settings)
+    people = pose_people(annotations, model, settings.every, True)
+    choices = gather_choices(model, people, settings, lambda step: print(step, file=sys.stderr))
+    figures = search_weights(choices, settings)
     card = _CARD.format(
         people=len(choices.miss),
         files=len(annotations.people),

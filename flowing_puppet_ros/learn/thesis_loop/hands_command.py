@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learn how hands look and move, from videos on which people's wrists were annotated."""
+"""Learn the detectors of hands from videos with annotated wrists."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.blas import one_blas_thread
 from flowing_puppet_ros.evidence.image.hands import ACROSS, ALONG, CELL_METRES, HandDetectors
 from flowing_puppet_ros.image.formats.annotations import Annotations
-from flowing_puppet_ros.learn.likelihood.samples import posed_people
-from flowing_puppet_ros.learn.thesis_loop.hands import Boxes, HandSettings, learn
+from flowing_puppet_ros.learn.likelihood.samples import pose_people
+from flowing_puppet_ros.learn.thesis_loop.hands import HandBoxes, HandSettings, learn_hands
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import make_out_folder
+from flowing_puppet_ros.threads import one_blas_thread
 
 NAME = "upper"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of `learn hands`."""
-    parser.add_argument("annotations", type=Path, help="JSON of joints a clip, or of the annotation tool")
+    """Add the flags of `learn hands`."""
+    parser.add_argument("annotations", type=Path, help="JSON of joints per clip, or of the annotation tool")
     parser.add_argument("--media", type=Path, help="folder of the videos [where the JSON is, or its clips/]")
     parser.add_argument("--leave-out", type=Path, help="annotations whose files and source videos are not learned from")
     parser.add_argument("--out", type=Path, required=True, help=f"folder for hands_{NAME}.npz and its model card")
@@ -34,7 +34,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = HandSettings.from_arguments(arguments)
     annotations = Annotations.load(arguments.annotations, arguments.media)
     if arguments.leave_out is not None:
-        annotations = annotations.without_sources_of(Annotations.load(arguments.leave_out))
+        annotations = annotations.exclude_sources_of(Annotations.load(arguments.leave_out))
     make_out_folder(arguments.out)
     model = DeformableStructures.load()
 
@@ -42,17 +42,19 @@ def run(arguments: argparse.Namespace) -> int:
         print(step, file=sys.stderr)
 
     with one_blas_thread():
-        learned, boxes = learn(model, lambda: posed_people(annotations, model, settings.every, True), settings, say)
+        learned, boxes = learn_hands(
+            model, lambda: pose_people(annotations, model, settings.every, True), settings, say
+        )
     path = arguments.out / f"hands_{NAME}.npz"
     np.savez_compressed(path, **learned.to_arrays())  # type: ignore[arg-type]
-    card = model_card(settings, learned, boxes, len(annotations.people), arguments.leave_out is not None)
+    card = format_card(settings, learned, boxes, len(annotations.people), arguments.leave_out is not None)
     path.with_suffix(".md").write_text(card, encoding="utf-8")
     print(path)
     return 0
 
 
-def model_card(settings: HandSettings, learned: HandDetectors, boxes: Boxes, files: int, left_out: bool) -> str:
-    """What the detectors are, from what they were learned and how they count."""
+def format_card(settings: HandSettings, learned: HandDetectors, boxes: HandBoxes, files: int, left_out: bool) -> str:
+    """Describe the detectors, their training data and their weights."""
     image, flow, _ = learned.joint
     return _CARD.format(
         command=f"flowing-puppet learn hands ANNOTATIONS.json{' --leave-out TEST.json' if left_out else ''}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How unlikely a configuration of 2D parts is: the negative logarithm of thesis Eq. 5 with the terms of Eq. 10."""
+"""Energy of a configuration of 2D parts: the negative logarithm of Eq. 5 with the terms of Eq. 10."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from flowing_puppet_ros.model.tree import PartTree
 
 
 class PairwiseEnergy:
-    """Sum over the edges of -log N([z_j, sin, cos, q_ji, t_j, z_i, t_i]; mean, covariance)."""
+    """Sum over the edges of -log N([z_j, sin, cos, q_ji, t_j, z_i, t_i]; mean, covariance) (Eqs. 5 and 10)."""
 
     def __init__(
         self,
@@ -23,7 +23,7 @@ class PairwiseEnergy:
         pairwise: Sequence[Gaussian],
         part_joints: Sequence[Sequence[int]],
     ) -> None:
-        """`part_joints` names, for every part, its joints: proximal, distal, then any others."""
+        """Precompute; `part_joints` are the joint indices of every part: proximal, distal, then any others."""
         self._parent, self._child = np.array(tree.edges).T
         self._bone = np.array([joints[:2] for joints in part_joints])
         shared = [part_joints[i].index(part_joints[j][0]) for i, j in tree.edges]
@@ -32,8 +32,8 @@ class PairwiseEnergy:
         ]
         ends = [(shapes[i], row) for (i, _), row in zip(tree.edges, rows, strict=True)]
         starts = [(shapes[j], len(shapes[j].mean) - shapes[j].joint_count) for _, j in tree.edges]
-        self._end_mean, self._end_basis = _stacked(ends)
-        self._start_mean, self._start_basis = _stacked(starts)
+        self._end_mean, self._end_basis = _stack_points(ends)
+        self._start_mean, self._start_basis = _stack_points(starts)
         self._mean = np.stack([pair.mean for pair in pairwise])
         factors = np.linalg.cholesky(np.stack([pair.covariance for pair in pairwise]))
         self._whiten = np.linalg.inv(factors)
@@ -41,7 +41,7 @@ class PairwiseEnergy:
         self._constant = float(volume + 0.5 * self._mean.size * np.log(2 * np.pi))
 
     def variables(self, joints: Array, coefficients: Array) -> Array:
-        """The pairwise variables (E,2Z+6) of parts with `coefficients` (N,Z) on `joints` (J,2); model space, metres."""
+        """Return the variables (E, 2Z+6) of Eq. 43 for `joints` (J, 2) m and `coefficients` (N, Z); model space."""
         i, j = self._parent, self._child
         ends = joints[self._bone]
         bone, center = ends[:, 1] - ends[:, 0], ends.mean(axis=1)
@@ -55,15 +55,15 @@ class PairwiseEnergy:
         return np.column_stack([coefficients[j], sine, cosine, gap, length[j], coefficients[i], length[i]])
 
     def __call__(self, joints: Array, coefficients: Array) -> float:
-        """Energy in nats, see `variables` for the arguments."""
+        """Return the energy in nats; arguments as in `variables`."""
         deviation = self.variables(joints, coefficients) - self._mean
         whitened = np.einsum("ekl,el->ek", self._whiten, deviation)
         return float(0.5 * (whitened**2).sum() + self._constant)
 
-    def many(self, joints: Array, coefficients: Array, edges: Sequence[int]) -> Array:
-        """Energies (P,) of some of the `edges` alone, for joints (P,J,2) and coefficients (P,N,Z); model space, metres.
+    def evaluate_batch(self, joints: Array, coefficients: Array, edges: Sequence[int]) -> Array:
+        """Return the energies (P,) of some of the `edges`, up to their constant.
 
-        Up to the constant of these edges.
+        `joints` (P, J, 2) m in model space, `coefficients` (P, N, Z).
         """
         chosen = list(edges)
         i, j = self._parent[chosen], self._child[chosen]
@@ -82,6 +82,6 @@ class PairwiseEnergy:
         return np.asarray(0.5 * (whitened**2).sum(axis=(1, 2)))
 
 
-def _stacked(rows: Sequence[tuple[PartShape, int]]) -> tuple[Array, Array]:
-    """Mean (E,2) and basis (E,2,Z) of one point of each of some parts."""
+def _stack_points(rows: Sequence[tuple[PartShape, int]]) -> tuple[Array, Array]:
+    """Stack the means (E, 2) and bases (E, 2, Z) of one point of each part."""
     return np.stack([shape.mean[row] for shape, row in rows]), np.stack([shape.basis[row] for shape, row in rows])

@@ -33,7 +33,7 @@ PART_JOINTS: dict[str, tuple[str, ...]] = {
 
 
 def part_tree(parts: int) -> PartTree:
-    """The tree of the 10-part model (hands in the lower arms, feet in the lower legs) or of the 14-part model."""
+    """Return the tree of the model of 10 `parts` (hands belong to lower arms, feet to lower legs) or of 14."""
     if parts not in JOINT_NAMES:
         raise InputError(f"there is no puppet of {parts} parts; choose 10 or 14")
     return PartTree.from_parents(DS10_PARENTS if parts == 10 else DS14_PARENTS)

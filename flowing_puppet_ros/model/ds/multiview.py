@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Deformable Structures seen from nine sides (thesis, "Multi-view DS Model", Eqs. 38-43).
+"""Deformable Structures in nine views (thesis, "Multi-view DS Model", Eqs. 38-43).
 
 Views are named by where the torso faces on a map whose south is the camera: S faces it, W the left of the image, E its
-right. The torso's shape is a mixture with one Gaussian a view, and so are the potentials between the torso and its
-neighbours; shapes and potentials of the limbs are the same in every view. Given its view the model is a
-`DeformableStructures` like any other: the coefficients of its torso are those of Eq. 39, standardised.
+right. The torso's shape is a mixture of one Gaussian per view, and so are the potentials between the torso and its
+neighbours; shapes and potentials of the limbs are the same in every view. Given its view, the model is an ordinary
+`DeformableStructures`: the coefficients of its torso are those of Eq. 39, standardised.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from flowing_puppet_ros.model.gaussian import Gaussian
 
 VIEW_NAMES = ("W", "WSW", "SW", "SSW", "S", "SSE", "SE", "ESE", "E")
 VIEW_HEADINGS = tuple(float(angle) for angle in np.radians(np.linspace(-90.0, 90.0, len(VIEW_NAMES))))
-"""Angle in radians by which the torso of each view is turned from the camera towards the right of the image."""
+"""Angle in radians by which the torso of each view is rotated from the camera towards the right of the image."""
 
-SCALES = np.linspace(-0.3, 0.3, 13)
-"""Logarithms of the scales, relative to the one estimated as if from the front, over which the view is judged."""
+LOG_SCALES = np.linspace(-0.3, 0.3, 13)
+"""Logarithms of the scales, relative to the frontal estimate, over which `MultiViewStructures.posterior` averages."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MultiViewStructures:
-    """One puppet a view, `views` in the order of `VIEW_NAMES`, and the views' probabilities `prior` (9,) (Eq. 38)."""
+    """One puppet per view, `views` in the order of `VIEW_NAMES`, with probabilities `prior` (9,) (Eq. 38)."""
 
     views: tuple[DeformableStructures, ...]
     prior: Array
@@ -50,20 +50,20 @@ class MultiViewStructures:
         return f"{self.views[0].name}-views"
 
     def at(self, view: str) -> DeformableStructures:
-        """The puppet whose torso faces `view`; InputError when there is no such view."""
+        """Return the puppet whose torso faces `view` (Eqs. 41 and 42); InputError when there is no such view."""
         if view not in VIEW_NAMES:
             raise InputError(f"there is no view {view!r}; choose one of {', '.join(VIEW_NAMES)}")
         return self.views[VIEW_NAMES.index(view)]
 
     def sample(self, rng: np.random.Generator, view: str | None = None) -> PuppetShape:
-        """Draw a puppet in model space (Eq. 40), of a random view unless one is named."""
+        """Draw a puppet in model space (Eq. 40), in a random view unless one is named."""
         drawn = VIEW_NAMES[rng.choice(len(VIEW_NAMES), p=self.prior)] if view is None else view
         return self.at(drawn).sample(rng)
 
     def posterior(self, joints: Array, confidence: Array) -> Array:
-        """Probability (9,) of each view given joints (J,2) in pixels (NaN unknown) and their confidence (J,).
+        """Return the probability (9,) of each view given `joints` (J, 2) px, NaN unknown, and `confidence` (J,).
 
-        The Gaussian of the known joints in every view, averaged over the unknown scale. InputError as in
+        It is the Gaussian of the known joints in every view, averaged over the unknown scale. InputError as in
         `DeformableStructures.estimate_scale`.
         """
         joints, confidence = np.asarray(joints, np.float64), np.asarray(confidence, np.float64)
@@ -72,12 +72,14 @@ class MultiViewStructures:
         scale = frontal.estimate_scale(joints, np.where(known, confidence, 0.0))
         noise = np.repeat((KNOWN_JOINT_NOISE / confidence[known]) ** 2, 2)
         index = np.arange(2 * len(joints)).reshape(-1, 2)[known].ravel()
-        evidence = np.empty((len(self.views), len(SCALES)))
+        evidence = np.empty((len(self.views), len(LOG_SCALES)))
         for row, view in enumerate(self.views):
             prior = view.joint_prior.marginal(index)
-            for column, factor in enumerate(np.exp(SCALES)):
+            for column, factor in enumerate(np.exp(LOG_SCALES)):
                 metres = (joints[known] / (scale * factor)).ravel()
-                evidence[row, column] = _anywhere(metres - prior.mean, prior.covariance + np.diag(noise))
+                evidence[row, column] = _translation_free_log_density(
+                    metres - prior.mean, prior.covariance + np.diag(noise)
+                )
                 # A density over pixels: metres shrink as the scale grows.
                 evidence[row, column] -= (len(index) - 2) * np.log(factor)
         total = logsumexp(evidence, axis=1) + np.log(self.prior)
@@ -85,18 +87,22 @@ class MultiViewStructures:
 
     @classmethod
     def from_arrays(cls, gender: str, parts: int, arrays: Mapping[str, Array]) -> Self:
-        """Build from the arrays that `to_arrays` gave (float32 is enough)."""
+        """Build from the arrays of a weights file (float32 is enough)."""
         tree = part_tree(parts)
         data = {key: np.asarray(value, np.float64) for key, value in arrays.items()}
         shapes = tuple(PartShape(data[f"mean_{n}"], data[f"basis_{n}"], len(PART_JOINTS[n])) for n in tree.names)
         pairs = data["pair_of_view"].astype(np.intp)
-        gaussians = [Gaussian(*g) for g in zip(data["pair_mean"], _square(data["pair_covariance"]), strict=True)]
-        priors = [Gaussian(*g) for g in zip(data["joint_mean"], _square(data["joint_covariance"]), strict=True)]
+        gaussians = [
+            Gaussian(*g) for g in zip(data["pair_mean"], _unpack_symmetric(data["pair_covariance"]), strict=True)
+        ]
+        priors = [
+            Gaussian(*g) for g in zip(data["joint_mean"], _unpack_symmetric(data["joint_covariance"]), strict=True)
+        ]
         views = tuple(
             DeformableStructures(
                 gender,
                 tree,
-                (turned_torso(shapes[0], data["torso_mean"][view], data["torso_factor"][view]), *shapes[1:]),
+                (make_view_torso(shapes[0], data["torso_mean"][view], data["torso_factor"][view]), *shapes[1:]),
                 tuple(gaussians[index] for index in pairs[view]),
                 priors[view],
                 data["length_pairs"].astype(np.intp),
@@ -107,18 +113,18 @@ class MultiViewStructures:
         return cls(views, data["prior"] / data["prior"].sum())
 
 
-def turned_torso(shape: PartShape, mean: Array, factor: Array) -> PartShape:
-    """The torso of one view: coefficients are `mean` (Z,) + `factor` (Z,Z) times standardised ones (Eq. 39)."""
+def make_view_torso(shape: PartShape, mean: Array, factor: Array) -> PartShape:
+    """Return the torso of one view: its coefficients are `mean` (Z,) + `factor` (Z, Z) times `shape`'s (Eq. 39)."""
     return PartShape(shape.mean + shape.basis @ mean, shape.basis @ factor, shape.joint_count)
 
 
-def packed(covariances: Array) -> Array:
-    """Lower triangles (n,D(D+1)/2) of symmetric matrices (n,D,D)."""
+def pack_symmetric(covariances: Array) -> Array:
+    """Return the lower triangles (n, D (D + 1) / 2) of symmetric matrices (n, D, D)."""
     rows, columns = np.tril_indices(covariances.shape[-1])
     return np.asarray(covariances[:, rows, columns])
 
 
-def _square(triangles: Array) -> Array:
+def _unpack_symmetric(triangles: Array) -> Array:
     size = round((np.sqrt(8 * triangles.shape[1] + 1) - 1) / 2)
     rows, columns = np.tril_indices(size)
     full = np.empty((len(triangles), size, size))
@@ -126,8 +132,8 @@ def _square(triangles: Array) -> Array:
     return full
 
 
-def _anywhere(deviation: Array, covariance: Array) -> float:
-    """Log density of a deviation (2K,), up to a constant, when the place of the whole is unknown (a flat prior)."""
+def _translation_free_log_density(deviation: Array, covariance: Array) -> float:
+    """Return the log density of a deviation (2K,), up to a constant, under a flat prior over a common translation."""
     shift = np.tile(np.eye(2), (len(deviation) // 2, 1))
     factor = np.linalg.cholesky(covariance)
     white, place = np.linalg.solve(factor, deviation), np.linalg.solve(factor, shift)

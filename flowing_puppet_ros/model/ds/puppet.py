@@ -26,17 +26,18 @@ from flowing_puppet_ros.model.tree import PartTree
 KNOWN_JOINT_NOISE = 0.02
 """Standard deviation in metres of a joint with confidence 1; it grows with the inverse of the confidence."""
 
-_SOMEWHERE = 100.0  # metres: standard deviation of where a person stands in model space
-_HUBER = 1.0  # standard deviations by which a bone may be shorter than usual before it counts less
+_POSITION_DEVIATION_M = 100.0  # standard deviation of a person's position in model space
+_HUBER_WIDTH = 1.0  # standard deviations by which a bone may be shorter than the mean before it counts less
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DeformableStructures:
     """A learned 2D puppet: linear part shapes, and pairwise Gaussians that tie shape to relative pose (Eqs. 5-10).
 
-    part_joints: joint indices of every part (proximal, distal, then any others). joint_prior: Gaussian of all joints
-    (2J,) around their mid-torso. length_pairs (P,2): joints whose distance tells the scale, log_length (P,2): mean and
-    standard deviation of its logarithm in metres. shoulder_width: distance of the mean puppet's shoulders, in metres.
+    `part_joints` are the joint indices of every part (proximal, distal, then any others). `joint_prior` is the Gaussian
+    of all joints (2J,) around their mid-torso. `length_pairs` (P, 2) are joints whose distance determines the scale,
+    `log_length` (P, 2) mean and standard deviation of its logarithm in metres. `shoulder_width` is the distance of the
+    mean puppet's shoulders in metres.
     """
 
     gender: str
@@ -71,7 +72,7 @@ class DeformableStructures:
 
     @property
     def bone(self) -> Array:
-        """Joint indices (N,2) of every part's bone: proximal, distal."""
+        """Joint indices (N, 2) of every part's bone: proximal, distal."""
         return np.array([joints[:2] for joints in self.part_joints])
 
     @classmethod
@@ -92,7 +93,7 @@ class DeformableStructures:
         return cls(gender, tree, shapes, pairwise, prior, data["length_pairs"].astype(np.intp), data["log_length"])
 
     def to_arrays(self) -> dict[str, Array]:
-        """The learned numbers as float32 arrays by name."""
+        """Return what was learned as float32 arrays by name."""
         arrays = {f"mean_{name}": shape.mean for name, shape in zip(self.tree.names, self.shapes, strict=True)}
         arrays |= {f"basis_{name}": shape.basis for name, shape in zip(self.tree.names, self.shapes, strict=True)}
         arrays["pair_mean"] = np.stack([pair.mean for pair in self.pairwise])
@@ -106,12 +107,12 @@ class DeformableStructures:
         size = self.shapes[0].basis.shape[2]
         return self._descend(rng.standard_normal(size), lambda given: given.sample(rng, 1)[0])
 
-    def likely(self) -> PuppetShape:
-        """The puppet that grows from the mean torso by conditional means, in model space."""
+    def likely_puppet(self) -> PuppetShape:
+        """Return the puppet that grows from the mean torso by conditional means, in model space."""
         return self._descend(np.zeros(self.shapes[0].basis.shape[2]), lambda given: given.mean)
 
     def _descend(self, torso: Array, choose: Callable[[Gaussian], Array]) -> PuppetShape:
-        """From the torso's coefficients to the leaves: `choose` picks from a child's conditional Gaussian (Eq. 12)."""
+        """Grow a puppet from torso to leaves: `choose` picks from each child's conditional Gaussian (Eq. 12)."""
         size = len(torso)
         layout = PairLayout(size)
         kept = layout.child + layout.angle + layout.gap
@@ -124,7 +125,7 @@ class DeformableStructures:
         return self._assemble(coefficients, poses)
 
     def mean_joints(self) -> Array:
-        """Joints (J,2) in model space of the puppet whose every part has its mean shape and relative pose."""
+        """Return the joints (J, 2) m in model space of the puppet of mean part shapes and mean relative poses."""
         layout = PairLayout(self.shapes[0].basis.shape[2])
         poses = [pair.mean[layout.angle + layout.gap] for pair in self.pairwise]
         return self._assemble([np.zeros(layout.size)] * len(self.tree), poses).joints
@@ -140,9 +141,9 @@ class DeformableStructures:
             if parent >= 0:
                 sine, cosine, *gap = poses[part - 1]
                 angle[part] = angle[parent] + np.arctan2(sine, cosine)
-                turned_gap = rotate(np.array(gap), np.sin(angle[parent]), np.cos(angle[parent]))
+                rotated_gap = rotate(np.array(gap), np.sin(angle[parent]), np.cos(angle[parent]))
                 arm = rotate(local[-shape.joint_count], np.sin(angle[part]), np.cos(angle[part]))
-                center[part] = joints[own[0]] + turned_gap - arm
+                center[part] = joints[own[0]] + rotated_gap - arm
             points = rotate(local, np.sin(angle[part]), np.cos(angle[part])) + center[part]
             contours.append(points[: -shape.joint_count])
             new = slice(0 if parent < 0 else 1, None)
@@ -150,15 +151,15 @@ class DeformableStructures:
         return PuppetShape(joints, tuple(contours), tuple(coefficients), 1.0, "front")
 
     def puppet_from_joints(self, joints: Array, scale: float, view: View = "front") -> PuppetShape:
-        """The most probable puppet on given joints (J,2) in pixels (thesis, annotation tool, Eqs. 23-30).
+        """Return the most probable puppet on given `joints` (J, 2) px at `scale` px/m (Eqs. 23-30, annotation tool).
 
-        `scale` in pixels per metre. All joints must be known: complete them first. InputError otherwise.
+        InputError unless all joints are known: complete them first.
         """
-        joints = self._checked(joints)
+        joints = self._check_joints(joints)
         if not np.isfinite(joints).all():
             unknown = self.joint_names[int(np.flatnonzero(~np.isfinite(joints).all(axis=1))[0])]
             raise InputError(f"joint {unknown} is unknown; complete the joints first")
-        to_pixels = self._to_pixels(scale, view)
+        to_pixels = self._pixels_per_metre(scale, view)
         origin = joints[0]
         contours, coefficients = self._shape_from_joints((joints - origin) / to_pixels)
         placed = tuple(contour * to_pixels + origin for contour in contours)
@@ -167,36 +168,36 @@ class DeformableStructures:
     def puppets_from_joints(
         self, joints: Array, scale: Array, view: View = "front", edges: Sequence[int] | None = None
     ) -> tuple[tuple[Array, ...], Array]:
-        """The most probable puppets on P sets of joints (P,J,2) px at scales (P,) px/m, all known and positive.
+        """Return the most probable puppets on P sets of known `joints` (P, J, 2) px at `scale` (P,) px/m > 0.
 
-        Returns contours (P,K_i,2) px of every part, and the energies (P,) of `energy` up to a constant, of the whole
-        puppet or of some of the tree's `edges` (indices).
+        They come as contours (P, K_i, 2) px of every part, and energies (P,) as of `energy`, up to a constant, of the
+        whole puppet or of some of the tree's `edges` (indices).
         """
-        to_pixels = np.asarray(scale, np.float64)[:, None, None] * self._to_pixels(1.0, view)
+        to_pixels = np.asarray(scale, np.float64)[:, None, None] * self._pixels_per_metre(1.0, view)
         origin = joints[:, :1]
         local = (joints - origin) / to_pixels
-        contours, coefficients = self._shape_from_joints.many(local)
+        contours, coefficients = self._shape_from_joints.infer_batch(local)
         chosen = range(len(self.tree.edges)) if edges is None else edges
-        energy = self._energy.many(local, coefficients, chosen)
+        energy = self._energy.evaluate_batch(local, coefficients, chosen)
         return tuple(contour * to_pixels + origin for contour in contours), energy
 
     def shape_coefficients(self, joints: Array, scale: Array, view: View = "front") -> Array:
-        """Shape coefficients (P,N,Z) of the puppets that `puppets_from_joints` gives."""
-        to_pixels = np.asarray(scale, np.float64)[:, None, None] * self._to_pixels(1.0, view)
-        return self._shape_from_joints.many((joints - joints[:, :1]) / to_pixels)[1]
+        """Return the shape coefficients (P, N, Z) of the puppets of `puppets_from_joints`."""
+        to_pixels = np.asarray(scale, np.float64)[:, None, None] * self._pixels_per_metre(1.0, view)
+        return self._shape_from_joints.infer_batch((joints - joints[:, :1]) / to_pixels)[1]
 
     def energy(self, shape: PuppetShape) -> float:
-        """-log p(l) of Eq. 5 in nats, with Z = 1, of a puppet that stands on its joints; lower is more likely."""
-        to_pixels = self._to_pixels(shape.scale, shape.view)
+        """Return -log p(l) of Eq. 5 in nats, with Z = 1, of a puppet from `puppet_from_joints`; lower is likelier."""
+        to_pixels = self._pixels_per_metre(shape.scale, shape.view)
         return self._energy((shape.joints - shape.joints[0]) / to_pixels, np.stack(shape.coefficients))
 
     def estimate_scale(self, joints: Array, confidence: Array) -> float:
-        """Pixels per metre of a person with joints (J,2) in pixels (NaN where unknown) and their confidence (J,).
+        """Estimate the scale in px/m of a person with `joints` (J, 2) px, NaN unknown, and their `confidence` (J,).
 
-        Robust mean over joint distances in proportion to what training saw; since foreshortening only shortens,
-        distances that are too short count less. InputError when no distance is known.
+        It is a robust mean of joint distances relative to those of the training data. Foreshortening only shortens, so
+        distances that are too short count less. InputError if no distance is known.
         """
-        joints, known = self._checked(joints), self._known(joints, confidence)
+        joints, known = self._check_joints(joints), self._find_known(joints, confidence)
         pairs = known[self.length_pairs].all(axis=1)
         distance = np.linalg.norm(joints[self.length_pairs[:, 0]] - joints[self.length_pairs[:, 1]], axis=1)
         pairs &= np.where(pairs, distance, 0.0) > 0.0
@@ -210,13 +211,13 @@ class DeformableStructures:
         log_scale = ratio[order][np.searchsorted(share, 0.5)]
         for _ in range(10):
             short = (log_scale - ratio) / deviation
-            weight = certainty * np.where(short > _HUBER, _HUBER / np.maximum(short, _HUBER), 1.0)
+            weight = certainty * np.where(short > _HUBER_WIDTH, _HUBER_WIDTH / np.maximum(short, _HUBER_WIDTH), 1.0)
             log_scale = (weight * ratio).sum() / weight.sum()
         return float(np.exp(log_scale))
 
     def estimate_view(self, joints: Array, confidence: Array) -> View:
-        """Which side the camera sees: "front" when the person's left shoulder and hip are on the right of the image."""
-        joints, known = self._checked(joints), self._known(joints, confidence)
+        """Return the side that the camera sees: "front" if left shoulder and hip are on the right of the image."""
+        joints, known = self._check_joints(joints), self._find_known(joints, confidence)
         sided = 0.0
         for name in ("shoulder", "hip"):
             left, right = self.joint_names.index(f"left_{name}"), self.joint_names.index(f"right_{name}")
@@ -225,19 +226,19 @@ class DeformableStructures:
         return "back" if sided < 0 else "front"
 
     def complete_joints(self, joints: Array, confidence: Array, scale: float, view: View = "front") -> Array:
-        """Joints (J,2) in pixels with the unknown ones (NaN or confidence 0) at their most likely place.
+        """Fill in the unknown `joints` (J, 2) px (NaN or confidence 0) at their most likely position.
 
-        The known joints stay as they are. The others are the mean of the joint Gaussian given the known ones, whose
-        noise grows as the confidence falls; hands and feet follow the limb they end (Eq. 10's mean angle); bones that
-        this mean leaves shorter than usual, because it averages over directions, get their usual length. InputError
-        when no joint is known.
+        Known joints stay as they are. The others are the mean of the joint Gaussian given the known ones, whose noise
+        grows as the `confidence` (J,) falls. Hands and feet follow the limb they end (mean angle of Eq. 10). Bones that
+        come out short, because the mean averages over directions, get their mean length. InputError if no joint is
+        known.
         """
-        joints, known = self._checked(joints), self._known(joints, confidence)
+        joints, known = self._check_joints(joints), self._find_known(joints, confidence)
         if not known.any():
             raise InputError("no joint of the person is known, so the others cannot be completed")
-        to_pixels = self._to_pixels(scale, view)
+        to_pixels = self._pixels_per_metre(scale, view)
         deviation = KNOWN_JOINT_NOISE / np.where(known, confidence, 1.0)
-        somewhere = _SOMEWHERE**2 * np.kron(np.ones((len(joints), len(joints))), np.eye(2))
+        somewhere = _POSITION_DEVIATION_M**2 * np.kron(np.ones((len(joints), len(joints))), np.eye(2))
         noisy = Gaussian(
             self.joint_prior.mean, self.joint_prior.covariance + somewhere + np.diag(np.repeat(deviation**2, 2))
         )
@@ -248,10 +249,10 @@ class DeformableStructures:
         if not known.all():
             rest = noisy.condition(index[~known].ravel(), index[known].ravel(), given).mean.reshape(-1, 2)
             filled[~known] = rest * to_pixels + origin
-        self._lay_extremities(filled, known, to_pixels)
-        return self._with_usual_lengths(filled, known, scale)
+        self._place_extremities(filled, known, to_pixels)
+        return self._stretch_to_mean_lengths(filled, known, scale)
 
-    def _lay_extremities(self, joints: Array, known: Array, to_pixels: Array) -> None:
+    def _place_extremities(self, joints: Array, known: Array, to_pixels: Array) -> None:
         """Put unknown hands and feet at their angle to a known limb; the joint Gaussian would average over angles."""
         for part in self._extremities:
             near, far = self.part_joints[part][:2]
@@ -261,8 +262,8 @@ class DeformableStructures:
             start, end = joints[limb] / to_pixels
             along = (end - start) / max(np.hypot(*(end - start)), np.finfo(float).tiny)
             sine, cosine = self.pairwise[part - 1].mean[PairLayout(self.shapes[part].basis.shape[2]).angle]
-            turned = np.array([cosine * along[0] - sine * along[1], sine * along[0] + cosine * along[1]])
-            joints[far] = joints[near] + turned / np.hypot(sine, cosine) * self._bone_length(part) * to_pixels
+            rotated = np.array([cosine * along[0] - sine * along[1], sine * along[0] + cosine * along[1]])
+            joints[far] = joints[near] + rotated / np.hypot(sine, cosine) * self._bone_length(part) * to_pixels
 
     @property
     def _extremities(self) -> tuple[int, ...]:
@@ -272,28 +273,29 @@ class DeformableStructures:
         """Length of a part's bone in its mean shape, metres."""
         return float(np.ptp(self.shapes[part].mean[-2:, 0]))
 
-    def _with_usual_lengths(self, joints: Array, known: Array, scale: float) -> Array:
+    def _stretch_to_mean_lengths(self, joints: Array, known: Array, scale: float) -> Array:
         for part in range(1, len(self.tree)):
             near, far = self.part_joints[part][:2]
-            usual = scale * self._bone_length(part)
+            mean_length = scale * self._bone_length(part)
             bone = joints[far] - joints[near]
             length = np.hypot(*bone)
-            if not known[far] and 0 < length < usual:
-                joints[far] = joints[near] + bone * (usual / length)
+            if not known[far] and 0 < length < mean_length:
+                joints[far] = joints[near] + bone * (mean_length / length)
         return joints
 
-    def _checked(self, joints: Array) -> Array:
+    def _check_joints(self, joints: Array) -> Array:
         joints = np.asarray(joints, np.float64)
         if joints.shape != (len(self.joint_names), 2):
             raise InputError(f"joints have the shape {joints.shape}; {self.name} needs ({len(self.joint_names)}, 2)")
         return joints
 
     @staticmethod
-    def _known(joints: Array, confidence: Array) -> Array:
+    def _find_known(joints: Array, confidence: Array) -> Array:
         return np.asarray(np.isfinite(joints).all(axis=1) & (np.nan_to_num(np.asarray(confidence)) > 0))
 
     @staticmethod
-    def _to_pixels(scale: float, view: View) -> Array:
+    def _pixels_per_metre(scale: float, view: View) -> Array:
+        """Return the factors (2,) from metres to pixels (Eqs. 8 and 9); InputError unless the scale is positive."""
         if not (np.isfinite(scale) and scale > 0):
             raise InputError(f"the scale of a puppet is {scale} px/m; it must be positive")
         return np.array([scale if view == "front" else -scale, scale])

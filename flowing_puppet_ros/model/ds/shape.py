@@ -19,18 +19,18 @@ from flowing_puppet_ros.model.tree import PartTree
 View = Literal["front", "back"]
 
 JOINT_NOISE = 0.003
-"""Standard deviation, in metres, with which a part's own joint points bind its shape coefficients."""
+"""Standard deviation, in metres, with which a part's own joint points constrain its shape coefficients."""
 
 COEFFICIENT_LIMIT = 3.0
-"""Shape coefficients, which have unit variance, are kept within this many standard deviations."""
+"""Standard deviations within which shape coefficients, which have unit variance, are kept."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PuppetShape:
     """One instance of a Deformable Structures puppet.
 
-    joints: (J,2) and contours: per part (K_i,2), in pixels (in metres of the model space when `scale` is 1).
-    coefficients: per part (Z,) with unit prior variance. scale: pixels per metre. view: side the camera sees.
+    `joints` (J, 2) and `contours` (K_i, 2) per part are in pixels (in metres of model space if `scale` is 1).
+    `coefficients` (Z,) per part have unit prior variance, `scale` is in px/m, and `view` is the side the camera sees.
     """
 
     joints: Array
@@ -42,7 +42,7 @@ class PuppetShape:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PartShape:
-    """Linear model of one part in its bone frame (Eq. 6), metres: mean (K+M,2), basis (K+M,2,Z).
+    """Linear model of one part in its bone frame (Eq. 6): `mean` (K+M, 2) m, `basis` (K+M, 2, Z) m.
 
     K contour points come first, then the part's M joint points: proximal, distal, then any others. The basis is scaled
     so that the coefficients have unit variance.
@@ -53,21 +53,21 @@ class PartShape:
     joint_count: int
 
     def points(self, coefficients: Array) -> Array:
-        """All (K+M,2) points for coefficients (Z,), in the bone frame."""
+        """Return all points (K+M, 2) for `coefficients` (Z,) in the bone frame (Eq. 6)."""
         return np.asarray(self.mean + self.basis @ coefficients)
 
     def contour(self, coefficients: Array) -> Array:
-        """The (K,2) contour points for coefficients (Z,), in the bone frame."""
+        """Return the contour points (K, 2) for `coefficients` (Z,) in the bone frame."""
         return self.points(coefficients)[: -self.joint_count]
 
     def joints(self, coefficients: Array) -> Array:
-        """The (M,2) joint points for coefficients (Z,), in the bone frame."""
+        """Return the joint points (M, 2) for `coefficients` (Z,) in the bone frame."""
         return self.points(coefficients)[-self.joint_count :]
 
 
 @dataclass(frozen=True, slots=True)
 class PairLayout:
-    """Where each variable of the pairwise Gaussian of Eq. 10 stands: [z_j, sin, cos, q_ji (2), t_j, z_i, t_i]."""
+    """Indices of the variables of the pairwise Gaussian of Eq. 10: [z_j, sin, cos, q_ji (2), t_j, z_i, t_i]."""
 
     size: int
 
@@ -103,7 +103,7 @@ class PairLayout:
 
 
 def rotate(points: Array, sine: float | Array, cosine: float | Array) -> Array:
-    """Turn (...,2) points from image x towards image y."""
+    """Rotate `points` (..., 2) from image x towards image y."""
     x, y = points[..., 0], points[..., 1]
     return np.stack([cosine * x - sine * y, sine * x + cosine * y], axis=-1)
 
@@ -134,7 +134,7 @@ def shape_posterior(
         information[part, :, start : start + counts[part]] = basis.T / noise**2
         information[part, :, -1] -= basis.T @ shape.mean[-shape.joint_count :].ravel() / noise**2
     factors = [_edge_factor(pair, size, sum(counts) + 3 * e, width) for e, pair in enumerate(pairwise)]
-    return _believe(tree, precision, information, factors)
+    return _propagate_beliefs(tree, precision, information, factors)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,6 +149,7 @@ class _EdgeFactor:
 
 
 def _edge_factor(pair: Gaussian, size: int, start: int, width: int) -> _EdgeFactor:
+    """Return the pairwise term of Eq. 23 as precisions and information vectors (Eqs. 28 and 30)."""
     layout = PairLayout(size)
     outcome = layout.child + layout.angle + layout.child_length
     joint = pair.marginal(outcome + layout.parent)
@@ -167,10 +168,10 @@ def _edge_factor(pair: Gaussian, size: int, start: int, width: int) -> _EdgeFact
     )
 
 
-def _believe(
+def _propagate_beliefs(
     tree: PartTree, precision: Array, information: Array, factors: Sequence[_EdgeFactor]
 ) -> tuple[Array, Array]:
-    """Leaf-to-root, then root-to-leaf messages in information form; returns the affine map to the belief means."""
+    """Pass messages (Eqs. 23 and 24) up and down in information form; return the map to the means (Eqs. 25-27, 29)."""
     upward_precision, upward_information = precision.copy(), information.copy()
     message: dict[int, tuple[Array, Array]] = {}
     for parent, child in reversed(tree.edges):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From joints to part contours: the posterior of thesis Eqs. 23-30, precomputed, then each part laid on its bone."""
+"""From joints to part contours: the posterior of Eqs. 23-30, precomputed, then each part is placed on its bone."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from flowing_puppet_ros.model.gaussian import Gaussian
 from flowing_puppet_ros.model.tree import PartTree
 
 LENGTH_LIMIT = 3.0
-"""The shape posterior sees bone lengths within this many standard deviations of the mean; the rest is stretching."""
+"""Standard deviations within which bone lengths enter the shape posterior; the rest is stretching."""
 
-LEAST_STRETCH = 0.4
-"""A bone that points at the camera keeps at least this share of its model length, so that its part stays a blob."""
+MIN_STRETCH = 0.4
+"""Share of its model length that a bone pointing at the camera keeps, so that its part stays a blob."""
 
-_SHORTEST = 1e-3  # metres: the direction of anything shorter is noise
+_MIN_LENGTH_M = 1e-3  # the direction of a shorter bone is noise
 
 
 class ShapeFromJoints:
-    """Posterior mean shape of every part for given joints, with all matrices made once."""
+    """Posterior mean shape of every part for given joints, with all matrices computed once."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class ShapeFromJoints:
         pairwise: Sequence[Gaussian],
         part_joints: Sequence[Sequence[int]],
     ) -> None:
-        """`part_joints` names, for every part, its joints: proximal, distal, then any others."""
+        """Precompute; `part_joints` are the joint indices of every part: proximal, distal, then any others."""
         self._gain, self._offset = shape_posterior(tree, shapes, pairwise)
         self._size = shapes[0].basis.shape[2]
         self._mean = np.concatenate([shape.mean for shape in shapes])
@@ -45,48 +45,50 @@ class ShapeFromJoints:
         self._flat_joints = np.concatenate([np.asarray(joints) for joints in part_joints])
         self._flat_part = np.repeat(np.arange(len(shapes)), [len(joints) for joints in part_joints])
         self._is_joint = np.concatenate([np.arange(len(s.mean)) >= len(s.mean) - s.joint_count for s in shapes])
-        self._spread = [_spread(shape) if shape.joint_count > 2 else None for shape in shapes]
+        self._influence = [_joint_influence(shape) if shape.joint_count > 2 else None for shape in shapes]
         proximal = self._contour_end
         mean_length = self._mean[proximal + 1, 0] - self._mean[proximal, 0]
         deviation = np.linalg.norm(self._basis[proximal + 1, 0] - self._basis[proximal, 0], axis=1)
-        self._shortest = np.maximum(mean_length - LENGTH_LIMIT * deviation, 0.2 * mean_length)
-        self._longest = mean_length + LENGTH_LIMIT * deviation
+        self._min_length = np.maximum(mean_length - LENGTH_LIMIT * deviation, 0.2 * mean_length)
+        self._max_length = mean_length + LENGTH_LIMIT * deviation
 
-    def observation(self, joints: Array) -> tuple[Array, Array, Array, Array]:
-        """What the posterior is conditioned on, for joints (J,2) in model space, metres.
+    def make_observation(self, joints: Array) -> tuple[Array, Array, Array, Array]:
+        """Return what the posterior is conditioned on, for `joints` (J, 2) m in model space.
 
-        Returns the observation (D,) of `shape_posterior`, bone directions (N,2), centres (N,2) and lengths (N,), and
-        clips the lengths inside the observation to what training has seen.
+        It is the observation (D,) of `shape_posterior`, in which bone lengths are clipped to the range of the training
+        data, with bone directions (N, 2), centres (N, 2) and lengths (N,).
         """
         ends = joints[self._bone]
         bone = ends[:, 1] - ends[:, 0]
         length = np.hypot(bone[:, 0], bone[:, 1])
-        direction = np.where(length[:, None] > _SHORTEST, bone / np.maximum(length, _SHORTEST)[:, None], (0.0, 1.0))
+        direction = np.where(
+            length[:, None] > _MIN_LENGTH_M, bone / np.maximum(length, _MIN_LENGTH_M)[:, None], (0.0, 1.0)
+        )
         center = 0.5 * (ends[:, 0] + ends[:, 1])
-        seen = np.clip(length, self._shortest, self._longest)
+        clipped = np.clip(length, self._min_length, self._max_length)
         part = self._flat_part
         local = rotate(joints[self._flat_joints] - center[part], -direction[part, 1], direction[part, 0])
-        local[:, 0] *= (seen / np.maximum(length, _SHORTEST))[part]
+        local[:, 0] *= (clipped / np.maximum(length, _MIN_LENGTH_M))[part]
         first, second = direction[self._parent], direction[self._child]
         sine = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
         cosine = (first * second).sum(axis=1)
-        pair = np.stack([sine, cosine, seen[self._child]], axis=1)
+        pair = np.stack([sine, cosine, clipped[self._child]], axis=1)
         return np.concatenate([local.ravel(), pair.ravel()]), direction, center, length
 
     def __call__(self, joints: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-        """Contours (K_i,2) and coefficients (Z,) of every part for joints (J,2); model space, metres.
+        """Return contours (K_i, 2) m and coefficients (Z,) of every part for `joints` (J, 2) m in model space.
 
-        After the inference every part is stretched along its bone so that the bone's ends lie on the given joints (what
-        lies beyond the ends, such as a hand beyond the wrist, keeps its size), and the torso's contour follows what
-        remains at its shoulders and hips.
+        After the inference, every part is stretched along its bone so that the bone's ends lie on the given joints.
+        What lies beyond the ends, such as a hand beyond the wrist, keeps its size. The torso's contour follows the
+        remaining offsets at its shoulders and hips.
         """
-        observation, direction, center, length = self.observation(joints)
+        observation, direction, center, length = self.make_observation(joints)
         posterior = (self._gain @ observation + self._offset).reshape(-1, self._size)
         coefficients = np.clip(posterior, -COEFFICIENT_LIMIT, COEFFICIENT_LIMIT)
         points = self._mean + np.squeeze(self._basis @ coefficients[self._part][:, :, None], axis=-1)
         proximal = points[self._contour_end]
-        model_length = np.maximum(points[self._contour_end + 1, 0] - proximal[:, 0], self._shortest)
-        stretch = np.maximum(length / model_length, LEAST_STRETCH)
+        model_length = np.maximum(points[self._contour_end + 1, 0] - proximal[:, 0], self._min_length)
+        stretch = np.maximum(length / model_length, MIN_STRETCH)
         part = self._part
         along = points[:, 0] - proximal[part, 0]
         inside = np.clip(along, 0.0, model_length[part])
@@ -94,25 +96,27 @@ class ShapeFromJoints:
         points = rotate(points, direction[part, 1], direction[part, 0]) + center[part]
         contours = [points[start:end] for start, end in zip(self._start, self._contour_end, strict=False)]
         residual = joints[self._flat_joints] - points[self._is_joint]
-        for index, spread in enumerate(self._spread):
-            if spread is not None:
-                contours[index] = contours[index] + spread @ residual[self._flat_part == index]
+        for index, influence in enumerate(self._influence):
+            if influence is not None:
+                contours[index] = contours[index] + influence @ residual[self._flat_part == index]
         return tuple(contours), tuple(coefficients)
 
-    def many(self, joints: Array) -> tuple[tuple[Array, ...], Array]:
-        """What a call gives, for P sets of joints (P,J,2) at once: contours (P,K_i,2) a part, coefficients (P,N,Z)."""
+    def infer_batch(self, joints: Array) -> tuple[tuple[Array, ...], Array]:
+        """Return contours (P, K_i, 2) m per part and coefficients (P, N, Z) for P sets of `joints` (P, J, 2) m."""
         ends = joints[:, self._bone]
         bone = ends[:, :, 1] - ends[:, :, 0]
         length = np.hypot(bone[..., 0], bone[..., 1])
-        direction = np.where(length[..., None] > _SHORTEST, bone / np.maximum(length, _SHORTEST)[..., None], (0.0, 1.0))
+        direction = np.where(
+            length[..., None] > _MIN_LENGTH_M, bone / np.maximum(length, _MIN_LENGTH_M)[..., None], (0.0, 1.0)
+        )
         center = 0.5 * (ends[:, :, 0] + ends[:, :, 1])
-        seen = np.clip(length, self._shortest, self._longest)
+        clipped = np.clip(length, self._min_length, self._max_length)
         part = self._flat_part
         local = rotate(joints[:, self._flat_joints] - center[:, part], -direction[:, part, 1], direction[:, part, 0])
-        local[..., 0] *= (seen / np.maximum(length, _SHORTEST))[:, part]
+        local[..., 0] *= (clipped / np.maximum(length, _MIN_LENGTH_M))[:, part]
         first, second = direction[:, self._parent], direction[:, self._child]
         sine = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
-        pair = np.stack([sine, (first * second).sum(axis=2), seen[:, self._child]], axis=2)
+        pair = np.stack([sine, (first * second).sum(axis=2), clipped[:, self._child]], axis=2)
         observation = np.concatenate([local.reshape(len(joints), -1), pair.reshape(len(joints), -1)], axis=1)
         posterior = (observation @ self._gain.T + self._offset).reshape(len(joints), -1, self._size)
         coefficients = np.clip(posterior, -COEFFICIENT_LIMIT, COEFFICIENT_LIMIT)
@@ -121,23 +125,23 @@ class ShapeFromJoints:
             count = self._contour_end[index] - start
             points = self._mean[start:end] + np.tensordot(coefficients[:, index], self._basis[start:end], axes=(1, 2))
             proximal = points[:, count, 0]
-            model_length = np.maximum(points[:, count + 1, 0] - proximal, self._shortest[index])
-            stretch = np.maximum(length[:, index] / model_length, LEAST_STRETCH)
+            model_length = np.maximum(points[:, count + 1, 0] - proximal, self._min_length[index])
+            stretch = np.maximum(length[:, index] / model_length, MIN_STRETCH)
             along = points[..., 0] - proximal[:, None]
             inside = np.clip(along, 0.0, model_length[:, None])
             middle = 0.5 * (model_length * stretch)[:, None]
             points[..., 0] = along + inside * (stretch[:, None] - 1.0) - middle
-            turned = rotate(points, direction[:, index, None, 1], direction[:, index, None, 0]) + center[:, None, index]
-            contour, spread = turned[:, :count], self._spread[index]
-            if spread is not None:
+            placed = rotate(points, direction[:, index, None, 1], direction[:, index, None, 0]) + center[:, None, index]
+            contour, influence = placed[:, :count], self._influence[index]
+            if influence is not None:
                 own = self._flat_joints[self._flat_part == index]
-                contour = contour + spread @ (joints[:, own] - turned[:, count:])
+                contour = contour + influence @ (joints[:, own] - placed[:, count:])
             contours.append(contour)
         return tuple(contours), coefficients
 
 
-def _spread(shape: PartShape) -> Array:
-    """Shares (K,M) in which each contour point follows each joint: inverse squared distance in the mean shape."""
+def _joint_influence(shape: PartShape) -> Array:
+    """Return the weights (K, M) of the joints at each contour point: inverse squared distance in the mean shape."""
     contour, joints = shape.mean[: -shape.joint_count], shape.mean[-shape.joint_count :]
     weight = 1.0 / (((contour[:, None] - joints[None]) ** 2).sum(axis=2) + 1e-6)
     return np.asarray(weight / weight.sum(axis=1, keepdims=True))

@@ -18,37 +18,36 @@ from flowing_puppet_ros.stream.messages.images import decode_image, make_image
 from flowing_puppet_ros.stream.messages.message_types import IMAGE, MessageFactory
 
 
-class OpticalFlowComponent(Component):
+class OpticalFlowComponent(Component[FlowSettings]):
     """Flow between each image and the next.
 
-    `flow/forward` carries the header of the earlier image, `flow/backward` that of the later: always that of the image
-    whose pixels move. A stamp that goes back or an image of another size starts anew.
+    `flow/forward` has the header of the earlier image, `flow/backward` that of the later one: always that of the image
+    whose pixels move. A stamp that goes back or an image of another size restarts the flow.
     """
 
     settings_type = FlowSettings
     inputs = (Port("image", IMAGE, "sensor", transport=COMPRESSED),)
     outputs = (
-        Port("flow/forward", IMAGE),
-        Port("flow/backward", IMAGE),
+        Port("flow/forward", IMAGE, recorded=False),
+        Port("flow/backward", IMAGE, recorded=False),
         Port("flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
     )
 
     def __init__(self, settings: FlowSettings, factory: MessageFactory) -> None:
         """Make the flow estimator."""
         super().__init__(settings, factory)
-        self._settings = settings
         self._flow = OpticalFlow(settings)
         self._previous: tuple[Any, int, U8] | None = None
 
     def warm_up(self) -> None:
-        """Compute the flow of made-up images, and colour it, with a component of its own."""
-        other = type(self)(self._settings, self.factory)
+        """Compute and colour the flow of synthetic images with another component."""
+        other = type(self)(self.settings, self.factory)
         other.set_subscribed("flow/preview", True)
-        for image in warm_up.images(self.factory):
+        for image in warm_up.make_images(self.factory):
             other.handle("image", image)
 
     def reset(self) -> None:
-        """Forget the previous image."""
+        """Drop the previous image."""
         self._previous = None
 
     def _process(self, port: str, message: Any) -> Output:
@@ -56,9 +55,9 @@ class OpticalFlowComponent(Component):
         previous, self._previous = self._previous, (message.header, stamp, image)
         if previous is None:
             return []
-        header, before, earlier = previous
-        if stamp <= before or earlier.shape != image.shape:
-            self._warn("the stamps went back or the image size changed: the flow starts anew")
+        header, earlier_stamp, earlier = previous
+        if stamp <= earlier_stamp or earlier.shape != image.shape:
+            self.report.warn("the stamps went back or the image size changed: the flow restarts")
             self.counters["restarts"] += 1
             return []
         forward, backward = self._flow(earlier, image)
@@ -67,15 +66,18 @@ class OpticalFlowComponent(Component):
             ("flow/forward", make_image(self.factory, header, forward, "32FC2")),
             ("flow/backward", make_image(self.factory, message.header, backward, "32FC2")),
         ]
-        if "flow/preview" in self._wanted:
-            outputs.append(("flow/preview", flow_picture(self.factory, header, [forward])))
+        if "flow/preview" in self._subscribed:
+            outputs.append(("flow/preview", make_flow_preview(self.factory, header, [forward])))
         return outputs
 
 
-def flow_picture(factory: MessageFactory, header: Any, flows: list[F32], side: int = 640) -> Any:
-    """Return an rgb8 Image of flow fields (H,W,2) side by side in the colours of the first one's range."""
+def make_flow_preview(factory: MessageFactory, header: Any, flows: list[F32], max_side: int = 640) -> Any:
+    """Return an rgb8 Image of `flows` (H, W, 2) side by side, coloured by the range of the first one.
+
+    Each flow is scaled down to at most `max_side` pixels on its longer side.
+    """
     scale = flow_scale(flows[0])
-    factor = min(1.0, side / max(flows[0].shape[:2]))
+    factor = min(1.0, max_side / max(flows[0].shape[:2]))
     pictures = []
     for flow in flows:
         picture = flow_to_rgb(flow, scale)

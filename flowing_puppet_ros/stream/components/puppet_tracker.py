@@ -16,35 +16,41 @@ from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, OpticalFlow
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
-from flowing_puppet_ros.image.video.live_tracker import LiveTracker, LiveTrackerSettings
+from flowing_puppet_ros.image.video.live_tracker import LiveTracker
+from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.settings import Settings, nested, setting
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
 from flowing_puppet_ros.stream.components import warm_up
-from flowing_puppet_ros.stream.components.optical_flow import flow_picture
-from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, image_humans
+from flowing_puppet_ros.stream.components.optical_flow import make_flow_preview
+from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, make_image_messages
 from flowing_puppet_ros.stream.messages.geometry import header_ns, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_flow, decode_image, make_image
 from flowing_puppet_ros.stream.messages.message_types import IMAGE, PUPPETS, MessageFactory
-from flowing_puppet_ros.stream.messages.puppets import keypoints_of, make_puppets
+from flowing_puppet_ros.stream.messages.puppets import decode_keypoints, make_puppets
 from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 
-_OF_A_NEW_TRACKER = {"model", "parts", "max_side", "seed", "humans", "humans_namespace"}
+_OF_A_NEW_TRACKER = {"model", "parts", "flow.max_side", "tracker.seed", "ros4hri.publish", "ros4hri.namespace"}
 
 
 @dataclass(frozen=True)
-class PuppetTrackerSettings(TrackerSettings, FlowSettings, LiveTrackerSettings, Ros4HriSettings):
+class PuppetTrackerSettings(Settings):
     """Settings of the tracker, its flow and its detector, and of what it waits for, draws and publishes."""
 
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     parts: int = setting(14, "parts of the puppet: 10, or 14 with hands and feet", low=10, high=14)
-    wait: int = setting(1, "newer images that may come before an image goes on without its detection", low=0, high=50)
-    max_side: int = setting(400, "longest image side the flow is computed at", unit="px", low=32, high=8192)
-    overlay_side: int = setting(960, "longest side of the overlay", unit="px", low=64, high=8192)
+    wait: int = setting(
+        1, "images to wait for a late detection before processing without it", low=0, high=50, advanced=True
+    )
+    flow: FlowSettings = nested(FlowSettings, max_side=400)
+    tracker: TrackerSettings = nested(TrackerSettings)
+    detection: LiveDetectionSettings = nested(LiveDetectionSettings)
+    ros4hri: Ros4HriSettings = nested(Ros4HriSettings)
+    overlay_max_side: int = setting(960, "longest side of the overlay", unit="px", low=64, high=8192)
 
 
-class PuppetTrackerComponent(Component):
+class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
     """Tracks the people of one camera.
 
     An image waits for the detection and the flow of its stamp when somebody publishes them, but not longer than
@@ -53,7 +59,7 @@ class PuppetTrackerComponent(Component):
     """
 
     settings_type = PuppetTrackerSettings
-    adoptable = frozenset(info.name for info in PuppetTrackerSettings.describe()) - _OF_A_NEW_TRACKER
+    hot_settings = frozenset(info.name for info in PuppetTrackerSettings.describe()) - _OF_A_NEW_TRACKER
     inputs = (
         Port("image", IMAGE, "sensor", transport=COMPRESSED),
         Port("flow/forward", IMAGE, optional=True),
@@ -71,44 +77,42 @@ class PuppetTrackerComponent(Component):
     def __init__(self, settings: PuppetTrackerSettings, factory: MessageFactory) -> None:
         """Load the body model."""
         super().__init__(settings, factory)
-        self._settings = settings
         self._model = DeformableStructures.load(settings.model, settings.parts)
-        self._tracker = FlowingPuppetTracker(self._model, settings, settings)
-        self._lookout = LiveTracker(settings, self._tracker, self.counters)
+        self._tracker = FlowingPuppetTracker(self._model, settings.tracker, settings.flow)
+        self._live = LiveTracker(self._tracker, settings.detection, self.counters)
         self._line = PendingQueue()
         self._shelves = {port.name: StampBuffer() for port in self.inputs if port.optional}
         self._header: Any = None
-        self._humans = Ros4HriPublisher(settings, factory, "skeleton2d", "roi", "cropped")
+        self._humans = Ros4HriPublisher(settings.ros4hri, factory, "skeleton2d", "roi", "cropped")
         self.outputs = (*type(self).outputs, *self._humans.ports)
 
     def warm_up(self) -> None:
         """Track somebody made up with a component of its own, and load the detector."""
-        other = type(self)(self._settings, self.factory)
+        other = type(self)(self.settings, self.factory)
         other.set_expected("detections", True)
         for port in other.outputs:
             if port.lazy:
                 other.set_subscribed(port.name, True)
-        messages = warm_up.tracking(self.factory, self._model)
+        messages = warm_up.make_tracker_input(self.factory, self._model)
         for port_name, message in messages:
             other.handle(port_name, message)
-        self._lookout.warm_up(decode_image(messages[-1][1]), warm_up.puppet(self._model))
+        self._live.warm_up(decode_image(messages[-1][1]), warm_up.make_puppet(self._model))
 
     def reset(self) -> None:
         """Forget the people and everything that waits."""
         self._tracker.reset()
-        self._lookout.reset()
+        self._live.reset()
         self._line.clear()
         for shelf in self._shelves.values():
             shelf.clear()
         self._header = None
 
-    def adopt(self, settings: Settings) -> None:
+    def reconfigure(self, settings: PuppetTrackerSettings) -> None:
         """Go on tracking the same people with other settings."""
-        assert isinstance(settings, PuppetTrackerSettings)
-        if settings.preset != self._settings.preset:
-            self._tracker.optical_flow = OpticalFlow(settings)
-        self.settings = self._settings = self._tracker.settings = settings
-        self._lookout.reconfigure(settings)
+        if settings.flow.preset != self.settings.flow.preset:
+            self._tracker.optical_flow = OpticalFlow(settings.flow)
+        self.settings, self._tracker.settings = settings, settings.tracker
+        self._live.reconfigure(settings.detection)
 
     def flush(self) -> Output:
         """Process the images that still wait."""
@@ -126,10 +130,10 @@ class PuppetTrackerComponent(Component):
 
     def _take(self, stamp: int, message: Any) -> None:
         """Put an image in line; one that comes a little too late is left out, one from long before is a restart."""
-        last = self._line.waiting[-1][0] if self._line.waiting else self._line.left
+        last = self._line.waiting[-1][0] if self._line.waiting else self._line.last_popped
         if last is not None and 0 < last - stamp < BACKWARD_JUMP_NS:
             self.counters["disordered images"] += 1
-            self._warn(f"an image is {(last - stamp) * 1e-6:.0f} ms older than the one before: it is left out")
+            self.report.warn(f"an image is {(last - stamp) * 1e-6:.0f} ms older than the one before: it is left out")
         else:
             self._line.waiting.append((stamp, message))
 
@@ -137,14 +141,14 @@ class PuppetTrackerComponent(Component):
         outputs: Output = []
         while self._line.waiting:
             stamp, message = self._line.waiting[0]
-            crowded = len(self._line.waiting) > self._settings.wait
+            crowded = len(self._line.waiting) > self.settings.wait
             if not (final or crowded or self._ready(stamp)):
                 break
             self._line.pop()
             try:
                 outputs += self._step(stamp, message)
             except InputError as error:
-                self._unusable(error)
+                self.report.count_unusable(error)
         return outputs
 
     def _ready(self, stamp: int) -> bool:
@@ -157,13 +161,13 @@ class PuppetTrackerComponent(Component):
     def _step(self, stamp: int, message: Any) -> Output:
         image, flow = decode_image(message), self._flow(stamp)
         people = self._detected(stamp)
-        if people is None and "detections" not in self._expected and self._settings.detect:
-            result = self._lookout.step(image, stamp, flow, self.background)
+        if people is None and "detections" not in self._expected and self.settings.detection.source != "none":
+            result = self._live.step(image, stamp, flow, self.background)
         else:
-            self._lookout.reset()
+            self._live.reset()
             result = self._tracker.step(image, stamp, people, flow)
         for warning in result.warnings:
-            self._warn(warning)
+            self.report.warn(warning)
         earlier, self._header = self._header, message.header
         self._forget(stamp)
         self.counters["images"] += 1
@@ -178,7 +182,7 @@ class PuppetTrackerComponent(Component):
                 self.counters["images without detection"] += 1
             return None
         self.counters["paired detections"] += 1
-        return keypoints_of(detections)
+        return decode_keypoints(detections)
 
     def _forget(self, stamp: int) -> None:
         """Drop what was for images up to this one; what no image has used is counted."""
@@ -195,39 +199,39 @@ class PuppetTrackerComponent(Component):
         backward = self._shelves["flow/backward"].get(stamp)
         if forward is None or backward is None:
             self.counters["images without flow"] += 1
-            self._warn("an image came without the flow that others had: it is computed here")
+            self.report.warn("an image came without the flow that others had: it is computed here")
             return None
         self.counters["paired flows"] += 1
         try:
             return decode_flow(forward), decode_flow(backward)
         except InputError as error:  # the image is good: its flow is computed here
-            self._unusable(error)
+            self.report.count_unusable(error)
             return None
 
     def _publish(self, header: Any, earlier: Any, image: U8, result: TrackResult) -> Output:
         puppets = make_puppets(self.factory, header, self._model, result.puppets)
         outputs: Output = [("puppets", puppets)]
-        if self._humans.on:
-            made = image_humans(self.factory, header, image, puppets.puppets)
-            outputs += self._humans.publish(header, list(made), made)
-        if "part_labels" in self._wanted:
-            labels = result.labels(image.shape[:2])
+        if self._humans.enabled:
+            made = make_image_messages(self.factory, header, image, puppets.puppets)
+            outputs += self._humans.make(header, list(made), made)
+        if "part_labels" in self._subscribed:
+            labels = result.render_part_labels(image.shape[:2])
             outputs.append(("part_labels", make_image(self.factory, header, labels, "mono8")))
-        if "overlay" in self._wanted:
+        if "overlay" in self._subscribed:
             outputs.append(("overlay", self._overlay(header, image, puppets)))
         if result.flow is not None and earlier is not None:
             forward = result.flow[0]
-            if "flow/preview" in self._wanted and "flow/forward" not in self._expected:
-                outputs.append(("flow/preview", flow_picture(self.factory, earlier, [forward])))
-            moved = result.puppet_flow() if "puppet_flow/preview" in self._wanted else None
+            if "flow/preview" in self._subscribed and "flow/forward" not in self._expected:
+                outputs.append(("flow/preview", make_flow_preview(self.factory, earlier, [forward])))
+            moved = result.puppet_flow() if "puppet_flow/preview" in self._subscribed else None
             if moved is not None:
-                picture = flow_picture(self.factory, earlier, [forward, moved.field])
+                picture = make_flow_preview(self.factory, earlier, [forward, moved.field])
                 outputs.append(("puppet_flow/preview", picture))
         return outputs
 
     def _overlay(self, header: Any, image: U8, puppets: Any) -> Any:
-        factor = min(1.0, self._settings.overlay_side / max(image.shape[:2]))
-        drawn = [DrawnPuppet.from_message(puppet).placed(factor) for puppet in puppets.puppets]
+        factor = min(1.0, self.settings.overlay_max_side / max(image.shape[:2]))
+        drawn = [DrawnPuppet.from_message(puppet).transform(factor) for puppet in puppets.puppets]
         if factor < 1:
             image = np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
         return make_image(self.factory, header, draw_puppets(image, drawn), "rgb8")

@@ -9,14 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.settings import SettingInfo, Settings, setting
 from flowing_puppet_ros.stream.component import Component
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
 from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
 from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
 
-COMPONENTS: dict[str, type[Component]] = {
+COMPONENTS: dict[str, type[Component[Any]]] = {
     "optical_flow": OpticalFlowComponent,
     "puppet_tracker": PuppetTrackerComponent,
     "visual_hull": VisualHullComponent,
@@ -25,25 +25,25 @@ COMPONENTS: dict[str, type[Component]] = {
 """The component that each node runs."""
 
 
-QUEUE = "messages of one input that may wait; the oldest is dropped for a newer"
+QUEUE_HELP = "messages of each input that may wait; a newer one replaces the oldest"
 
 
 @dataclass(frozen=True)
 class NodeSettings(Settings):
     """Settings that every node has beside those of its component."""
 
-    queue: int = setting(1, QUEUE, low=1, high=1000)
-    autostart: bool = setting(True, "configure and activate at the start; without, a lifecycle manager does")
+    queue: int = setting(1, QUEUE_HELP, low=1, high=1000)
+    autostart: bool = setting(True, "configure and activate on start-up; off: a lifecycle manager does it")
 
 
 @dataclass(frozen=True)
 class HullNodeSettings(NodeSettings):
     """Where many inputs make one set, those that come late must find the others still there."""
 
-    queue: int = setting(4, QUEUE, low=1, high=1000)
+    queue: int = setting(4, QUEUE_HELP, low=1, high=1000)
 
 
-FIXED = frozenset({"autostart"})
+FIXED_SETTINGS = frozenset({"autostart"})
 """Settings of every node that cannot be changed once it runs."""
 
 
@@ -57,16 +57,29 @@ def parameter_yaml(name: str) -> str:
     lines = [
         "# SPDX-License-Identifier: Apache-2.0",
         f"# Parameters of the node {name} at their defaults; `make config` writes this file from the settings.",
+        "# Advanced parameters, which the documentation lists, can be set in the same way.",
         f"/**/{name}:",
         "  ros__parameters:",
     ]
-    for settings_type in (COMPONENTS[name].settings_type, node_settings(name)):
-        for info in settings_type.describe():
-            lines += [f"    # {info.description}", f"    {info.name}: {_scalar(info.default)}"]
+    part = ""
+    for info in published(name):
+        above, dot, leaf = info.name.rpartition(".")
+        if above != part:
+            lines += [f"    {above}:"] if dot else []
+            part = above
+        indent = " " * (6 if dot else 4)
+        lines += [f"{indent}# {info.description}", f"{indent}{leaf}: {_to_yaml(info.default)}"]
     return "\n".join(lines) + "\n"
 
 
-def _scalar(value: Any) -> str:
+def published(name: str) -> list[SettingInfo]:
+    """Return the settings of a node that are offered: those of the node, of its component, then of its parts."""
+    kinds = (COMPONENTS[name].settings_type, node_settings(name))
+    infos = [info for kind in kinds for info in kind.describe() if not info.advanced]
+    return sorted(infos, key=lambda info: "." in info.name)
+
+
+def _to_yaml(value: Any) -> str:
     """Return a value as YAML that keeps its type: numbers with a point or an exponent with one are floating point."""
     if isinstance(value, bool):
         return "true" if value else "false"

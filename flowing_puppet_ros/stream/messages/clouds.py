@@ -13,36 +13,36 @@ from flowing_puppet_ros.stream.messages.message_types import MessageFactory, mes
 
 # sensor_msgs/PointField datatype -> numpy
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-_FLOAT32 = 7
-_FARTHEST = 1000.0
-"""Metres from the median point; no sensor of people reaches beyond, drivers mark unknown points with such numbers."""
+_FLOAT32 = 7  # of sensor_msgs/PointField
+_MAX_DISTANCE_M = 1000.0
+"""Maximum distance from the median point; no sensor for people reaches further, and drivers mark unknown points so."""
 _NORMALS = ("normal_x", "normal_y", "normal_z")
 
 
 def decode_cloud(message: Any) -> tuple[F64, F64 | None]:
-    """Return the finite points (N,3) in metres and, when the cloud has normal_x/y/z, their normals (N,3).
+    """Return the finite points (N, 3) in metres and, when the cloud has normal_x/y/z, their normals (N, 3).
 
-    An organised cloud is flattened and points with a NaN, infinite or absurd coordinate are left out, whatever
-    `is_dense` says. A normal that is not finite becomes zero. InputError when there are no x, y, z fields or the data
-    do not fit the sizes the message names.
+    An organised cloud is flattened. Points with a NaN, infinite or absurd coordinate are left out, whatever `is_dense`
+    says; a normal that is not finite becomes zero. InputError if there are no x, y, z fields or the data does not fit
+    the sizes in the message.
     """
     types = {field.name: field for field in message.fields}
     missing = [name for name in "xyz" if name not in types]
     if missing:
         raise InputError(f"a point cloud with the fields {', '.join(types) or 'none'} has no {missing[0]}")
-    records = _records(message, types)
+    records = _read_records(message, types)
     points = np.stack([records[name].astype(float) for name in "xyz"], axis=1)
     good = np.isfinite(points).all(axis=1)
     if good.any():
-        good[good] = np.abs(points[good] - np.median(points[good], axis=0)).max(axis=1) < _FARTHEST
+        good[good] = np.abs(points[good] - np.median(points[good], axis=0)).max(axis=1) < _MAX_DISTANCE_M
     if not all(name in types for name in _NORMALS):
         return points[good], None
     normals = np.stack([records[name].astype(float) for name in _NORMALS], axis=1)[good]
     return points[good], np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
 
 
-def _records(message: Any, fields: dict[str, Any]) -> Array:
-    """View the cloud as a flat structured array of the fields we know how to read."""
+def _read_records(message: Any, fields: dict[str, Any]) -> Array:
+    """View the cloud as a flat structured array of the fields that are read."""
     order = ">" if message.is_bigendian else "<"
     known = {name: field for name, field in fields.items() if name in ("x", "y", "z", *_NORMALS)}
     for name, field in known.items():
@@ -66,7 +66,7 @@ def _records(message: Any, fields: dict[str, Any]) -> Array:
 
 
 def make_cloud(factory: MessageFactory, header: Any, points: Array, normals: Array | None = None) -> Any:
-    """Return a dense, unorganised float32 PointCloud2 of points (N,3) in metres and their normals (N,3)."""
+    """Return a dense, unorganised float32 PointCloud2 of `points` (N, 3) in metres and their `normals` (N, 3)."""
     columns = [np.asarray(points, np.float32).reshape(-1, 3)]
     names = ["x", "y", "z"]
     if normals is not None:

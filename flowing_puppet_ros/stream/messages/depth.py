@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images and their camera_info to the point clouds that a body is fitted to."""
+"""Depth images and their camera_info to point clouds, to which bodies are fitted."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.images import decode_depth
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory
 
-MOST_POINTS = 80_000
-"""Points taken of a depth image: every n-th pixel of every n-th row, n as small as that allows."""
+MAX_POINTS = 80_000
+"""Maximum points of a depth image: every n-th pixel of every n-th row is taken, with n as small as possible."""
 
 
-def depth_points(depth: F32, info: Any) -> F32:
-    """Return the points (N,3) in metres of a depth image (H,W), metres, NaN unknown, in the camera's optical frame.
+def back_project(depth: F32, info: Any) -> F32:
+    """Return the points (N, 3) in metres of `depth` (H, W), metres, NaN unknown, in the camera's optical frame.
 
     The image is rectified, as REP-118 images are: pixel (u, v) at depth z lies at ((u - cx) z / fx, (v - cy) z / fy, z)
-    with the projection matrix `p` of the CameraInfo, or its `k` where `p` is not given. x right, y down, z forward
-    (REP-103). InputError when the camera is not calibrated or calibrated for another image size.
+    with the projection matrix `p` of the CameraInfo, or its `k` when `p` is not given. x is right, y down, z forward
+    (REP-103). InputError if the camera is not calibrated, or calibrated for another image size.
     """
     height, width = depth.shape
     if (int(info.width), int(info.height)) != (width, height):
         raise InputError(f"the depth image is {width}x{height}, its camera_info says {info.width}x{info.height}")
-    fx, fy, cx, cy = _pinhole(info)
-    step = max(1, math.ceil(math.sqrt(width * height / MOST_POINTS)))
+    fx, fy, cx, cy = _read_pinhole(info)
+    step = max(1, math.ceil(math.sqrt(width * height / MAX_POINTS)))
     rows, columns = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
     z = depth[np.ix_(rows, columns)]
     right = ((columns - cx) / fx).astype(np.float32)[None, :] * z
@@ -37,20 +37,22 @@ def depth_points(depth: F32, info: Any) -> F32:
     return np.stack([right, down, z], axis=2)[np.isfinite(z)]
 
 
-def _pinhole(info: Any) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy in pixels, of the projection matrix or else the camera matrix."""
+def _read_pinhole(info: Any) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy in pixels from the projection matrix or else the camera matrix."""
     k, p = np.asarray(info.k, float).reshape(-1), np.asarray(info.p, float).reshape(-1)
     values = (p[0], p[5], p[2], p[6]) if p[0] or p[5] else (k[0], k[4], k[2], k[5])
     fx, fy, cx, cy = (float(value) for value in values)
     if not (fx or fy):
         raise InputError("the camera_info is uncalibrated (k and p are all zero); publish a calibrated camera_info")
     if not all(map(math.isfinite, (fx, fy, cx, cy))) or fx <= 0 or fy <= 0:
-        raise InputError(f"the camera_info has the focal lengths {fx:g} and {fy:g}, which is no pinhole camera's")
+        raise InputError(
+            f"the camera_info has the focal lengths {fx:g} and {fy:g}, which are not those of a pinhole camera"
+        )
     return fx, fy, cx, cy
 
 
-def depth_cloud(factory: MessageFactory, image: Any, info: Any) -> Any:
-    """Return the PointCloud2 message of a depth Image and its CameraInfo (None: there is none, an InputError)."""
+def make_depth_cloud(factory: MessageFactory, image: Any, info: Any) -> Any:
+    """Return the PointCloud2 message of a depth Image and its CameraInfo; InputError if that is None."""
     if info is None:
         raise InputError("no camera_info came yet: a depth image cannot be used without it; publish or remap it")
-    return make_cloud(factory, image.header, depth_points(decode_depth(image), info))
+    return make_cloud(factory, image.header, back_project(decode_depth(image), info))

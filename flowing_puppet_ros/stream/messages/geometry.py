@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Headers, transforms, puppets and bodies to and from ROS messages.
+"""Stamps, headers, poses and transforms to and from ROS messages.
 
-The functions look at field names only, so they read rclpy messages and bag messages alike; a `MessageFactory` makes
+The functions use field names only, so they read rclpy messages and bag messages alike; a `MessageFactory` makes
 messages of either kind.
 """
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.model.rotation import quaternion
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory
 from flowing_puppet_ros.units import NANOSECONDS
 
@@ -30,7 +31,7 @@ def stamp_ns(message: Any) -> int:
 
 
 def make_stamp(factory: MessageFactory, nanoseconds: int) -> Any:
-    """Return a builtin_interfaces/Time of `nanoseconds` since the epoch."""
+    """Return the builtin_interfaces/Time of `nanoseconds` since the epoch."""
     seconds, rest = divmod(nanoseconds, NANOSECONDS)
     return factory.make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
 
@@ -45,24 +46,8 @@ def make_point(factory: MessageFactory, xyz: Sequence[float] | Array) -> Any:
     return factory.make("geometry_msgs/msg/Point", x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
 
 
-def quaternion(rotation: Array) -> F64:
-    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation matrix (3,3)."""
-    r = np.asarray(rotation, float)
-    # Bar-Itzhack's symmetric matrix: its principal eigenvector is the quaternion, also of a slightly inexact matrix.
-    k = np.array(
-        [
-            [r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[2, 0] + r[0, 2], r[2, 1] - r[1, 2]],
-            [r[1, 0] + r[0, 1], r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2], r[0, 2] - r[2, 0]],
-            [r[2, 0] + r[0, 2], r[2, 1] + r[1, 2], r[2, 2] - r[0, 0] - r[1, 1], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], r[0, 0] + r[1, 1] + r[2, 2]],
-        ]
-    )
-    q = np.linalg.eigh(k)[1][:, -1]
-    return q if q[3] >= 0 else -q
-
-
 def rotation_matrix(q: Sequence[float] | Array) -> F64:
-    """Return the rotation matrix (3,3) of a quaternion (x, y, z, w) of any length but 0."""
+    """Return the rotation matrix (3, 3) of a quaternion (x, y, z, w) of any non-zero length; InputError otherwise."""
     length = math.sqrt(sum(float(c) ** 2 for c in q))
     if not length > 0 or not math.isfinite(length):
         raise InputError(f"the rotation ({', '.join(f'{float(c):g}' for c in q)}) is not a quaternion")
@@ -77,8 +62,8 @@ def rotation_matrix(q: Sequence[float] | Array) -> F64:
 
 
 def make_quaternion(factory: MessageFactory, rotation: Array) -> Any:
-    """Return a geometry_msgs/Quaternion of a rotation matrix (3,3)."""
-    x, y, z, w = (float(c) for c in quaternion(rotation))
+    """Return the geometry_msgs/Quaternion of a rotation matrix (3, 3)."""
+    w, x, y, z = (float(c) for c in quaternion(rotation))
     return factory.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
@@ -107,15 +92,15 @@ def make_transform(factory: MessageFactory, header: Any, child: str, position: A
 
 
 class FrameTree:
-    """The static frames heard on `/tf_static`."""
+    """The static frames received on `/tf_static`."""
 
     def __init__(self) -> None:
         self._parent: dict[str, tuple[str, F64, F64]] = {}
 
     def add(self, message: Any) -> None:
-        """Take the transforms of a TFMessage; a later one replaces an earlier one of the same child.
+        """Add the transforms of a TFMessage; a later one replaces an earlier one of the same child.
 
-        InputError names the first that cannot be used; the others are taken.
+        InputError names the first that cannot be used, after all others were added.
         """
         unusable = []
         for item in message.transforms:
@@ -128,25 +113,25 @@ class FrameTree:
         if unusable:
             raise InputError(unusable[0])
 
-    def root(self, frame: str) -> str:
-        """Return the topmost known ancestor of `frame` (itself when it has none)."""
-        return self._climb(frame)[0]
+    def find_root(self, frame: str) -> str:
+        """Return the topmost known ancestor of `frame`, or `frame` itself when it has none."""
+        return self._pose_in_root(frame)[0]
 
-    def _climb(self, frame: str) -> tuple[str, F64, F64]:
+    def _pose_in_root(self, frame: str) -> tuple[str, F64, F64]:
         position, rotation = np.zeros(3), np.eye(3)
         seen = {frame}
         while frame in self._parent:
-            frame, step, turn = self._parent[frame]
+            frame, parent_position, parent_rotation = self._parent[frame]
             if frame in seen:
                 raise InputError(f"the frames on /tf_static form a loop through {frame!r}")
             seen.add(frame)
-            position, rotation = turn @ position + step, turn @ rotation
+            position, rotation = parent_rotation @ position + parent_position, parent_rotation @ rotation
         return frame, position, rotation
 
-    def pose(self, frame: str, target: str) -> tuple[F64, F64] | None:
-        """Return the position (3,) and rotation (3,3) of `frame` in `target`; None when nothing connects them."""
-        frame_root, position, rotation = self._climb(frame.lstrip("/"))
-        target_root, target_position, target_rotation = self._climb(target.lstrip("/"))
+    def lookup_pose(self, frame: str, target: str) -> tuple[F64, F64] | None:
+        """Return the position (3,) and rotation (3, 3) of `frame` in `target`; None when they are not connected."""
+        frame_root, position, rotation = self._pose_in_root(frame.lstrip("/"))
+        target_root, target_position, target_rotation = self._pose_in_root(target.lstrip("/"))
         if frame_root != target_root:
             return None
         return target_rotation.T @ (position - target_position), target_rotation.T @ rotation

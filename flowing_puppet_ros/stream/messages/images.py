@@ -10,15 +10,15 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F32, U8, Array
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.messages.compressed_depth import LARGEST_PIXELS, is_compressed_depth, unpack_depth
+from flowing_puppet_ros.stream.messages.compressed_depth import MAX_PIXELS, decode_compressed_depth, is_compressed_depth
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory, message_bytes
 
-JPEG_QUALITY = 85
+JPEG_QUALITY = 85  # of compressed outputs, 0 to 100
 
-FARTHEST_FLOW = 1e5
-"""Pixels; no flow leads farther than images are wide."""
+MAX_FLOW_PX = 1e5
+"""Maximum displacement in pixels; no flow is larger than images are wide."""
 
-# encoding -> (channels, bytes a channel, OpenCV conversion to RGB)
+# encoding -> (channels, bytes per channel, OpenCV conversion to RGB)
 _RAW: dict[str, tuple[int, int, int | None]] = {
     "rgb8": (3, 1, None),
     "bgr8": (3, 1, cv2.COLOR_BGR2RGB),
@@ -43,29 +43,29 @@ _RAW: dict[str, tuple[int, int, int | None]] = {
         for size in (1, 2)
     },
 }
-# encoding -> (type of a pixel, metres a unit); mono16 is how some drivers name millimetres (REP-118 has both others)
+# encoding -> (type of a pixel, metres per unit); some drivers call millimetres mono16 (REP-118 has the other two)
 _DEPTH = {"16uc1": ("u2", 0.001), "mono16": ("u2", 0.001), "32fc1": ("f4", 1.0)}
 
 
 def decode_image(message: Any) -> U8:
-    """Return the (H,W,3) RGB image of an Image or a CompressedImage; InputError in one sentence when it has none."""
+    """Return the RGB image (H, W, 3) of an Image or a CompressedImage; InputError when it cannot be decoded."""
     if hasattr(message, "format"):
         return _decode_compressed(message)
     encoding = message.encoding.lower()
     if encoding not in _RAW:
         raise InputError(f"the image encoding {message.encoding!r} is not one of {', '.join(_RAW)}")
     channels, size, conversion = _RAW[encoding]
-    pixels = _rows(message, channels, np.dtype("u1" if size == 1 else ">u2" if message.is_bigendian else "<u2"))
+    pixels = _read_rows(message, channels, np.dtype("u1" if size == 1 else ">u2" if message.is_bigendian else "<u2"))
     if size == 2:
         pixels = (pixels >> 8).astype(np.uint8)
     if conversion is None:
-        # Kernels are compiled for arrays that may be written, as all other conversions return.
+        # Kernels are compiled for writeable arrays, which all other conversions return.
         return np.array(pixels)
     try:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
     except cv2.error as error:  # packed formats need an even width, Bayer patterns two rows
         raise InputError(
-            f"an image of {message.width}x{message.height} is no whole {message.encoding} image"
+            f"an image of {message.width}x{message.height} is not a whole {message.encoding} image"
         ) from error
 
 
@@ -76,18 +76,18 @@ def _decode_compressed(message: Any) -> U8:
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(data, flags) if len(data) else None
-    except cv2.error:  # a header that names more pixels than OpenCV takes
+    except cv2.error:  # the header names more pixels than OpenCV accepts
         image = None
     if image is None:
         raise InputError(f"a compressed image of format {message.format!r} and {len(data)} bytes cannot be decoded")
     return np.asarray(image, np.uint8)
 
 
-def _rows(message: Any, channels: int, dtype: np.dtype[Any]) -> Array:
-    """Return the pixels (H,W) or (H,W,channels) of a raw Image without the padding of its rows."""
+def _read_rows(message: Any, channels: int, dtype: np.dtype[Any]) -> Array:
+    """Return the pixels (H, W) or (H, W, channels) of a raw Image without the padding of its rows."""
     height, width, step = int(message.height), int(message.width), int(message.step)
-    if height * width > LARGEST_PIXELS:
-        raise InputError(f"an image of {width}x{height} is larger than {LARGEST_PIXELS // 1_000_000} million pixels")
+    if height * width > MAX_PIXELS:
+        raise InputError(f"an image of {width}x{height} is larger than {MAX_PIXELS // 1_000_000} million pixels")
     data = message_bytes(message.data)
     needed = width * channels * dtype.itemsize
     if height < 1 or width < 1 or step < needed or len(data) < step * (height - 1) + needed:
@@ -98,48 +98,48 @@ def _rows(message: Any, channels: int, dtype: np.dtype[Any]) -> Array:
 
 
 def decode_labels(message: Any) -> U8:
-    """Return the (H,W) labels of a mono8 Image."""
+    """Return the labels (H, W) of a mono8 Image; InputError for another encoding."""
     if message.encoding.lower() not in ("mono8", "8uc1"):
-        raise InputError(f"part labels come as mono8, not as {message.encoding!r}")
-    return np.asarray(_rows(message, 1, np.dtype("u1")))
+        raise InputError(f"part labels must be mono8, not {message.encoding!r}")
+    return np.asarray(_read_rows(message, 1, np.dtype("u1")))
 
 
 def decode_flow(message: Any) -> F32:
-    """Return the (H,W,2) flow of a 32FC2 Image: pixels, +x right, +y down, NaN where unknown or absurd."""
+    """Return the flow (H, W, 2) of a 32FC2 Image: pixels, +x right, +y down, NaN where unknown or absurd."""
     if message.encoding.upper() != "32FC2":
-        raise InputError(f"optical flow comes as 32FC2, not as {message.encoding!r}")
-    pixels = _rows(message, 2, np.dtype(">f4" if message.is_bigendian else "<f4"))
+        raise InputError(f"optical flow must be 32FC2, not {message.encoding!r}")
+    pixels = _read_rows(message, 2, np.dtype(">f4" if message.is_bigendian else "<f4"))
     pixels = pixels.astype(np.float32, copy=False)
-    sane = np.abs(pixels) < FARTHEST_FLOW
-    return pixels if sane.all() else np.where(sane.all(axis=2, keepdims=True), pixels, np.float32(np.nan))
+    valid = np.abs(pixels) < MAX_FLOW_PX
+    return pixels if valid.all() else np.where(valid.all(axis=2, keepdims=True), pixels, np.float32(np.nan))
 
 
-def is_depth(encoding: str) -> bool:
-    """Whether `decode_depth` reads images of this encoding; mono16 may be a picture as well."""
+def is_depth_encoding(encoding: str) -> bool:
+    """Return whether `decode_depth` reads images of this encoding; mono16 may be a picture as well."""
     return encoding.lower() in _DEPTH
 
 
 def decode_depth(message: Any) -> F32:
-    """Return the (H,W) depth of a depth Image in metres along the optical axis (REP-118), NaN where unknown.
+    """Return the depth (H, W) of a depth Image in metres along the optical axis (REP-118), NaN where unknown.
 
-    16UC1 is in millimetres and 0 is unknown, 32FC1 is in metres; what is not positive or not finite is unknown. Takes
-    the CompressedImage of the transport `compressedDepth` too.
+    16UC1 is in millimetres and 0 is unknown; 32FC1 is in metres, and values that are not positive or not finite are
+    unknown. A CompressedImage of the transport `compressedDepth` is decoded too.
     """
     if hasattr(message, "format"):
-        raw: Array = unpack_depth(message)
+        raw: Array = decode_compressed_depth(message)
         unit = 0.001 if raw.dtype == np.uint16 else 1.0
     else:
         encoding = message.encoding.lower()
         if encoding not in _DEPTH:
-            raise InputError(f"depth comes as 16UC1 (mm) or 32FC1 (m), not as {message.encoding!r}")
+            raise InputError(f"depth must be 16UC1 (mm) or 32FC1 (m), not {message.encoding!r}")
         form, unit = _DEPTH[encoding]
-        raw = _rows(message, 1, np.dtype((">" if message.is_bigendian else "<") + form))
+        raw = _read_rows(message, 1, np.dtype((">" if message.is_bigendian else "<") + form))
     depth = raw.astype(np.float32) * np.float32(unit)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(np.nan))
 
 
 def make_image(factory: MessageFactory, header: Any, pixels: Array, encoding: str) -> Any:
-    """Return an Image of (H,W) or (H,W,C) pixels whose type fits `encoding`."""
+    """Return the Image of `pixels` (H, W) or (H, W, C), whose type fits `encoding`."""
     little = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
     return factory.make(
         "sensor_msgs/msg/Image",
@@ -153,16 +153,19 @@ def make_image(factory: MessageFactory, header: Any, pixels: Array, encoding: st
     )
 
 
-def compress(factory: MessageFactory, message: Any) -> Any:
+def compress_image(factory: MessageFactory, message: Any) -> Any:
     """Return the CompressedImage (JPEG) of an rgb8 Image."""
     rgb = decode_image(message)
     return factory.make(
-        "sensor_msgs/msg/CompressedImage", header=message.header, format="rgb8; jpeg compressed bgr8", data=jpeg(rgb)
+        "sensor_msgs/msg/CompressedImage",
+        header=message.header,
+        format="rgb8; jpeg compressed bgr8",
+        data=encode_jpeg(rgb),
     )
 
 
-def jpeg(rgb: U8, quality: int = JPEG_QUALITY) -> U8:
-    """Return the bytes of the JPEG file of an (H,W,3) RGB image."""
+def encode_jpeg(rgb: U8, quality: int = JPEG_QUALITY) -> U8:
+    """Return the JPEG file of an RGB image (H, W, 3) as bytes (N,)."""
     done, data = cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not done:
         raise InputError(f"an image of shape {rgb.shape} cannot be written as JPEG")

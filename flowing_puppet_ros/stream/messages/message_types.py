@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The types of the messages that come in and go out, and what makes messages of any flavour."""
+"""The types of the messages that come in and go out, and the factory of messages of any kind."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+MESH = "shape_msgs/msg/Mesh"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 PUPPETS = "flowing_puppet_msgs/msg/PuppetArray"
 BODIES = "flowing_puppet_msgs/msg/BodyArray"
@@ -20,13 +21,13 @@ SILHOUETTES = "flowing_puppet_msgs/msg/SilhouetteSet"
 
 
 class MessageFactory(Protocol):
-    """Makes ROS messages of one kind (rclpy's or the bag library's)."""
+    """Factory of ROS messages of one kind (those of rclpy or of the bag library)."""
 
     def make(self, type_name: str, **values: Any) -> Any:
-        """Make a message of type `package/msg/Name`; arrays of numbers come as ndarray, other arrays as lists."""
+        """Make a message of type `package/msg/Name`; arrays of numbers are given as ndarray, other arrays as lists."""
         ...
 
 
 def message_bytes(data: Any) -> U8:
-    """View the uint8[] field of any message flavour as an array, without a copy."""
+    """View a uint8[] field of any kind of message as an array, without a copy."""
     return data.view(np.uint8) if isinstance(data, np.ndarray) else np.frombuffer(memoryview(data), np.uint8)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import Array
+from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
 from flowing_puppet_ros.stream.messages.message_types import BODIES, PUPPETS, MessageFactory
@@ -21,18 +21,20 @@ if TYPE_CHECKING:
 
 _MESSAGES = "flowing_puppet_msgs/msg/"
 
-type Joint = tuple[float, float, float, float]
-"""x, y, z in metres and confidence, 0 to 1."""
+type JointPosition = tuple[float, float, float, float]
+"""x, y, z in metres, and a confidence in [0, 1]."""
 
 
-def keypoints_of(message: Any) -> list[Keypoints]:
+def decode_puppet_joints(puppet: Any) -> tuple[F64, F64]:
+    """Return the joints (J, 2) in pixels and their confidences (J,) of a Puppet message; NaN where unknown."""
+    joints = np.array([(joint.x, joint.y) for joint in puppet.joints], float).reshape(-1, 2)
+    return joints, np.array([joint.confidence for joint in puppet.joints], float)
+
+
+def decode_keypoints(message: Any) -> list[Keypoints]:
     """Return the people of a PuppetArray as keypoints (pixels; NaN where unknown)."""
     return [
-        Keypoints(
-            tuple(joint.name for joint in puppet.joints),
-            np.array([(joint.x, joint.y) for joint in puppet.joints], float).reshape(-1, 2),
-            np.array([joint.confidence for joint in puppet.joints], float),
-        )
+        Keypoints(tuple(joint.name for joint in puppet.joints), *decode_puppet_joints(puppet))
         for puppet in message.puppets
     ]
 
@@ -74,7 +76,7 @@ def _make_puppet(factory: MessageFactory, model: DeformableStructures, puppet: T
 
 
 def make_joints(factory: MessageFactory, names: Sequence[str], joints: Array, confidence: Array) -> list[Any]:
-    """Return the BodyJoints of joints (J,3) in metres with confidence (J,); those that are NaN are left out."""
+    """Return the BodyJoints of `joints` (J, 3) in metres with `confidence` (J,); joints that are NaN are left out."""
     return [
         factory.make(_MESSAGES + "BodyJoint", name=name, position=make_point(factory, xyz), confidence=c)
         for name, xyz, c in zip(names, joints, confidence, strict=True)
@@ -82,7 +84,7 @@ def make_joints(factory: MessageFactory, names: Sequence[str], joints: Array, co
     ]
 
 
-def joints_of(body: Any) -> dict[str, Joint]:
+def decode_body_joints(body: Any) -> dict[str, JointPosition]:
     """Return name -> (x, y, z, confidence) of a Body's joints."""
     return {
         joint.name: (joint.position.x, joint.position.y, joint.position.z, joint.confidence) for joint in body.joints
@@ -90,7 +92,7 @@ def joints_of(body: Any) -> dict[str, Joint]:
 
 
 def make_body(factory: MessageFactory, identity: str, model: StitchedPuppet, fit: BodyFit) -> Any:
-    """Return the Body message of a fit in the frame of the points that it was fitted to."""
+    """Return the Body message of a fit, in the frame of the points that it was fitted to."""
     state = fit.state
     parts = []
     for index, name in enumerate(model.tree.names):
@@ -105,14 +107,14 @@ def make_body(factory: MessageFactory, identity: str, model: StitchedPuppet, fit
                 confidence=fit.part_confidence[index],
             )
         )
-    certain = np.full(len(fit.joints), fit.confidence)
+    confidence = np.full(len(fit.joints), fit.confidence)
     return factory.make(
         _MESSAGES + "Body",
         id=identity,
         model=model.name,
         energy=fit.energy,
         confidence=fit.confidence,
-        joints=make_joints(factory, model.joint_names, fit.joints, certain),
+        joints=make_joints(factory, model.joint_names, fit.joints, confidence),
         parts=parts,
     )
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kinematic skeleton of REP-155 laid into a fitted body: 20 joint angles, link frames and a URDF.
+"""The kinematic skeleton of REP-155 fitted into a body: 20 joint angles, link frames and a URDF.
 
-Names, order and axes are those that consumers of REP-155 know: at zero the person stands upright with hanging limbs,
-x out of the chest, y to the left, z to the head. Lengths are the fitted person's.
+Names, order and axes are those of REP-155: at zero the person stands upright with hanging limbs, x out of the chest,
+y to the left, z to the head. Lengths are those of the fitted person.
 """
 
 from __future__ import annotations
@@ -18,178 +18,185 @@ from scipy.spatial.transform import Rotation
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-# Bend at which the other bone of a limb tells the hinge's axis as surely as the turn of the part does (sine).
-SURE_BEND = 0.2
-
+RELIABLE_BEND_SINE = 0.2
+"""Sine of the bend at which a limb's two bones determine the hinge's axis as reliably as the part's rotation does."""
 
 type Axis = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class Joint:
-    """A joint with the link of the same name, its parent link, and the axis (x, y, z) it turns about; None is fixed."""
+class SkeletonJoint:
+    """A joint with the link of the same name, its parent link and its axis of rotation (x, y, z); None is fixed."""
 
     name: str
     parent: str
     axis: Axis | None = None
 
 
-def _limb(
+def _limb_joints(
     side: str, parent: str, kind: str, hinge: str, end: str, axes: tuple[tuple[float, float, float], ...]
-) -> list[Joint]:
+) -> list[SkeletonJoint]:
     yaw, pitch, roll = f"{side}_y_{kind}", f"{side}_p_{kind}", f"{side}_r_{kind}"
-    first = [Joint(yaw, parent, axes[0]), Joint(pitch, yaw, axes[1]), Joint(roll, pitch, axes[2])]
-    return [*first, Joint(f"{side}_{hinge}", roll, (0, -1, 0)), Joint(f"{side}_{end}", f"{side}_{hinge}")]
+    first = [
+        SkeletonJoint(yaw, parent, axes[0]),
+        SkeletonJoint(pitch, yaw, axes[1]),
+        SkeletonJoint(roll, pitch, axes[2]),
+    ]
+    return [
+        *first,
+        SkeletonJoint(f"{side}_{hinge}", roll, (0, -1, 0)),
+        SkeletonJoint(f"{side}_{end}", f"{side}_{hinge}"),
+    ]
 
 
-def _arm(side: str, sign: float) -> list[Joint]:
+def _arm_joints(side: str, sign: float) -> list[SkeletonJoint]:
     axes = (0.0, 0.0, -sign), (sign, 0.0, 0.0), (0.0, 0.0, sign)
-    return _limb(side, "torso", "shoulder", "elbow", "wrist", axes)
+    return _limb_joints(side, "torso", "shoulder", "elbow", "wrist", axes)
 
 
-def _leg(side: str, sign: float) -> list[Joint]:
+def _leg_joints(side: str, sign: float) -> list[SkeletonJoint]:
     axes = (0.0, 0.0, -1.0), (sign, 0.0, 0.0), (0.0, -1.0, 0.0)
-    return _limb(side, "body", "hip", "knee", "ankle", axes)
+    return _limb_joints(side, "body", "hip", "knee", "ankle", axes)
 
 
 JOINTS = (
-    Joint("waist", "body", (0, 1, 0)),
-    Joint("torso", "waist"),
-    Joint("r_head", "torso", (1, 0, 0)),
-    Joint("y_head", "r_head", (0, 0, 1)),
-    Joint("p_head", "y_head", (0, -1, 0)),
-    Joint("head", "p_head"),
-    *_arm("l", 1.0),
-    *_arm("r", -1.0),
-    *_leg("l", 1.0),
-    *_leg("r", -1.0),
+    SkeletonJoint("waist", "body", (0, 1, 0)),
+    SkeletonJoint("torso", "waist"),
+    SkeletonJoint("r_head", "torso", (1, 0, 0)),
+    SkeletonJoint("y_head", "r_head", (0, 0, 1)),
+    SkeletonJoint("p_head", "y_head", (0, -1, 0)),
+    SkeletonJoint("head", "p_head"),
+    *_arm_joints("l", 1.0),
+    *_arm_joints("r", -1.0),
+    *_leg_joints("l", 1.0),
+    *_leg_joints("r", -1.0),
 )
 """All joints, parents before children; `body` is the root."""
-MOVING = tuple(joint.name for joint in JOINTS if joint.axis is not None)
-"""The 20 joints that turn, in the order of REP-155's reference producer."""
+MOVING_JOINTS = tuple(joint.name for joint in JOINTS if joint.axis is not None)
+"""The 20 revolute joints in the order of REP-155's reference producer."""
 _SIDES = {"l": "left", "r": "right"}
 _LIMBS = {"shoulder": ("shoulder", "elbow", "wrist", "upper_arm"), "hip": ("hip", "knee", "ankle", "upper_leg")}
-"""First, second and third joint of a limb, and the part that lies between the first two."""
+"""First, second and third joint of a limb, and the part between the first two."""
 
-Frame = tuple[np.ndarray, np.ndarray]
+LinkFrame = tuple[np.ndarray, np.ndarray]
 """Position (3,) in metres and rotation (3, 3)."""
 
 
 class Skeleton:
-    """The skeleton of the people of one body model."""
+    """The REP-155 skeleton of the people of one body model."""
 
     def __init__(self, model: StitchedPuppet) -> None:
         self._model = model
         self._index = {name: row for row, name in enumerate(model.joint_names)}
-        self._rest = self._at_rest(np.zeros((len(model.tree), model.shape_count)))
-        self._hinges = {(side, kind): self._hinge(self._rest, side, kind) for side in _SIDES for kind in _LIMBS}
+        self._rest = self._joints_at_rest(np.zeros((len(model.tree), model.shape_count)))
+        self._hinges = {(side, kind): self._hinge_at_rest(self._rest, side, kind) for side in _SIDES for kind in _LIMBS}
 
-    def body_frame(self, joints: np.ndarray, state: BodyState) -> Frame:
-        """`body_<id>` of REP-155: origin between the hips, axes of the torso (x out of the chest, z to the head)."""
-        return self._middle(joints), state.rotation[0]
+    def body_frame(self, joints: np.ndarray, state: BodyState) -> LinkFrame:
+        """Return REP-155's `body_<id>`: origin between the hips, axes of the torso (x forward, z to the head)."""
+        return self._hip_centre(joints), state.rotation[0]
 
-    def origins(self, shape: np.ndarray) -> dict[str, np.ndarray]:
-        """Where (3,) each joint sits in its parent link for a person of `shape` (16, S), metres."""
-        joints = self._at_rest(shape)
-        middle, torso = self._middle(joints), self._model.rest_center[0]
+    def joint_origins(self, shape: np.ndarray) -> dict[str, np.ndarray]:
+        """Return each joint's position (3,) in its parent link, metres, for a person of `shape` (16, S)."""
+        joints = self._joints_at_rest(shape)
+        middle, torso = self._hip_centre(joints), self._model.rest_center[0]
         head = self._model.rest_center[self._model.tree.index("head")]
         found = {joint.name: np.zeros(3) for joint in JOINTS}
-        found |= {"torso": torso - middle, "r_head": self._of(joints, "neck") - torso}
-        found["head"] = head - self._of(joints, "neck")
+        found |= {"torso": torso - middle, "r_head": self._joint(joints, "neck") - torso}
+        found["head"] = head - self._joint(joints, "neck")
         for short, side in _SIDES.items():
             for kind, (first, second, third, _) in _LIMBS.items():
-                a, b, c = (self._of(joints, f"{side}_{name}") for name in (first, second, third))
+                a, b, c = (self._joint(joints, f"{side}_{name}") for name in (first, second, third))
                 found[f"{short}_y_{kind}"] = a - (torso if kind == "shoulder" else middle)
                 found[f"{short}_{second}"] = np.array([0.0, 0.0, -np.linalg.norm(b - a)])
                 found[f"{short}_{third}"] = np.array([0.0, 0.0, -np.linalg.norm(c - b)])
         return found
 
-    def angles(self, joints: np.ndarray, state: BodyState) -> dict[str, float]:
-        """Angles (radians) of the 20 moving joints of a body with joints (J, 3), by name in the order of `MOVING`.
+    def joint_angles(self, joints: np.ndarray, state: BodyState) -> dict[str, float]:
+        """Return the angles (radians) of the 20 moving joints by name, in the order of `MOVING_JOINTS`.
 
-        Bones point from joint to joint; how a limb is turned about itself, the head and the torso come from the
-        rotations of the parts.
+        The bones follow from `joints` (J, 3); the twist of the limbs, the head and the torso follow from the rotations
+        of the parts in `state`.
         """
         body = state.rotation[0]
-        bend = self._bend(joints, body) - self._bend(self._rest, np.eye(3))
+        bend = self._torso_lean(joints, body) - self._torso_lean(self._rest, np.eye(3))
         chest = body @ rotation.exp(np.array([0.0, bend, 0.0]))
         head = chest.T @ state.rotation[self._model.tree.index("head")]
         # Euler angles about the positive axes; those of the joints may point the other way.
-        turned = {"waist": bend, **dict(zip(("r_head", "y_head", "p_head"), _euler(head, "XZY"), strict=True))}
+        angles = {"waist": bend, **dict(zip(("r_head", "y_head", "p_head"), _euler_angles(head, "XZY"), strict=True))}
         for short, side in _SIDES.items():
-            turned |= self._limb_angles(short, side, "shoulder", "ZXZ", chest, joints, state)
-            turned |= self._limb_angles(short, side, "hip", "ZXY", body, joints, state)
+            angles |= self._limb_angles(short, side, "shoulder", "ZXZ", chest, joints, state)
+            angles |= self._limb_angles(short, side, "hip", "ZXY", body, joints, state)
         signs = {joint.name: float(sum(joint.axis)) for joint in JOINTS if joint.axis is not None}
-        return {name: turned[name] * signs[name] for name in MOVING}
+        return {name: angles[name] * signs[name] for name in MOVING_JOINTS}
 
     def _limb_angles(
         self, short: str, side: str, kind: str, order: str, parent: np.ndarray, joints: np.ndarray, state: BodyState
     ) -> dict[str, float]:
         first, second, third, part = _LIMBS[kind]
-        a, b, c = (self._of(joints, f"{side}_{name}") for name in (first, second, third))
+        a, b, c = (self._joint(joints, f"{side}_{name}") for name in (first, second, third))
         upper, lower = _unit(b - a), _unit(c - b)
         own = state.rotation[self._model.tree.index(f"{side}_{part}")]
-        hinge = SURE_BEND * own @ self._hinges[short, kind] + self._bent(upper, lower, kind)
+        hinge = RELIABLE_BEND_SINE * own @ self._hinges[short, kind] + self._bend_axis(upper, lower, kind)
         hinge = _unit(hinge - upper * (upper @ hinge))
         axes = np.stack([np.cross(hinge, -upper), hinge, -upper], axis=1)
         local = parent.T @ axes
         if short == "r" and kind == "shoulder":
-            # As the left arm in the mirror, so that both raise their arms by a positive angle.
+            # Mirrored to a left arm, so that both arms are raised by a positive angle.
             mirror = np.diag([1.0, -1.0, 1.0])
-            first_turn, raised, roll = (-angle for angle in _euler(mirror @ local @ mirror, order))
+            yaw, pitch, roll = (-angle for angle in _euler_angles(mirror @ local @ mirror, order))
         else:
-            first_turn, raised, roll = _euler(local, order)
-        # About the hinge, which is y: an elbow folds the forearm forward, a knee the shank backward.
-        fold = math.atan2(np.cross(upper, lower) @ hinge, upper @ lower)
+            yaw, pitch, roll = _euler_angles(local, order)
+        # About the hinge, which is y: an elbow flexes the forearm forward, a knee the shank backward.
+        flexion = math.atan2(np.cross(upper, lower) @ hinge, upper @ lower)
         names = f"{short}_y_{kind}", f"{short}_p_{kind}", f"{short}_r_{kind}", f"{short}_{second}"
-        return dict(zip(names, (first_turn, raised, roll, fold), strict=True))
+        return dict(zip(names, (yaw, pitch, roll, flexion), strict=True))
 
-    def _hinge(self, joints: np.ndarray, side: str, kind: str) -> np.ndarray:
-        """Y (3,) of a limb's upper link for a body at rest, where all parts have the axes of the body."""
+    def _hinge_at_rest(self, joints: np.ndarray, side: str, kind: str) -> np.ndarray:
+        """Return y (3,) of a limb's upper link for a body at rest, where all parts have the axes of the body."""
         first, second, third, _ = _LIMBS[kind]
-        a, b, c = (self._of(joints, f"{_SIDES[side]}_{name}") for name in (first, second, third))
-        return _unit(self._bent(_unit(b - a), _unit(c - b), kind))
+        a, b, c = (self._joint(joints, f"{_SIDES[side]}_{name}") for name in (first, second, third))
+        return _unit(self._bend_axis(_unit(b - a), _unit(c - b), kind))
 
     @staticmethod
-    def _bent(upper: np.ndarray, lower: np.ndarray, kind: str) -> np.ndarray:
-        """Y of a limb's upper link, as long as the sine of the bend, from the directions of both bones."""
+    def _bend_axis(upper: np.ndarray, lower: np.ndarray, kind: str) -> np.ndarray:
+        """Return y of a limb's upper link from the directions of both bones; its length is the sine of the bend."""
         across = np.cross(upper, lower)
         return -across if kind == "shoulder" else across
 
-    def _bend(self, joints: np.ndarray, body: np.ndarray) -> float:
-        """How far the line from the hips to the neck leans forward in the frame of the torso, radians."""
-        along = body.T @ (self._of(joints, "neck") - self._middle(joints))
+    def _torso_lean(self, joints: np.ndarray, body: np.ndarray) -> float:
+        """Return the forward lean in radians of the line from hips to neck, in the frame of the torso."""
+        along = body.T @ (self._joint(joints, "neck") - self._hip_centre(joints))
         return math.atan2(along[0], along[2])
 
-    def _at_rest(self, shape: np.ndarray) -> np.ndarray:
+    def _joints_at_rest(self, shape: np.ndarray) -> np.ndarray:
         return self._model.joints(self._model.vertices(replace(self._model.rest_state(), shape=shape)))
 
-    def _middle(self, joints: np.ndarray) -> np.ndarray:
-        return np.asarray((self._of(joints, "left_hip") + self._of(joints, "right_hip")) / 2)
+    def _hip_centre(self, joints: np.ndarray) -> np.ndarray:
+        return np.asarray((self._joint(joints, "left_hip") + self._joint(joints, "right_hip")) / 2)
 
-    def _of(self, joints: np.ndarray, name: str) -> np.ndarray:
+    def _joint(self, joints: np.ndarray, name: str) -> np.ndarray:
         return np.asarray(joints[self._index[name]])
 
 
-def link_frames(origins: Mapping[str, np.ndarray], angles: Mapping[str, float]) -> dict[str, Frame]:
-    """Where every link is in the frame of `body`, by forward kinematics."""
-    placed: dict[str, Frame] = {"body": (np.zeros(3), np.eye(3))}
+def link_frames(origins: Mapping[str, np.ndarray], angles: Mapping[str, float]) -> dict[str, LinkFrame]:
+    """Return the frame of every link in the frame of `body`, by forward kinematics."""
+    frames: dict[str, LinkFrame] = {"body": (np.zeros(3), np.eye(3))}
     for joint in JOINTS:
-        position, turn = placed[joint.parent]
+        position, orientation = frames[joint.parent]
         own = np.eye(3) if joint.axis is None else rotation.exp(angles[joint.name] * np.array(joint.axis, float))
-        placed[joint.name] = position + turn @ origins[joint.name], turn @ own
-    return placed
+        frames[joint.name] = position + orientation @ origins[joint.name], orientation @ own
+    return frames
 
 
-def urdf(identity: str, origins: Mapping[str, np.ndarray]) -> str:
-    """The person as URDF: links and joints of `JOINTS`, each name followed by `_<identity>`; bones are cylinders."""
+def make_urdf(identity: str, origins: Mapping[str, np.ndarray]) -> str:
+    """Return the person's URDF: links and joints of `JOINTS`, names ending in `_<identity>`, bones as cylinders."""
     lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr('human_' + identity)}>"]
     lines.append(f"  <link name={quoteattr('body_' + identity)}/>")
     bones: dict[str, list[np.ndarray]] = {}
     for joint in JOINTS:
         bones.setdefault(joint.parent, []).append(origins[joint.name])
     for joint in JOINTS:
-        lines += _link(f"{joint.name}_{identity}", bones.get(joint.name, []), ball=joint.name == "head")
+        lines += _make_link(f"{joint.name}_{identity}", bones.get(joint.name, []), ball=joint.name == "head")
         x, y, z = origins[joint.name]
         kind = "fixed" if joint.axis is None else "revolute"
         lines.append(f'  <joint name={quoteattr(f"{joint.name}_{identity}")} type="{kind}">')
@@ -203,16 +210,16 @@ def urdf(identity: str, origins: Mapping[str, np.ndarray]) -> str:
     return "\n".join([*lines, "</robot>", ""])
 
 
-def _link(name: str, bones: list[np.ndarray], ball: bool) -> list[str]:
+def _make_link(name: str, bones: list[np.ndarray], ball: bool) -> list[str]:
     long = [bone for bone in bones if np.linalg.norm(bone) > 0.01]
     shapes = ['<origin xyz="0 0 0" rpy="0 0 0"/><geometry><sphere radius="0.1"/></geometry>'] if ball else []
     for bone in long:
         length = float(np.linalg.norm(bone))
         x, y, z = bone / 2
-        # A cylinder lies along z: tilted about y, then turned about z.
-        tilt, turn = np.arccos(np.clip(bone[2] / length, -1, 1)), np.arctan2(bone[1], bone[0])
-        where = f'<origin xyz="{x:.4f} {y:.4f} {z:.4f}" rpy="0 {tilt:.4f} {turn:.4f}"/>'
-        shapes.append(f'{where}<geometry><cylinder length="{length:.4f}" radius="0.03"/></geometry>')
+        # A cylinder lies along z: rotated about y, then about z.
+        pitch, yaw = np.arccos(np.clip(bone[2] / length, -1, 1)), np.arctan2(bone[1], bone[0])
+        origin = f'<origin xyz="{x:.4f} {y:.4f} {z:.4f}" rpy="0 {pitch:.4f} {yaw:.4f}"/>'
+        shapes.append(f'{origin}<geometry><cylinder length="{length:.4f}" radius="0.03"/></geometry>')
     if not shapes:
         return [f"  <link name={quoteattr(name)}/>"]
     visuals = [f"    <visual>{shape}</visual>" for shape in shapes]
@@ -223,7 +230,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-9))
 
 
-def _euler(turn: np.ndarray, order: str) -> tuple[float, float, float]:
-    """Angles about the positive axes, in the order in which the joints follow from the trunk outwards."""
-    a, b, c = Rotation.from_matrix(turn).as_euler(order, suppress_warnings=True)
+def _euler_angles(matrix: np.ndarray, order: str) -> tuple[float, float, float]:
+    """Return the angles about the positive axes, in the order of the joints from the trunk outwards."""
+    a, b, c = Rotation.from_matrix(matrix).as_euler(order, suppress_warnings=True)
     return float(a), float(b), float(c)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bodies as what viewers and programs read: triangle markers, part poses, the topology of the mesh."""
+"""Bodies as messages for viewers and programs: triangle markers, part poses, the topology of the mesh."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import I64, Array
 from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
-from flowing_puppet_ros.stream.messages.message_types import MessageFactory
+from flowing_puppet_ros.stream.messages.message_types import MESH, MessageFactory
 
 if TYPE_CHECKING:
     from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 _MARKER = "visualization_msgs/msg/Marker"
-_TRIANGLE_LIST, _ADD, _DELETE = 11, 0, 2
+_TRIANGLE_LIST, _ADD, _DELETE = 11, 0, 2  # of visualization_msgs/Marker
 _NAMESPACE = "bodies"
-_LIFETIME_S = 5
-_SKIN = (0.85, 0.68, 0.55)
+_LIFETIME_S = 5  # viewers delete a marker that is not renewed
+_SKIN_RGB = (0.85, 0.68, 0.55)
 
 
 def make_mesh_marker(factory: MessageFactory, header: Any, number: int, faces: Array, vertices: Array) -> Any:
-    """Return a TRIANGLE_LIST marker of a body mesh: faces (F,3), vertices (V,3) in metres in the header's frame."""
+    """Return the TRIANGLE_LIST marker of a body: `faces` (F, 3), `vertices` (V, 3) in metres in the header's frame."""
     points = [make_point(factory, vertex) for vertex in vertices]
-    red, green, blue = _SKIN
+    red, green, blue = _SKIN_RGB
     return factory.make(
         _MARKER,
         header=header,
@@ -42,7 +42,7 @@ def make_mesh_marker(factory: MessageFactory, header: Any, number: int, faces: A
 
 
 def make_deletions(factory: MessageFactory, header: Any, numbers: Sequence[int]) -> list[Any]:
-    """Return the markers that take the bodies of these numbers from the viewer."""
+    """Return the markers that delete the bodies with these marker ids from the viewer."""
     pose = make_pose(factory, np.zeros(3), np.eye(3))
     return [
         factory.make(_MARKER, header=header, ns=_NAMESPACE, id=number, action=_DELETE, pose=pose) for number in numbers
@@ -50,7 +50,7 @@ def make_deletions(factory: MessageFactory, header: Any, numbers: Sequence[int])
 
 
 def make_part_poses(factory: MessageFactory, header: Any, states: Sequence[BodyState]) -> Any:
-    """Return a PoseArray of the parts' centres and rotations: 16 a body, bodies one after the other."""
+    """Return the PoseArray of the parts' centres and rotations: 16 per body, one body after the other."""
     poses = [
         make_pose(factory, center, rotation)
         for state in states
@@ -60,19 +60,19 @@ def make_part_poses(factory: MessageFactory, header: Any, states: Sequence[BodyS
 
 
 def make_topology(factory: MessageFactory, model: StitchedPuppet) -> Any:
-    """Return the shape_msgs/Mesh of the model at rest; its triangles hold for the vertices of every fit."""
+    """Return the shape_msgs/Mesh of the model at rest; its triangles are valid for the vertices of every fit."""
     triangles = [
         factory.make("shape_msgs/msg/MeshTriangle", vertex_indices=np.asarray(face, np.uint32)) for face in model.faces
     ]
     vertices = [make_point(factory, vertex) for vertex in model.vertices(model.rest_state())]
-    return factory.make("shape_msgs/msg/Mesh", triangles=triangles, vertices=vertices)
+    return factory.make(MESH, triangles=triangles, vertices=vertices)
 
 
 def preview_faces(model: StitchedPuppet, triangles: int) -> I64:
-    """Return faces (F',3) over the model's own vertices, about `triangles` of them; all of the model's when 0.
+    """Return about `triangles` faces (F', 3) over the model's own vertices; all of the model's faces when 0.
 
-    Quadric edge collapses (Garland and Heckbert 1997) of the body at rest, every vertex that is left moved to the
-    nearest of the model's, so that the coarse mesh is posed and shaped as the fine one is.
+    Quadric edge collapse (Garland and Heckbert 1997) of the body at rest. Every remaining vertex is replaced by the
+    nearest one of the model, so that the coarse mesh has the pose and shape of the full one.
     """
     if not 0 < triangles < len(model.faces):
         return np.asarray(model.faces, np.int64)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Silhouettes of one person in calibrated cameras to and from messages, and the bodies that are fitted to them."""
+"""Silhouettes of one person in calibrated cameras to and from messages."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ Masks = Mapping[str, U8]
 def make_silhouettes(
     factory: MessageFactory, header: Any, person: Any, cameras: Mapping[str, Camera], masks: Masks, headers: Any
 ) -> Any:
-    """Return the SilhouetteSet of a person (a Body of joints) whose masks (h,w) the cameras of these names cut out.
+    """Return the SilhouetteSet of `person` (a Body with joints) from the mask (h, w) of each camera, by camera name.
 
-    `header` has the instant and the common frame, `headers` (camera name -> header) those of the images.
+    `header` has the stamp and the common frame; `headers` (camera name -> header) are those of the images.
     """
     silhouettes = [
         factory.make(
             "flowing_puppet_msgs/msg/Silhouette",
             camera=name,
-            info=_make_info(factory, headers[name], cameras[name].resized(mask.shape[::-1])),
+            info=_make_info(factory, headers[name], cameras[name].resize(mask.shape[::-1])),
             pose=make_pose(factory, cameras[name].centre, cameras[name].rotation.T),
             mask=make_image(factory, headers[name], mask, "mono8"),
         )
@@ -52,23 +52,23 @@ def _make_info(factory: MessageFactory, header: Any, camera: Camera) -> Any:
     )
 
 
-def views_of(message: Any) -> list[tuple[Camera, U8]]:
-    """Return the cameras and masks (h,w) of a SilhouetteSet; InputError names the camera that cannot be used."""
+def decode_silhouettes(message: Any) -> list[tuple[Camera, U8]]:
+    """Return the cameras and masks (h, w) of a SilhouetteSet; InputError names the camera that cannot be used."""
     views = []
-    for each in message.silhouettes:
-        info, place, turn = each.info, each.pose.position, each.pose.orientation
+    for silhouette in message.silhouettes:
+        info, position, orientation = silhouette.info, silhouette.pose.position, silhouette.pose.orientation
         try:
-            rotation = rotation_matrix((turn.x, turn.y, turn.z, turn.w)).T
-            translation = -rotation @ np.array([place.x, place.y, place.z])
+            rotation = rotation_matrix((orientation.x, orientation.y, orientation.z, orientation.w)).T
+            translation = -rotation @ np.array([position.x, position.y, position.z])
             camera = Camera.from_info(
                 info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model
             )
-            mask = decode_labels(each.mask)
+            mask = decode_labels(silhouette.mask)
         except InputError as error:
-            raise InputError(f"{each.camera}: {error}") from error
+            raise InputError(f"{silhouette.camera}: {error}") from error
         if mask.shape[::-1] != camera.size:
             raise InputError(
-                f"{each.camera}: the mask is {mask.shape[1]} x {mask.shape[0]}, its camera_info says"
+                f"{silhouette.camera}: the mask is {mask.shape[1]} x {mask.shape[0]}, its camera_info says"
                 f" {camera.size[0]} x {camera.size[1]}"
             )
         views.append((camera, mask))

@@ -18,6 +18,8 @@ from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
+pytestmark = pytest.mark.slow
+
 LIMB_JOINTS = tuple(
     f"{side}_{name}" for side in ("left", "right") for name in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 )
@@ -28,7 +30,7 @@ PLACE = np.array([1.0, -2.0, 0.9])
 
 @pytest.fixture(scope="module")
 def man() -> tuple[np.ndarray, np.ndarray, Joints]:
-    """Points, normals and joints of a man who stands turned by 2 rad, away from the origin."""
+    """Points, normals and joints of a man with a yaw of 2 rad, away from the origin."""
     joints = joints_of()
     points, normals = cloud_of(joints)
     return points @ TURN.T + PLACE, normals @ TURN.T, {name: TURN @ at + PLACE for name, at in joints.items()}
@@ -113,7 +115,7 @@ def crate() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("cloud", [two_people, ball, crate, dog])
 def test_what_is_no_single_person_is_not_reliable(cloud: Callable[[], tuple[np.ndarray, np.ndarray]]) -> None:
-    small = FitterSettings(particles=10, iterations=8, local_particles=6, local_iterations=3, limb_rounds=0)
+    small = FitterSettings(particles=10, iterations=8, local_particles=6, local_iterations=3, max_limb_repairs=0)
     fit = BodyFitter(StitchedPuppet.load("neutral"), small).fit(*cloud())
     assert not fit.reliable
     assert np.isfinite(fit.vertices).all() and np.isfinite(fit.energy)
@@ -129,7 +131,7 @@ def test_unusable_clouds_are_refused_in_one_sentence(fitter: BodyFitter) -> None
         (np.zeros((100, 3)), "0 m wide"),
         (1e300 * cloud, "m wide"),
         (np.concatenate([cloud, [[1e5, 0, 0]]]), "1e[+]05 m wide"),
-        (np.repeat(cloud[:40], 30, axis=0), "40 places"),
+        (np.repeat(cloud[:40], 30, axis=0), "40 distinct points"),
         (np.outer(np.linspace(0, 2, 100), [1, 2, 3]), "on a line"),
         (np.pad(cloud[:, :2], ((0, 0), (0, 1))), "in a plane"),
     ):
@@ -162,7 +164,7 @@ def test_fit_verb_writes_the_contract_and_goes_on_after_a_bad_input(
     np.save(tmp_path / "man.npy", 100 * np.concatenate([points, normals], axis=1))
     (tmp_path / "empty.xyz").write_bytes(b"")
     flags = ["--particles", "8", "--iterations", "6", "--local-particles", "6", "--local-iterations", "2"]
-    flags += ["--limb-rounds", "0", "--up", "z", "--json", "--out"]
+    flags += ["--max-limb-repairs", "0", "--up", "z", "--json", "--out"]
     status = main(["fit", str(tmp_path / "empty.xyz"), str(tmp_path / "man.npy"), *flags, str(tmp_path / "fits")])
     assert status == 1, "one of two inputs failed"
     output = capsys.readouterr()

@@ -17,8 +17,8 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 
 @pytest.fixture(scope="module")
-def finder(model: StitchedPuppet) -> BodyHypotheses:
-    return BodyHypotheses(model, FitterSettings(limb_rounds=2))
+def hypotheses(model: StitchedPuppet) -> BodyHypotheses:
+    return BodyHypotheses(model, FitterSettings(max_limb_repairs=2))
 
 
 @pytest.fixture(scope="module")
@@ -51,22 +51,23 @@ def off(model: StitchedPuppet, body: BodyState, joints: Joints, names: tuple[str
     return max(float(np.linalg.norm(found[name] - joints[name])) for name in names)
 
 
+@pytest.mark.slow
 def test_two_legs_on_one_come_apart(
-    model: StitchedPuppet, finder: BodyHypotheses, joints: Joints, cloud: Cloud, body: BodyState
+    model: StitchedPuppet, hypotheses: BodyHypotheses, joints: Joints, cloud: Cloud, body: BodyState
 ) -> None:
     wrong = placed_like(model, body, "right", "left", ("upper_leg", "lower_leg", "foot"))
     names = ("right_knee", "right_ankle", "left_knee", "left_ankle")
     assert off(model, wrong, joints, names) > 0.2
-    start = finder.candidate(wrong, cloud)
+    start = hypotheses.evaluate(wrong, cloud)
     assert start.quality.limb_suspect
     grid = CloudGrid.build(cloud.points, cloud.normals)
-    mended = finder.repair_limbs(start, cloud, grid, np.random.default_rng(0))
-    assert off(model, mended.state, joints, names) < 0.1
-    assert mended.cost < 0.7 * start.cost
+    repaired = hypotheses.repair_limbs(start, cloud, grid, np.random.default_rng(0))
+    assert off(model, repaired.state, joints, names) < 0.1
+    assert repaired.cost < 0.7 * start.cost
 
 
 def test_an_arm_is_found_in_what_the_rest_leaves_and_the_rest_stays(
-    model: StitchedPuppet, finder: BodyHypotheses, joints: Joints, cloud: Cloud, body: BodyState
+    model: StitchedPuppet, hypotheses: BodyHypotheses, joints: Joints, cloud: Cloud, body: BodyState
 ) -> None:
     arm = limb_groups(model.tree)[2]
     assert [model.tree.names[part] for part in arm] == [
@@ -76,7 +77,7 @@ def test_an_arm_is_found_in_what_the_rest_leaves_and_the_rest_stays(
     center[list(arm[1:])] += [0.0, 0.1, 0.5]
     wrong = replace(body, center=center)
     grid = CloudGrid.build(cloud.points, cloud.normals)
-    found = finder.limbs.run(wrong, arm, cloud, grid, np.random.default_rng(0))
+    found = hypotheses.limb_search.run(wrong, arm, cloud, grid, np.random.default_rng(0))
     assert found is not None
     assert off(model, found, joints, ("left_elbow", "left_wrist")) < 0.12 < off(model, wrong, joints, ("left_wrist",))
     others = np.setdiff1d(np.arange(16), arm)
@@ -84,26 +85,27 @@ def test_an_arm_is_found_in_what_the_rest_leaves_and_the_rest_stays(
     np.testing.assert_array_equal(found.rotation[others], wrong.rotation[others])
 
 
+@pytest.mark.slow
 def test_no_limb_is_sought_where_nothing_is_left(
-    model: StitchedPuppet, finder: BodyHypotheses, cloud: Cloud, body: BodyState
+    model: StitchedPuppet, hypotheses: BodyHypotheses, cloud: Cloud, body: BodyState
 ) -> None:
     arm = limb_groups(model.tree)[2]
     rest = model.vertices(body)[~np.isin(model.part_of_vertex, arm)]
     near = np.linalg.norm(cloud.points[:, None] - rest, axis=2).min(axis=1) < 0.03
     armless = Cloud.of(cloud.points[near], cloud.normals[near])
     grid = CloudGrid.build(armless.points, armless.normals)
-    assert finder.limbs.run(body, arm, armless, grid, np.random.default_rng(0)) is None
+    assert hypotheses.limb_search.run(body, arm, armless, grid, np.random.default_rng(0)) is None
 
 
 def test_a_body_without_fault_stays_as_it_is(
-    model: StitchedPuppet, finder: BodyHypotheses, cloud: Cloud, body: BodyState
+    model: StitchedPuppet, hypotheses: BodyHypotheses, cloud: Cloud, body: BodyState
 ) -> None:
     vertices = model.vertices(body)
     own = Cloud.of(vertices, np.zeros_like(vertices))
-    candidate = replace(finder.candidate(body, cloud), quality=assess_fit(model, vertices, own))
+    candidate = replace(hypotheses.evaluate(body, cloud), quality=assess_fit(model, vertices, own))
     candidate = replace(candidate, quality=replace(candidate.quality, part_confidence=np.ones(16)))
     grid = CloudGrid.build(cloud.points, cloud.normals)
-    assert finder.repair_limbs(candidate, cloud, grid, np.random.default_rng(0)) is candidate
+    assert hypotheses.repair_limbs(candidate, cloud, grid, np.random.default_rng(0)) is candidate
 
 
 def test_groups_hold_every_limb_from_the_trunk_outwards(model: StitchedPuppet) -> None:

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from flowing_puppet_ros.body.fit import hypotheses
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.model.sp import StitchedPuppet
-from flowing_puppet_ros.parallel import parallel_map, usable_threads
+from flowing_puppet_ros.threads import parallel_map, usable_threads
 
 
 def test_results_keep_the_order_of_the_items() -> None:
@@ -33,11 +33,18 @@ def test_a_worker_that_may_use_one_core_uses_one(monkeypatch: pytest.MonkeyPatch
     assert [usable_threads(1), usable_threads(3), usable_threads(8)] == [1, 3, 4]
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     points, normals = cloud_of(joints_of(), 2500)
-    # So few particles misplace limbs, which are then sought anew.
+    # So few particles misplace limbs, which are then searched again.
     small = FitterSettings(
-        particles=8, iterations=8, local_particles=6, local_iterations=3, refine_iterations=4, restarts=0, limb_rounds=1
+        particles=8,
+        iterations=8,
+        local_particles=6,
+        local_iterations=3,
+        gauss_newton_steps=4,
+        restarts=0,
+        max_limb_repairs=1,
     )
     fits = []
     for threads, seed in ((1, 5), (2, 5), (2, 6)):

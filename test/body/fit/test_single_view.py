@@ -9,10 +9,10 @@ from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.cloud.single_view import DEPTH_TOLERANCE, SingleViewCloud
+from flowing_puppet_ros.body.cloud.single_view import MIN_DEPTH_TOLERANCE_M, SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
-from flowing_puppet_ros.body.search.part_points import part_points
+from flowing_puppet_ros.body.search.part_points import build_part_points
 from flowing_puppet_ros.body.search.particles import states_to_particles
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -49,6 +49,7 @@ def errors_of(fitter: BodyFitter, fit: BodyFit, joints: dict[str, np.ndarray]) -
     return np.array([np.linalg.norm(found[name] - joints[name]) for name in LIMB_JOINTS])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lift", "count", "noise"), [(1.4, 6000, 0.005), (0.4, 1200, 0.02)])
 def test_depth_cameras_and_lidars_show_the_joints_and_the_sides(
     fitter: BodyFitter, lift: float, count: int, noise: float
@@ -73,15 +74,15 @@ def test_free_space_draws_out_what_stands_in_it_and_nothing_else() -> None:
     side = cloud.view.axes[0]
     behind, before = points[::50] + 0.3 * forward, points[::50] - 0.05 * forward
     beside = points.mean(axis=0) + 1.5 * side
-    assert not cloud.free_space(behind, 0.1).matrix.any()
-    drawn = cloud.free_space(np.concatenate([before, beside[None]]), 0.1)
+    assert not cloud.free_space_term(behind, 0.1).matrix.any()
+    attracted = cloud.free_space_term(np.concatenate([before, beside[None]]), 0.1)
     # The step of a Gauss-Newton on each vertex alone, pseudo-inverse because other directions are free.
-    steps = -np.einsum("vij,vj->vi", np.linalg.pinv(drawn.matrix), drawn.vector)
-    assert np.median(np.abs(steps[:-1] @ forward - (0.05 - DEPTH_TOLERANCE))) < 0.01
+    steps = -np.einsum("vij,vj->vi", np.linalg.pinv(attracted.matrix), attracted.vector)
+    assert np.median(np.abs(steps[:-1] @ forward - (0.05 - MIN_DEPTH_TOLERANCE_M))) < 0.01
     assert steps[-1] @ side < -0.5
     assert abs(steps[-1] @ (beside - SENSOR)) < 1e-9 * np.linalg.norm(beside - SENSOR) + 1e-9
-    far = cloud.free_space(np.concatenate([before, beside[None]]), 0.01)
-    assert np.trace(far.matrix[-1]) < 0.01 * np.trace(drawn.matrix[-1])
+    far = cloud.free_space_term(np.concatenate([before, beside[None]]), 0.01)
+    assert np.trace(far.matrix[-1]) < 0.01 * np.trace(attracted.matrix[-1])
 
 
 def test_hidden_vertices_are_not_seen(fitter: BodyFitter) -> None:
@@ -95,19 +96,19 @@ def test_hidden_vertices_are_not_seen(fitter: BodyFitter) -> None:
     cloud = SingleViewCloud.seen_from(vertices[facing & arm], normals[facing & arm], sensor)
     seen = cloud.sees(vertices, normals)
     assert seen[facing & arm].mean() > 0.97
-    shadow = facing & cloud.view.hidden(vertices)
+    shadow = facing & cloud.view.find_hidden(vertices)
     assert shadow.sum() > 50 and not seen[shadow].any()
     assert not seen[~facing].any()
     with pytest.raises(InputError, match="within the cloud"):
         SingleViewCloud.seen_from(vertices, normals, vertices.mean(axis=0))
 
 
-def test_bank_judges_bodies_by_all_or_by_some_of_their_parts(fitter: BodyFitter) -> None:
+def test_bank_scores_bodies_by_all_or_by_some_of_their_parts(fitter: BodyFitter) -> None:
     model = fitter.model
-    bank = PoseBank(model, part_points(model))
+    bank = PoseBank(model, build_part_points(model))
     points, normals = cloud_of(joints_of(), 3000)
     coarse = CoarseCloud.of(Cloud.of(points, normals), 60)
-    bodies = bank.best(coarse, 4)
+    bodies = bank.find_best(coarse, 4)
     cost = [bank.cost(body, coarse) for body in bodies]
     assert cost == sorted(cost)
     groups = states_to_particles(model, bodies)

@@ -5,7 +5,7 @@ import numpy as np
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic, two_way_distance
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.refine.gauss_newton import LOOSE, GaussNewton, RefineWeights
+from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -46,6 +46,6 @@ def test_loose_parts_follow_a_foreign_surface_more_closely() -> None:
     cloud = Cloud.of(truth, vertex_normals(truth, model.faces))
     refiner, none = GaussNewton(model), JointTargets.none(model)
     firm = refiner.run(start, cloud, none, RefineWeights(sigma_start=0.05, sigma_end=0.05, iterations=6))
-    loose = refiner.run(firm, cloud, none, LOOSE)
+    loose = refiner.run(firm, cloud, none, LOOSE_STITCHING)
     apart = [two_way_distance(model.vertices(body), model.faces, cloud) for body in (start, firm, loose)]
     assert apart[2] < apart[1] - 0.0001 < apart[0]

@@ -34,8 +34,8 @@ def test_gradient_equals_numerical_derivative() -> None:
     poses = rng.normal(size=5)
 
     def cost(step: np.ndarray) -> float:
-        turned = so3.log((parent @ so3.exp(step[:3])).T @ child @ so3.exp(step[3:6]))
-        deviation = np.concatenate([turned, poses + step[6:]]) - gaussian.mean
+        rotation = so3.log((parent @ so3.exp(step[:3])).T @ child @ so3.exp(step[3:6]))
+        deviation = np.concatenate([rotation, poses + step[6:]]) - gaussian.mean
         return float(0.5 * deviation @ precision @ deviation)
 
     relative = so3.log(parent.T @ child)

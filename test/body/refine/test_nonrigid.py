@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The non-rigid finish on surfaces that the body model cannot express, and where there is nothing to follow."""
+"""The non-rigid refinement on surfaces that the body model cannot express, and where there is nothing to follow."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 
 
 @pytest.fixture(scope="module")
-def finish(model: StitchedPuppet) -> NonRigidRefinement:
+def nonrigid(model: StitchedPuppet) -> NonRigidRefinement:
     return NonRigidRefinement(model.faces, len(model.part_of_vertex), NonRigidWeights())
 
 
@@ -42,35 +42,35 @@ def test_umbrella_takes_the_mean_of_the_neighbours() -> None:
     np.testing.assert_allclose(umbrella_laplacian(faces, 5) @ values, expected)
 
 
-def test_what_the_model_cannot_express_is_followed(model: StitchedPuppet, finish: NonRigidRefinement) -> None:
+def test_what_the_model_cannot_express_is_followed(model: StitchedPuppet, nonrigid: NonRigidRefinement) -> None:
     start, truth = swollen(model)
     cloud = cloud_on(truth, model.faces, 8000)
-    finished = finish.run(start, cloud)
-    before, after = (np.linalg.norm(vertices - truth, axis=1).mean() for vertices in (start, finished))
+    refined = nonrigid.run(start, cloud)
+    before, after = (np.linalg.norm(vertices - truth, axis=1).mean() for vertices in (start, refined))
     assert before > 0.006
     assert after < 0.75 * before
-    assert two_way_distance(finished, model.faces, cloud) < two_way_distance(start, model.faces, cloud) - 0.002
+    assert two_way_distance(refined, model.faces, cloud) < two_way_distance(start, model.faces, cloud) - 0.002
 
 
-def test_holes_follow_their_surroundings(model: StitchedPuppet, finish: NonRigidRefinement) -> None:
+def test_holes_follow_their_surroundings(model: StitchedPuppet, nonrigid: NonRigidRefinement) -> None:
     start = model.vertices(model.rest_state())
     truth = start + np.array([0.01, 0.0, 0.01])
     whole = cloud_on(truth, model.faces, 8000)
     low, high = np.quantile(start[:, 2], [0.35, 0.42])
     kept = (whole.points[:, 2] < low) | (whole.points[:, 2] > high)
-    finished = finish.run(start, Cloud.of(whole.points[kept], whole.normals[kept]))
+    refined = nonrigid.run(start, Cloud.of(whole.points[kept], whole.normals[kept]))
     inside = (start[:, 2] > low + 0.01) & (start[:, 2] < high)
     assert inside.sum() > 30
-    assert np.linalg.norm(finished - truth, axis=1)[inside].mean() < 0.006
+    assert np.linalg.norm(refined - truth, axis=1)[inside].mean() < 0.006
 
 
-def test_a_cloud_that_is_elsewhere_moves_nothing(model: StitchedPuppet, finish: NonRigidRefinement) -> None:
+def test_a_cloud_that_is_elsewhere_moves_nothing(model: StitchedPuppet, nonrigid: NonRigidRefinement) -> None:
     start = model.vertices(model.rest_state())
     elsewhere = Cloud.of(start + np.array([20.0, 0.0, 0.0]), vertex_normals(start, model.faces))
-    assert np.abs(finish.run(start, elsewhere) - start).max() < 1e-3
+    assert np.abs(nonrigid.run(start, elsewhere) - start).max() < 1e-3
 
 
-def test_the_same_cloud_gives_the_same_bytes(model: StitchedPuppet, finish: NonRigidRefinement) -> None:
+def test_the_same_cloud_gives_the_same_bytes(model: StitchedPuppet, nonrigid: NonRigidRefinement) -> None:
     start, truth = swollen(model)
     cloud = cloud_on(truth, model.faces, 2000)
-    assert finish.run(start, cloud).tobytes() == finish.run(start.copy(), cloud).tobytes()
+    assert nonrigid.run(start, cloud).tobytes() == nonrigid.run(start.copy(), cloud).tobytes()

@@ -8,16 +8,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flowing_puppet_ros.body.scans.scan import Scan, read_scan, storable, write_ply
+from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
 from flowing_puppet_ros.body.scans.scan_frame import (
-    UP_NAMES,
+    UP_AXES,
     ScanFrame,
-    all_candidates,
-    axis_of,
     guess_scale,
+    is_seen_from_origin,
+    parse_axis,
+    propose_all_up_axes,
+    propose_up_axes,
     rotation_to_z_up,
-    seen_from_origin,
-    up_candidates,
 )
 from flowing_puppet_ros.errors import InputError
 
@@ -53,7 +53,7 @@ def test_text_meshes_keep_the_order_of_vertices(tmp_path: Path, suffix: str) -> 
 
 
 @pytest.mark.parametrize("coloured", [False, True])
-def test_written_ply_reads_back_and_inside_out_faces_are_turned(tmp_path: Path, coloured: bool) -> None:
+def test_written_ply_reads_back_and_inside_out_faces_are_flipped(tmp_path: Path, coloured: bool) -> None:
     colours = np.full((8, 3), 7) if coloured else None
     write_ply(tmp_path / "a.ply", BOX, BOX_FACES[:, ::-1], colours)
     scan = read_scan(tmp_path / "a.ply")
@@ -64,15 +64,15 @@ def test_written_ply_reads_back_and_inside_out_faces_are_turned(tmp_path: Path, 
 
 def test_places_far_from_the_origin_keep_their_digits(tmp_path: Path) -> None:
     far = BOX + np.array([5e5, 5.5e6, 300.0])
-    assert storable(BOX).dtype == np.float32
-    np.testing.assert_array_equal(storable(far), far)
+    assert to_smallest_float(BOX).dtype == np.float32
+    np.testing.assert_array_equal(to_smallest_float(far), far)
     write_ply(tmp_path / "a.ply", far, BOX_FACES)
     np.testing.assert_array_equal(read_scan(tmp_path / "a.ply").points, far)
 
 
 def test_surface_samples_lie_on_the_mesh_evenly() -> None:
     without_area = np.array([[0, 0, 1], [2, 2, 2]])
-    points, normals = Scan(BOX, np.concatenate([without_area, BOX_FACES, without_area])).surface(
+    points, normals = Scan(BOX, np.concatenate([without_area, BOX_FACES, without_area])).sample_surface(
         4000, np.random.default_rng(0)
     )
     assert normals is not None and np.isfinite(normals).all()
@@ -112,6 +112,7 @@ BAD: dict[str, bytes | None] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_are_refused_in_one_sentence(tmp_path: Path, name: str) -> None:
     content = BAD[name]
@@ -128,7 +129,7 @@ def test_pickles_and_wrong_arrays_are_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "flat.npy", np.zeros(9))
     np.savez(tmp_path / "many.npz", a=np.zeros((5, 3)), b=np.zeros((5, 3)))
     np.save(tmp_path / "nan.npy", np.full((9, 3), np.nan))
-    for name, words in (("objects", "numpy"), ("flat", r"\(9,\)"), ("nan", "none of them is finite")):
+    for name, words in (("objects", "NumPy"), ("flat", r"\(9,\)"), ("nan", "none of which is finite")):
         with pytest.raises(InputError, match=words):
             read_scan(tmp_path / f"{name}.npy")
     with pytest.raises(InputError, match="a, b"):
@@ -136,7 +137,7 @@ def test_pickles_and_wrong_arrays_are_refused(tmp_path: Path) -> None:
 
 
 def test_frame_there_and_back() -> None:
-    frame = ScanFrame(0.01, rotation_to_z_up(axis_of("y")))
+    frame = ScanFrame(0.01, rotation_to_z_up(parse_axis("y")))
     points = np.random.default_rng(0).normal(size=(5, 3))
     np.testing.assert_allclose(frame.to_scan(frame.to_body(points)), points)
     np.testing.assert_allclose(frame.to_body(np.array([[0.0, 100.0, 0.0]])), [[0.0, 0.0, 1.0]])
@@ -152,10 +153,10 @@ def test_every_direction_becomes_z_by_a_rotation(up: list[float]) -> None:
 
 
 def test_people_with_y_up_look_along_z_and_z_up_stays() -> None:
-    assert np.array_equal(rotation_to_z_up(axis_of("z")), np.eye(3))
-    assert np.array_equal(rotation_to_z_up(axis_of("y")) @ [0, 0, 1], [1, 0, 0])
-    assert np.array_equal(axis_of("-x"), [-1, 0, 0])
-    assert len({tuple(axis_of(name)) for name in UP_NAMES}) == 6
+    assert np.array_equal(rotation_to_z_up(parse_axis("z")), np.eye(3))
+    assert np.array_equal(rotation_to_z_up(parse_axis("y")) @ [0, 0, 1], [1, 0, 0])
+    assert np.array_equal(parse_axis("-x"), [-1, 0, 0])
+    assert len({tuple(parse_axis(name)) for name in UP_AXES}) == 6
 
 
 @pytest.mark.parametrize("unit", [1.0, 0.01, 0.001])
@@ -168,7 +169,7 @@ def test_units_are_guessed_from_size(unit: float) -> None:
         guess_scale(Scan(cloud * 20))
 
 
-def test_closed_surface_of_no_usual_size_is_scaled_to_an_adult() -> None:
+def test_closed_surface_of_another_size_is_scaled_to_an_adult() -> None:
     scan = Scan(BOX * 7, BOX_FACES)
     assert scan.area is not None
     assert scan.area * guess_scale(scan) ** 2 == pytest.approx(1.8)
@@ -178,8 +179,8 @@ def test_up_is_the_long_side_and_open_when_two_are_alike() -> None:
     cloud = np.random.default_rng(0).uniform(0, 1, (500, 3))
 
     def names(sides: list[float], one_sided: bool) -> list[str]:
-        found = up_candidates(cloud * sides, one_sided)
-        return [next(name for name in UP_NAMES if np.array_equal(axis_of(name), up)) for up in found]
+        found = propose_up_axes(cloud * sides, one_sided)
+        return [next(name for name in UP_AXES if np.array_equal(parse_axis(name), up)) for up in found]
 
     assert names([0.5, 0.4, 1.7], False) == ["z"]
     assert names([0.5, 1.7, 0.4], False) == ["y"]
@@ -189,16 +190,16 @@ def test_up_is_the_long_side_and_open_when_two_are_alike() -> None:
 
 def test_people_who_lie_askew_have_their_length_among_the_directions() -> None:
     cloud = np.random.default_rng(0).normal(size=(500, 3)) * [0.5, 0.15, 0.1]
-    assert len(all_candidates(cloud)) == 6
+    assert len(propose_all_up_axes(cloud)) == 6
     turn = rotation_to_z_up(np.array([1.0, 1.0, 0.2])).T
-    askew = all_candidates(cloud[:, [1, 2, 0]] @ turn.T)
+    askew = propose_all_up_axes(cloud[:, [1, 2, 0]] @ turn.T)
     assert len(askew) == 8
     np.testing.assert_allclose(np.abs(askew[6] @ turn[:, 2]), 1, atol=0.01)
     np.testing.assert_allclose(askew[6], -askew[7])
 
 
 @pytest.mark.parametrize("count", [500, 6000])
-def test_one_side_is_told_from_a_whole_body_by_what_lies_behind(count: int) -> None:
+def test_a_single_view_differs_from_a_whole_body_by_what_lies_behind(count: int) -> None:
     rng = np.random.default_rng(0)
     normals = rng.normal(size=(count * 2, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -206,6 +207,6 @@ def test_one_side_is_told_from_a_whole_body_by_what_lies_behind(count: int) -> N
     body = normals * [0.15, 0.2, 0.85] + place
     front = body[(normals / [0.15, 0.2, 0.85] * body).sum(axis=1) < 0]
     noise = 0.005 * rng.normal(size=front.shape)
-    assert seen_from_origin(front + noise)
-    assert not seen_from_origin(body[:count])
-    assert not seen_from_origin(front - place)
+    assert is_seen_from_origin(front + noise)
+    assert not is_seen_from_origin(body[:count])
+    assert not is_seen_from_origin(front - place)

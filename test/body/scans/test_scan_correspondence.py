@@ -6,7 +6,7 @@ import pytest
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, two_way_distance
 from flowing_puppet_ros.body.scans.scan import Scan
-from flowing_puppet_ros.body.scans.scan_correspondence import closest_on_mesh, correspond
+from flowing_puppet_ros.body.scans.scan_correspondence import correspond, find_closest_on_mesh
 
 SHIFT = np.array([5.0, 0.0, 0.0])
 Ball = tuple[np.ndarray, np.ndarray, Cloud]
@@ -32,10 +32,10 @@ def sphere(rings: int = 12, sectors: int = 18) -> tuple[np.ndarray, np.ndarray]:
 def test_closest_point_equals_dense_search() -> None:
     vertices, faces = sphere()
     queries = np.random.default_rng(0).normal(size=(60, 3)) * 0.9
-    place = closest_on_mesh(queries, None, vertices, faces)
+    place = find_closest_on_mesh(queries, None, vertices, faces)
     assert np.all(place.barycentric >= -1e-12)
     np.testing.assert_allclose(place.barycentric.sum(axis=1), 1)
-    found = np.linalg.norm(place.points(vertices, faces) - queries, axis=1)
+    found = np.linalg.norm(place.interpolate(vertices, faces) - queries, axis=1)
     mix = np.random.default_rng(1).dirichlet(np.ones(3), 400)
     dense = np.einsum("mk,fkd->fmd", mix, vertices[faces]).reshape(-1, 3)
     brute = np.array([np.linalg.norm(dense - query, axis=1).min() for query in queries])
@@ -46,16 +46,16 @@ def test_closest_point_equals_dense_search() -> None:
 def test_large_faces_are_found_from_far_off_their_centres() -> None:
     vertices = np.array([[0, 0, 0], [10, 0, 0], [0, 10, 0], [0, 0, 0.3], [0.1, 0, 0.3], [0, 0.1, 0.3]], dtype=float)
     faces = np.array([[0, 1, 2], [3, 4, 5]])
-    place = closest_on_mesh(np.array([[9.5, 0.2, 0.05]]), None, vertices, faces)
-    np.testing.assert_allclose(place.points(vertices, faces)[0], [9.5, 0.2, 0.0], atol=1e-9)
+    place = find_closest_on_mesh(np.array([[9.5, 0.2, 0.05]]), None, vertices, faces)
+    np.testing.assert_allclose(place.interpolate(vertices, faces)[0], [9.5, 0.2, 0.0], atol=1e-9)
 
 
 def test_normals_choose_the_right_side_of_a_thin_plate() -> None:
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0.1], [1, 0, 0.1], [0, 1, 0.1]], dtype=float)
     faces = np.array([[0, 2, 1], [3, 4, 5]])
     query, down = np.array([[0.2, 0.2, 0.09]]), np.array([[0.0, 0.0, -1.0]])
-    assert closest_on_mesh(query, down, vertices, faces).face[0] == 0
-    assert closest_on_mesh(query, -down, vertices, faces).face[0] == 1
+    assert find_closest_on_mesh(query, down, vertices, faces).face[0] == 0
+    assert find_closest_on_mesh(query, -down, vertices, faces).face[0] == 1
 
 
 def test_of_two_near_faces_the_parallel_one_is_taken() -> None:
@@ -63,9 +63,9 @@ def test_of_two_near_faces_the_parallel_one_is_taken() -> None:
     wall = [[0.3, -1, -0.999], [0.3, 1, -0.999], [0.3, 0, 1.001]]
     vertices, faces = np.array(ledge + wall, dtype=float), np.array([[0, 1, 2], [3, 4, 5]])
     point, up, across = np.array([[0.297, 0.2, 0.0035]]), np.array([[0.0, 0.0, 2.0]]), np.array([[2.0, 0.0, 0.0]])
-    assert closest_on_mesh(point, None, vertices, faces).face[0] == 1
-    assert closest_on_mesh(point, up, vertices, faces).face[0] == 0
-    assert closest_on_mesh(point, across, vertices, faces).face[0] == 1
+    assert find_closest_on_mesh(point, None, vertices, faces).face[0] == 1
+    assert find_closest_on_mesh(point, up, vertices, faces).face[0] == 0
+    assert find_closest_on_mesh(point, across, vertices, faces).face[0] == 1
 
 
 def test_correspondence_follows_a_rigid_motion() -> None:
@@ -85,8 +85,8 @@ def test_correspondence_follows_a_rigid_motion() -> None:
 def test_closest_places_do_not_depend_on_the_unit(size: float) -> None:
     vertices, faces = sphere()
     points = np.random.default_rng(1).normal(size=(200, 3))
-    expected = closest_on_mesh(points, None, vertices, faces).points(vertices, faces)
-    found = closest_on_mesh(size * points, None, size * vertices, faces).points(size * vertices, faces)
+    expected = find_closest_on_mesh(points, None, vertices, faces).interpolate(vertices, faces)
+    found = find_closest_on_mesh(size * points, None, size * vertices, faces).interpolate(size * vertices, faces)
     np.testing.assert_allclose(found / size, expected, atol=1e-9)
 
 
@@ -125,7 +125,7 @@ def test_contradicting_normals_and_far_points_do_not_pull(ball: Ball) -> None:
     assert np.abs(far.matrix).sum() < 1e-3
 
 
-def test_only_the_seen_side_is_judged(ball: Ball) -> None:
+def test_only_the_seen_side_counts(ball: Ball) -> None:
     vertices, faces, _ = ball
     front = vertices[vertices[:, 0] > 0]
     one_sided = Cloud.of(front, front, viewpoint=np.array([50.0, 0.0, 0.0]))

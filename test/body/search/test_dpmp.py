@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Searches of some of the parts, their modes, and limbs hung on bodies."""
+"""Searches of some of the parts, their modes, and limbs attached to bodies."""
 
 import numpy as np
 import pytest
@@ -48,30 +48,30 @@ def test_parts_with_one_particle_stay_and_every_mode_holds_its_own_particle(
         parents = above.take(np.arange(12) % len(above))
         start[part] = Particles.join([start[part], proposer.attach_to_parent(part, parents, start[part].shape[0], rng)])
     none, stages = JointTargets.none(model), limb_stages(model.tree)
-    found = search.optimise(start, grid, none, stages, 2, rng, keep=5)
+    found = search.optimise(start, grid, none, stages, 2, rng, max_particles=5)
     others = np.setdiff1d(np.arange(16), leg)
     np.testing.assert_array_equal(found.state.center[others], body.center[others])
     np.testing.assert_array_equal(found.state.pose[others], body.pose[others])
     assert [len(group.particles) for group in found.scored] == [5 if part in leg else 1 for part in range(16)]
     foot = leg[-1]
-    modes = search.modes(found, foot)
+    modes = search.extract_modes(found, foot)
     np.testing.assert_array_equal([mode.center[foot] for mode in modes], found.scored[foot].particles.center)
     assert any(np.array_equal(mode.center, found.state.center) for mode in modes)
     # No body of other particles above the foot has less energy than the mode with that foot.
     for mode in modes[:2]:
-        least = search.energy(mode, grid)
+        lowest = search.energy(mode, grid)
         for thigh in range(5):
             other = mode.center.copy(), mode.rotation.copy(), mode.pose.copy(), mode.shape.copy()
             for values, own in zip(other, astuple(found.scored[leg[0]].particles, thigh), strict=True):
                 values[leg[0]][: len(own)] = own
-            assert search.energy(BodyState(*other), grid) >= least - 1e-9
+            assert search.energy(BodyState(*other), grid) >= lowest - 1e-9
 
 
 def astuple(particles: Particles, index: int) -> tuple[np.ndarray, ...]:
     return particles.center[index], particles.rotation[index], particles.pose[index], particles.shape[index]
 
 
-def test_hung_parts_turn_within_their_limits_about_their_interfaces(
+def test_attached_parts_rotate_within_their_limits_about_their_interfaces(
     model: StitchedPuppet, points: tuple[PartPoints, ...], body: BodyState
 ) -> None:
     group, part = states_to_particles(model, [body] * 200), model.tree.index("left_lower_arm")
@@ -86,16 +86,18 @@ def test_hung_parts_turn_within_their_limits_about_their_interfaces(
     assert inside[np.linalg.norm(turns, axis=1) < 3.1].all(axis=1).mean() > 0.95
     assert np.ptp(turns, axis=0).max() > 0.7 * (high - low).max()
     weight = model.interfaces[part - 1].weight
-    ends = [np.average(points[p].interfaces[part - 1].world(group[p]), axis=1, weights=weight) for p in (above, part)]
+    ends = [
+        np.average(points[p].interfaces[part - 1].to_world(group[p]), axis=1, weights=weight) for p in (above, part)
+    ]
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
 
 
-def test_usual_limbs_have_the_mean_of_their_gaussians(
+def test_limbs_at_the_mean_have_the_mean_of_their_gaussians(
     model: StitchedPuppet, points: tuple[PartPoints, ...], search: BodyParticleSearch, body: BodyState
 ) -> None:
     arm = limb_groups(model.tree)[3]
-    usual = LimbSearch(model, search, Proposer(model, points)).mean_limb(body, arm)
-    group, meshes = states_to_particles(model, [usual]), model.parts(usual)
+    at_mean = LimbSearch(model, search, Proposer(model, points)).pose_limb_at_mean(body, arm)
+    group, meshes = states_to_particles(model, [at_mean]), model.parts(at_mean)
     for part in arm:
         above, mean, interface = model.tree.parents[part], model.pairwise[part - 1].mean, model.interfaces[part - 1]
         np.testing.assert_allclose(so3.log(relative(model, group, part))[0], mean[:3], atol=1e-9)
@@ -103,5 +105,5 @@ def test_usual_limbs_have_the_mean_of_their_gaussians(
         ends = meshes[above][interface.parent_index], meshes[part][interface.child_index]
         np.testing.assert_allclose(ends[0].mean(axis=0), ends[1].mean(axis=0), atol=1e-9)
     others = np.setdiff1d(np.arange(16), arm)
-    np.testing.assert_array_equal(usual.center[others], body.center[others])
-    assert not np.array_equal(usual.center[arm[1]], body.center[arm[1]])
+    np.testing.assert_array_equal(at_mean.center[others], body.center[others])
+    assert not np.array_equal(at_mean.center[arm[1]], body.center[arm[1]])

@@ -8,7 +8,7 @@ from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.levenberg import (
     CONTRADICTING_WEIGHT,
-    POSE_PRIOR,
+    POSE_PRIOR_WEIGHT,
     assemble,
     levenberg_marquardt,
     prepare_part,
@@ -49,7 +49,7 @@ def test_marquardt_brings_a_part_back_to_its_surface(model: StitchedPuppet, poin
     assert np.array_equal(still.center, moved.center)
 
 
-def test_marquardt_follows_believed_joints(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> None:
+def test_marquardt_follows_joint_targets(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> None:
     mesh = model.parts(model.rest_state())[UPPER_LEG]
     part = PartPointsOf(model, UPPER_LEG, mesh)
     start = copies(model, 1)[UPPER_LEG]
@@ -59,7 +59,7 @@ def test_marquardt_follows_believed_joints(model: StitchedPuppet, points: tuple[
     weight[knee] = 100.0
     pulled = levenberg_marquardt(points[UPPER_LEG], start, part.grid, JointTargets(goal, weight), 15, 60)
     row = points[UPPER_LEG].joint_index.tolist().index(knee)
-    np.testing.assert_allclose(points[UPPER_LEG].joints.world(pulled)[0, row], goal[knee], atol=0.01)
+    np.testing.assert_allclose(points[UPPER_LEG].joints.to_world(pulled)[0, row], goal[knee], atol=0.01)
 
 
 class PartPointsOf:
@@ -72,7 +72,9 @@ class PartPointsOf:
 
     def cost(self, points: tuple[PartPoints, ...], particles: Particles) -> np.ndarray:
         own = points[self._part]
-        return self.grid.data_cost(own.surface.world(particles), own.normals @ particles.rotation.transpose(0, 2, 1))[0]
+        return self.grid.data_cost(
+            own.surface.to_world(particles), own.normals @ particles.rotation.transpose(0, 2, 1)
+        )[0]
 
 
 def test_marquardt_s_normal_equations_equal_finite_differences(
@@ -85,10 +87,10 @@ def test_marquardt_s_normal_equations_equal_finite_differences(
     goal, belief = rng.normal(size=(len(own.joints), 3)), rng.random(len(own.joints))
 
     def world(unknowns: np.ndarray) -> np.ndarray:
-        turned = body.rotation[0] @ so3.exp(unknowns[:3])
+        rotation = body.rotation[0] @ so3.exp(unknowns[:3])
         center = body.center + unknowns[3:6] @ body.rotation[0].T
-        moved = Particles(center, turned[None], body.pose + unknowns[6:], body.shape)
-        return np.concatenate([own.surface.world(moved)[0], own.joints.world(moved)[0]])
+        moved = Particles(center, rotation[None], body.pose + unknowns[6:], body.shape)
+        return np.concatenate([own.surface.to_world(moved)[0], own.joints.to_world(moved)[0]])
 
     zero, count = np.zeros(6 + body.pose.shape[1]), len(own.surface)
     found = [look_up(part.grid.nearest, part.grid.origin, part.grid.cell, *point) for point in world(zero)[:count]]
@@ -99,15 +101,15 @@ def test_marquardt_s_normal_equations_equal_finite_differences(
     jacobian = np.stack([(world(e) - world(-e)).ravel() / 2e-6 for e in 1e-6 * np.eye(len(zero))], axis=1)
     hessian, gradient = (jacobian.T * weight) @ jacobian, (jacobian.T * weight) @ residual.ravel()
     cost = 0.5 * (weight * residual.ravel() ** 2).sum()
-    hessian[6:, 6:] += POSE_PRIOR * np.eye(len(zero) - 6)
-    gradient[6:] += POSE_PRIOR * body.pose[0]
+    hessian[6:, 6:] += POSE_PRIOR_WEIGHT * np.eye(len(zero) - 6)
+    gradient[6:] += POSE_PRIOR_WEIGHT * body.pose[0]
 
     prepared = prepare_part(own, body, JointTargets(*belief_of(model, own, goal, belief)), count)
     found_hessian, found_gradient = np.ones_like(hessian), np.ones_like(gradient)
     state = body.center[0], body.rotation[0], body.pose[0]
     grid = (part.grid.points, part.grid.normals, part.grid.nearest, part.grid.origin, part.grid.cell)
     value = assemble(*state, prepared[0][0], prepared[1], grid, found_hessian, found_gradient)
-    assert value == pytest.approx(cost + 0.5 * POSE_PRIOR * (body.pose**2).sum())
+    assert value == pytest.approx(cost + 0.5 * POSE_PRIOR_WEIGHT * (body.pose**2).sum())
     lower = np.tril_indices(len(zero))
     np.testing.assert_allclose(found_hessian[lower], hessian[lower], rtol=1e-5, atol=1e-8)
     np.testing.assert_allclose(found_gradient, gradient, rtol=1e-5, atol=1e-8)
@@ -116,7 +118,7 @@ def test_marquardt_s_normal_equations_equal_finite_differences(
 def belief_of(
     model: StitchedPuppet, own: PartPoints, goal: np.ndarray, belief: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Targets and weights of all joints where only a part's own are believed."""
+    """Targets and weights of all joints where only those of a part have weight."""
     places, weight = np.zeros((len(model.joint_names), 3)), np.zeros(len(model.joint_names))
     places[own.joint_index], weight[own.joint_index] = goal, belief
     return places, weight

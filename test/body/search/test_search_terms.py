@@ -6,7 +6,7 @@ import pytest
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import farthest_points, vertex_normals
-from flowing_puppet_ros.body.fit.initialisation import body_from_joints, flip_heading, joint_targets
+from flowing_puppet_ros.body.fit.initialisation import body_from_joints, flip_heading, make_joint_targets
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles, stitching_costs
 from flowing_puppet_ros.body.search.part_points import PartPoints
@@ -43,14 +43,14 @@ def test_points_of_parts_equal_the_model(model: StitchedPuppet, points: tuple[Pa
     meshes, joints = model.parts(body), model.joints(model.vertices(model.rest_state()))
     rest = states_to_particles(model, [model.rest_state()])
     for part, group in enumerate(states_to_particles(model, [body])):
-        surface = points[part].surface.world(group)[0]
+        surface = points[part].surface.to_world(group)[0]
         distance = np.linalg.norm(surface[:, None] - meshes[part], axis=2).min(axis=1)
         assert distance.max() < 1e-9
-        own = points[part].joints.world(rest[part])[0]
+        own = points[part].joints.to_world(rest[part])[0]
         np.testing.assert_allclose(own, joints[points[part].joint_index], atol=1e-6)
     for edge, (parent, child) in enumerate(model.tree.edges):
         interface = model.interfaces[edge]
-        at_child = points[child].interfaces[edge].world(states_to_particles(model, [body])[child])[0]
+        at_child = points[child].interfaces[edge].to_world(states_to_particles(model, [body])[child])[0]
         np.testing.assert_allclose(at_child, meshes[child][interface.child_index])
         assert parent == model.tree.parents[child]
 
@@ -74,17 +74,17 @@ def test_normals_of_the_template_point_outward(model: StitchedPuppet) -> None:
     assert (np.cross(moved[:, 0], moved[:, 1]) * moved[:, 2]).sum() / 6 > volume + 0.01
 
 
-def test_judged_particles_survive_taking_and_joining(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> None:
+def test_scored_particles_survive_taking_and_joining(model: StitchedPuppet, points: tuple[PartPoints, ...]) -> None:
     rng = np.random.default_rng(0)
     group = Proposer(model, points).random_walk(copies(model, 6)[UPPER_LEG], WalkNoise(0.1, 0.3, 1.0, 1.0), rng)
     vertices = model.vertices(model.rest_state())
     grid = CloudGrid.build(vertices, vertex_normals(vertices, model.faces))
     targets = JointTargets(np.zeros((len(model.joint_names), 3)), np.ones(len(model.joint_names)))
-    whole = ScoredParticles.judge(points[UPPER_LEG], group, grid, targets)
+    whole = ScoredParticles.score(points[UPPER_LEG], group, grid, targets)
     order = np.array([4, 0, 5, 1])
     again = whole.take(order[:2]).extend(whole.take(order[2:]))
-    direct = ScoredParticles.judge(points[UPPER_LEG], group.take(order), grid, targets)
-    for name in ("distance", "mismatch", "pull"):
+    direct = ScoredParticles.score(points[UPPER_LEG], group.take(order), grid, targets)
+    for name in ("distance", "mismatch", "joint_cost"):
         np.testing.assert_allclose(getattr(again, name), getattr(direct, name))
     for edge, interface in direct.interfaces.items():
         np.testing.assert_allclose(again.interfaces[edge], interface)
@@ -97,10 +97,10 @@ def test_conditional_samples_have_the_gaussian_s_moments() -> None:
     factor = rng.normal(size=(5, 5))
     joint = Gaussian(rng.normal(size=5), factor @ factor.T)
     kept, given, values = np.array([1, 3]), np.array([0, 4]), np.array([0.5, -1.0])
-    drawn = Conditional.of(joint, kept, given).sample(rng, np.tile(values, (40000, 1)))
+    sampled = Conditional.of(joint, kept, given).sample(rng, np.tile(values, (40000, 1)))
     exact = joint.condition(kept, given, values)
-    np.testing.assert_allclose(drawn.mean(axis=0), exact.mean, atol=0.05)
-    np.testing.assert_allclose(np.cov(drawn.T), exact.covariance, atol=0.05 * np.abs(exact.covariance).max())
+    np.testing.assert_allclose(sampled.mean(axis=0), exact.mean, atol=0.05)
+    np.testing.assert_allclose(np.cov(sampled.T), exact.covariance, atol=0.05 * np.abs(exact.covariance).max())
 
 
 def test_neighbours_propose_parts_that_are_stitched_to_them(
@@ -109,13 +109,13 @@ def test_neighbours_propose_parts_that_are_stitched_to_them(
     vertices = model.vertices(model.rest_state())
     grid = CloudGrid.build(vertices, vertex_normals(vertices, model.faces))
     none = JointTargets.none(model)
-    judged = [ScoredParticles.judge(p, group, grid, none) for p, group in zip(points, copies(model, 12), strict=True)]
+    scored = [ScoredParticles.score(p, group, grid, none) for p, group in zip(points, copies(model, 12), strict=True)]
     proposer, noise = Proposer(model, points), WalkNoise(0.04, 0.25, 0.5, 0.3)
-    new = proposer.propose(UPPER_LEG, judged, noise, 1.0, np.random.default_rng(0))
+    new = proposer.propose(UPPER_LEG, scored, noise, 1.0, np.random.default_rng(0))
     assert len(new) == 12
-    moved = ScoredParticles.judge(points[UPPER_LEG], new, grid, none)
+    moved = ScoredParticles.score(points[UPPER_LEG], new, grid, none)
     gaps = [
-        np.linalg.norm(moved.interfaces[edge] - judged[other].interfaces[edge][:1], axis=2).mean(axis=1)
+        np.linalg.norm(moved.interfaces[edge] - scored[other].interfaces[edge][:1], axis=2).mean(axis=1)
         for edge, other in (
             (UPPER_LEG - 1, 0),
             (model.tree.children(UPPER_LEG)[0] - 1, model.tree.children(UPPER_LEG)[0]),
@@ -134,7 +134,7 @@ def test_states_and_particles_are_inverse(model: StitchedPuppet) -> None:
         np.testing.assert_array_equal(getattr(back, name), getattr(bodies[2], name))
 
 
-def test_turning_around_twice_changes_places_back(model: StitchedPuppet) -> None:
+def test_flipping_the_heading_twice_restores_the_body(model: StitchedPuppet) -> None:
     body = model.sample(np.random.default_rng(0))
     once = flip_heading(model, body)
     hand, other = model.tree.index("left_hand"), model.tree.index("right_hand")
@@ -156,7 +156,7 @@ def test_stages_end_with_all_parts_counting(model: StitchedPuppet) -> None:
 
 
 def squatting(model: StitchedPuppet) -> dict[str, np.ndarray]:
-    """Joints of nobody in particular: knees and elbows bent at right angles, longer limbs than the template's."""
+    """Joints of an invented person: knees and elbows bent at right angles, longer limbs than the template's."""
     joints = dict(zip(model.joint_names, model.joints(model.vertices(model.rest_state())), strict=True))
     for side, sign in (("left", 1.0), ("right", -1.0)):
         joints[f"{side}_knee"] = joints[f"{side}_hip"] + 0.45 * np.array([0.8, 0.3 * sign, -0.5])
@@ -171,7 +171,7 @@ def squatting(model: StitchedPuppet) -> dict[str, np.ndarray]:
 def test_body_is_placed_on_joints(model: StitchedPuppet) -> None:
     turn, shift = so3.exp(np.array([0.0, 0.0, 2.5])), np.array([3.0, 1.0, 0.5])
     goal = {name: turn @ at + shift for name, at in squatting(model).items()}
-    targets = joint_targets(model, {name: (at[0], at[1], at[2], 1.0) for name, at in goal.items()})
+    targets = make_joint_targets(model, {name: (at[0], at[1], at[2], 1.0) for name, at in goal.items()})
     body = body_from_joints(model, GaussNewton(model), targets)
     found = dict(zip(model.joint_names, model.joints(model.vertices(body)), strict=True))
     errors = {name: np.linalg.norm(found[name] - at) for name, at in goal.items()}
@@ -181,7 +181,7 @@ def test_body_is_placed_on_joints(model: StitchedPuppet) -> None:
 
 def test_too_few_joints_are_refused(model: StitchedPuppet) -> None:
     with pytest.raises(InputError, match="1 of the 3"):
-        joint_targets(model, {"neck": (0, 0, 0, 1), "face": (np.nan, 0, 0, 1), "wing": (0, 0, 0, 1)})
+        make_joint_targets(model, {"neck": (0, 0, 0, 1), "face": (np.nan, 0, 0, 1), "wing": (0, 0, 0, 1)})
 
 
 def test_a_trunk_on_a_line_faces_where_the_limbs_say(model: StitchedPuppet) -> None:
@@ -191,21 +191,21 @@ def test_a_trunk_on_a_line_faces_where_the_limbs_say(model: StitchedPuppet) -> N
     rest = dict(zip(model.joint_names, model.joints(model.vertices(model.rest_state())), strict=True))
     goal = {name: at for name, at in goal.items() if name != "face"} | {name: turn @ rest[name] for name in spine}
     body = body_from_joints(
-        model, GaussNewton(model), joint_targets(model, {name: (*at, 1.0) for name, at in goal.items()})
+        model, GaussNewton(model), make_joint_targets(model, {name: (*at, 1.0) for name, at in goal.items()})
     )
     assert (body.rotation[0] @ [1, 0, 0]) @ (turn @ [1, 0, 0]) > 0.9
     with pytest.raises(InputError, match="on a line"):
-        joint_targets(model, {name: (0, 0, float(k), 1) for k, name in enumerate((*spine, "face"))})
+        make_joint_targets(model, {name: (0, 0, float(k), 1) for k, name in enumerate((*spine, "face"))})
 
 
-def test_finish_draws_a_disturbed_body_to_the_surface_of_another_shape(model: StitchedPuppet) -> None:
+def test_gauss_newton_moves_a_perturbed_body_to_the_surface_of_another_shape(model: StitchedPuppet) -> None:
     rng = np.random.default_rng(2)
     truth = model.sample(rng, shape_scale=1.0, pose_scale=0.5)
     vertices = model.vertices(truth)
     cloud = Cloud.of(vertices, vertex_normals(vertices, model.faces))
     center = truth.center + rng.normal(0, 0.02, truth.center.shape)
-    turned = so3.exp(rng.normal(0, 0.1, (16, 3))) @ truth.rotation
-    start = BodyState(center, turned, np.zeros_like(truth.pose), np.zeros_like(truth.shape))
+    rotation = so3.exp(rng.normal(0, 0.1, (16, 3))) @ truth.rotation
+    start = BodyState(center, rotation, np.zeros_like(truth.pose), np.zeros_like(truth.shape))
     refined = GaussNewton(model).run(start, cloud, JointTargets.none(model), RefineWeights())
     before = np.linalg.norm(model.vertices(start) - vertices, axis=1).mean()
     after = np.linalg.norm(model.vertices(refined) - vertices, axis=1).mean()

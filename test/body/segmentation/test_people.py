@@ -47,10 +47,10 @@ def test_two_people_among_furniture_are_found_and_nothing_else(person: np.ndarra
     found = segment_people(scene, -scene, SETTINGS, np.array([0.0, -4.0, 1.0]))
     assert len(found) == 2
     for cloud in found:
-        whose = truth[cloud.rows]
-        owner = np.bincount(whose[whose >= 0]).argmax()
-        assert (whose == owner).mean() > 0.97
-        assert (whose == owner).sum() > 0.97 * (person[:, 2] > 0.1).sum()
+        bodies = truth[cloud.rows]
+        owner = np.bincount(bodies[bodies >= 0]).argmax()
+        assert (bodies == owner).mean() > 0.97
+        assert (bodies == owner).sum() > 0.97 * (person[:, 2] > 0.1).sum()
         assert np.array_equal(cloud.points, scene[cloud.rows])
         assert cloud.normals is not None and np.array_equal(cloud.normals, -cloud.points)
     again = segment_people(scene, None, SETTINGS, np.array([0.0, -4.0, 1.0]))
@@ -58,7 +58,7 @@ def test_two_people_among_furniture_are_found_and_nothing_else(person: np.ndarra
     assert len(segment_people(scene, None, SegmentationSettings(max_people=1), np.array([0.0, -4.0, 1.0]))) == 1
 
 
-def test_an_empty_room_holds_nobody() -> None:
+def test_an_empty_room_has_no_people() -> None:
     scene = room(np.random.default_rng(1))
     assert segment_people(scene, None, SETTINGS, np.array([0.0, -4.0, 1.0])) == []
     assert segment_people(scene, None, SETTINGS) == []
@@ -67,7 +67,7 @@ def test_an_empty_room_holds_nobody() -> None:
 def test_a_person_alone_stays_whole_wherever_the_origin_is(person: np.ndarray) -> None:
     for place in (np.zeros(3), np.array([5e5, 5.5e6, 300.0])):
         (cloud,) = segment_people(person + place, None, SETTINGS)
-        assert len(cloud.rows) == len(person)
+        assert len(cloud.points) == len(person)
         assert cloud.score > 0.8
 
 
@@ -77,11 +77,11 @@ def test_rings_far_away_stay_together(person: np.ndarray) -> None:
     direction = seen / np.linalg.norm(seen, axis=1, keepdims=True)
     ring = np.abs(np.degrees(direction[:, 2]) % 0.6 - 0.3) < 0.06
     (cloud,) = segment_people(seen[ring], None, SETTINGS, np.zeros(3))
-    assert len(cloud.rows) > 0.95 * ring.sum()
-    assert segment_people(seen[ring], None, SegmentationSettings(reach=8.0), np.zeros(3)) == []
+    assert len(cloud.points) > 0.95 * ring.sum()
+    assert segment_people(seen[ring], None, SegmentationSettings(max_range=8.0), np.zeros(3)) == []
 
 
-def test_nothing_in_gives_nobody_and_wrong_shapes_are_refused(person: np.ndarray) -> None:
+def test_no_points_give_no_people_and_wrong_shapes_are_refused(person: np.ndarray) -> None:
     assert segment_people(np.empty((0, 3)), None, SETTINGS) == []
     assert segment_people(np.full((500, 3), np.nan), None, SETTINGS) == []
     assert segment_people(np.zeros((500, 3)), None, SETTINGS) == []

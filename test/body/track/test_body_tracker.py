@@ -7,15 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.body.synthetic_scans import Scene, surface_samples, whole_scan
+from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, sample_surface, scan_whole
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 FRAME = 50_000_000  # nanoseconds
-SETTINGS = BodyTrackerSettings(track_points=1500)
+SETTINGS = BodyTrackerSettings(max_points=1500)
 
 
 class _KnowingFitter(BodyFitter):
@@ -32,10 +33,10 @@ class _KnowingFitter(BodyFitter):
         viewpoint: np.ndarray | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
-        own_surface: bool = True,
+        nonrigid: bool = True,
         quick: bool = False,
     ) -> BodyFit:
-        return self.result(self.truth, self.cloud(points, normals, viewpoint))
+        return self.assess(self.truth, self.prepare_cloud(points, normals, viewpoint))
 
 
 @pytest.fixture(scope="module")
@@ -61,8 +62,18 @@ def _cloud(
     model: StitchedPuppet, state: BodyState, seed: int = 0, noise: float = 0.003
 ) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    points, normals = surface_samples(model.vertices(state), model.faces, rng, 1500)
+    points, normals = sample_surface(model.vertices(state), model.faces, rng, 1500)
     return points + noise * rng.standard_normal(points.shape), normals
+
+
+def _step(
+    tracker: BodyTracker,
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    stamp: int,
+    viewpoint: np.ndarray | None = None,
+) -> BodyFit:
+    return tracker.track_or_refit(PersonCloud(points, normals, stamp, viewpoint))
 
 
 def _error(fitter: BodyFitter, fit: BodyFit, truth: BodyState) -> float:
@@ -74,11 +85,12 @@ def test_a_walk_is_followed_without_searching(fitter: _KnowingFitter, person: Bo
     fitter.truth = _at(person, 0)
     for frame in range(6):
         truth = _at(person, frame)
-        fit = tracker.track_or_refit(*_cloud(fitter.model, truth, frame), frame * FRAME)
+        fit = _step(tracker, *_cloud(fitter.model, truth, frame), frame * FRAME)
         assert _error(fitter, fit, truth) < 0.012
     assert tracker.counters == {"searched": 1, "tracked": 5}
 
 
+@pytest.mark.slow
 def test_motion_goes_on_at_its_velocity(fitter: _KnowingFitter, person: BodyState) -> None:
     """At 25 cm a frame the last body is too far to start from; the extrapolated one is not."""
     moving, standing = BodyTracker(fitter, SETTINGS), BodyTracker(fitter, SETTINGS)
@@ -86,25 +98,26 @@ def test_motion_goes_on_at_its_velocity(fitter: _KnowingFitter, person: BodyStat
     for tracker, frames in ((moving, (0, 0.2, 0.6, 1.2, 2.0, 3.0, 4.0)), (standing, (0, 0, 0, 0, 0, 0, 4.0))):
         for count, frame in enumerate(frames):
             truth = _at(person, frame, speed=0.25)
-            fit = tracker.track_or_refit(*_cloud(fitter.model, truth, count), count * FRAME)
+            fit = _step(tracker, *_cloud(fitter.model, truth, count), count * FRAME)
         if tracker is moving:
             assert _error(fitter, fit, truth) < 0.015
     assert moving.counters["searched"] == 1
     assert standing.counters["widened"] == 1
 
 
+@pytest.mark.slow
 def test_a_lost_person_is_searched_for(fitter: _KnowingFitter, person: BodyState) -> None:
     tracker = BodyTracker(fitter, SETTINGS)
     fitter.truth = person
     for frame in range(3):
-        tracker.track_or_refit(*_cloud(fitter.model, person, frame), frame * FRAME)
+        _step(tracker, *_cloud(fitter.model, person, frame), frame * FRAME)
     elsewhere = replace(person, center=person.center + np.array([3.0, -2.0, 0.0]))
     fitter.truth = elsewhere
-    fit = tracker.track_or_refit(*_cloud(fitter.model, elsewhere), 3 * FRAME)
+    fit = _step(tracker, *_cloud(fitter.model, elsewhere), 3 * FRAME)
     assert _error(fitter, fit, elsewhere) < 0.012
     assert tracker.counters["searched"] == 2
     # The jump is no velocity.
-    fit = tracker.track_or_refit(*_cloud(fitter.model, elsewhere), 4 * FRAME)
+    fit = _step(tracker, *_cloud(fitter.model, elsewhere), 4 * FRAME)
     assert _error(fitter, fit, elsewhere) < 0.012
     assert tracker.counters["searched"] == 2
 
@@ -113,8 +126,8 @@ def test_a_lost_person_is_searched_for(fitter: _KnowingFitter, person: BodyState
 def test_time_that_jumps_back_starts_a_new_track(fitter: _KnowingFitter, person: BodyState, stamp: int) -> None:
     tracker = BodyTracker(fitter, SETTINGS)
     fitter.truth = person
-    tracker.track_or_refit(*_cloud(fitter.model, person), 0)
-    tracker.track_or_refit(*_cloud(fitter.model, person), stamp)
+    _step(tracker, *_cloud(fitter.model, person), 0)
+    _step(tracker, *_cloud(fitter.model, person), stamp)
     assert tracker.counters["searched"] == 2
 
 
@@ -122,18 +135,18 @@ def test_a_person_is_found_again_after_a_gap(fitter: _KnowingFitter, person: Bod
     """As after the first search of a live stream: seconds later, somewhere else, in about the same pose."""
     tracker = BodyTracker(fitter, SETTINGS)
     fitter.truth = person
-    tracker.track_or_refit(*_cloud(fitter.model, person), 0)
+    _step(tracker, *_cloud(fitter.model, person), 0)
     later = _at(replace(person, center=person.center + np.array([0.5, -1.5, 0.0])), 4)
-    fit = tracker.track_or_refit(*_cloud(fitter.model, later), 80 * FRAME)
+    fit = _step(tracker, *_cloud(fitter.model, later), 80 * FRAME)
     assert _error(fitter, fit, later) < 0.012
     assert tracker.counters["searched"] == 1
 
 
 def test_a_wrong_search_does_not_replace_a_better_track(fitter: _KnowingFitter, person: BodyState) -> None:
-    tracker = BodyTracker(fitter, BodyTrackerSettings(track_points=1500, track_lost_ratio=1.0, track_lost_distance=0.0))
+    tracker = BodyTracker(fitter, BodyTrackerSettings(max_points=1500, lost_ratio=1.0, lost_distance=0.0))
     fitter.truth = person
     for frame in range(4):
-        fit = tracker.track_or_refit(*_cloud(fitter.model, person, frame, noise=0.002 * frame), frame * FRAME)
+        fit = _step(tracker, *_cloud(fitter.model, person, frame, noise=0.002 * frame), frame * FRAME)
         fitter.truth = _at(person, 30)
         assert _error(fitter, fit, person) < 0.015
     assert tracker.counters["searched"] > 1
@@ -150,7 +163,7 @@ def test_shape_is_learned_over_one_sided_frames(fitter: _KnowingFitter, person: 
         eye = middle + 3 * np.array([np.cos(angle), np.sin(angle), 0.0])
         points, normals = _cloud(model, person, frame)
         near = ((eye - points) * normals).sum(axis=1) > 0
-        fit = tracker.track_or_refit(points[near], normals[near], frame * FRAME, eye)
+        fit = _step(tracker, points[near], normals[near], frame * FRAME, eye)
         shapes.append(fit.state.shape[0])
     error = np.linalg.norm(np.array(shapes)[:, :3] - person.shape[0, :3], axis=1)
     assert error[-1] < 0.5 * error[0]
@@ -163,7 +176,7 @@ def test_the_same_clouds_give_the_same_bytes(fitter: _KnowingFitter, person: Bod
         tracker = BodyTracker(fitter, SETTINGS)
         fitter.truth = person
         for frame in range(3):
-            fit = tracker.track_or_refit(*_cloud(fitter.model, _at(person, frame), frame), frame * FRAME)
+            fit = _step(tracker, *_cloud(fitter.model, _at(person, frame), frame), frame * FRAME)
         return fit.vertices.tobytes()
 
     assert run() == run()
@@ -178,10 +191,10 @@ def test_a_bad_cloud_is_named_and_the_track_goes_on(
     tracker = BodyTracker(fitter, SETTINGS)
     fitter.truth = person
     points, normals = _cloud(fitter.model, person)
-    tracker.track_or_refit(points, normals, 0)
+    _step(tracker, points, normals, 0)
     with pytest.raises(InputError):
-        tracker.track_or_refit(spoil(points), None, FRAME)
-    tracker.track_or_refit(points, normals, 2 * FRAME)
+        _step(tracker, spoil(points), None, FRAME)
+    _step(tracker, points, normals, 2 * FRAME)
     assert tracker.counters == {"searched": 1, "tracked": 1}
 
 
@@ -191,6 +204,8 @@ def test_clouds_without_normals_are_tracked(fitter: _KnowingFitter, person: Body
     model = fitter.model
     for frame in range(3):
         truth = _at(person, frame)
-        scan = whole_scan(Scene(model.vertices(truth), model.faces), np.random.default_rng(frame), 1500, noise=0.003)
-        fit = tracker.track_or_refit(scan.points, None, frame * FRAME)
+        scan = scan_whole(
+            RaycastScene(model.vertices(truth), model.faces), np.random.default_rng(frame), 1500, noise=0.003
+        )
+        fit = _step(tracker, scan.points, None, frame * FRAME)
         assert _error(fitter, fit, truth) < 0.015

@@ -19,20 +19,22 @@ from distributed import Client
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.cli import main
-from flowing_puppet_ros.cli.batch.cluster import on_cluster
-from flowing_puppet_ros.cli.batch.processes import in_processes
-from flowing_puppet_ros.cli.batch.task import Task
+from flowing_puppet_ros.cli.batch.cluster import run_on_cluster
+from flowing_puppet_ros.cli.batch.processes import run_in_processes
+from flowing_puppet_ros.cli.batch.task import BatchTask
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
-FAST = ["--particles", "4", "--iterations", "2", "--restarts", "0", "--limb-rounds", "0", "--lm-steps", "1"]
-FAST += ["--refine-iterations", "3", "--cloud-points", "800", "--no-surface-finish", "--up", "z", "--unit", "m"]
-BAGS = 8
+pytestmark = pytest.mark.slow
+
+FAST = ["--particles", "4", "--iterations", "2", "--restarts", "0", "--max-limb-repairs", "0", "--levenberg-steps", "1"]
+FAST += ["--gauss-newton-steps", "3", "--max-points", "800", "--no-nonrigid", "--up", "z", "--unit", "m"]
+BAGS = 5
 ROOT = Path(__file__).resolve().parents[3]
 GOLDEN = ROOT / "bags" / "golden" / "golden.mcap"
 
 
 def write_scans(folder: Path, count: int) -> Path:
-    """Clouds of one standing person in other places, and one without a point."""
+    """Write clouds of one standing person at several places, and one without a point."""
     folder.mkdir()
     model = StitchedPuppet.load()
     vertices = model.vertices(model.rest_state())
@@ -43,7 +45,7 @@ def write_scans(folder: Path, count: int) -> Path:
 
 
 def write_bags(folder: Path, names: Sequence[str]) -> Path:
-    """Bags of the first camera of the golden bag, one like the other."""
+    """Write identical bags of the first camera of the golden bag."""
     folder.mkdir()
     with open_bag(GOLDEN) as bag, BagWriter(folder / f"{names[0]}.mcap") as writer:
         topics = [name for name in bag.topics if name.startswith("/cam1/")]
@@ -57,14 +59,14 @@ def write_bags(folder: Path, names: Sequence[str]) -> Path:
 
 
 def run(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, list[dict[str, Any]], str]:
-    """Exit status, the JSON objects and what was said on stderr."""
+    """Return the exit status, the JSON objects and the text on stderr."""
     status = main([*map(str, words), "--json"])
     output = capsys.readouterr()
     return status, [json.loads(line) for line in output.out.splitlines()], output.err
 
 
 def contents(folder: Path) -> dict[str, Any]:
-    """Every result in a folder; of a fit all but the time that it took."""
+    """Return every result in a folder; of a fit, all but its time."""
     found: dict[str, Any] = {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix != ".npz"}
     for path in folder.glob("*.npz"):
         with np.load(path) as arrays:
@@ -142,7 +144,7 @@ def test_unusable_arguments_are_one_sentence(
     words: list[str], sentence: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("flowing_puppet_ros.cli.batch.cluster.REACH_SECONDS", 1.0)
+    monkeypatch.setattr("flowing_puppet_ros.cli.batch.cluster.CONNECT_TIMEOUT_S", 1.0)
     (tmp_path / "empty").mkdir()
     np.savez(tmp_path / "scan.npz", points=np.zeros((9, 3)))
     assert main(words) == 2
@@ -151,8 +153,8 @@ def test_unusable_arguments_are_one_sentence(
 
 def test_a_process_that_dies_takes_no_other_input_with_it(tmp_path: Path) -> None:
     names = ["a", "dies", "b", "unusable", "dies_once", "broken", "c"]
-    tasks = [Task(work, tmp_path / "inputs" / name, Plan(tmp_path)) for name in names]
-    answers = dict(in_processes(tasks, 2))
+    tasks = [BatchTask(work, tmp_path / "inputs" / name, Plan(tmp_path)) for name in names]
+    answers = dict(run_in_processes(tasks, 2))
     assert sorted(answers) == list(range(len(names)))
     errors = {names[index]: found.error for index, found in answers.items() if found.error}
     assert set(errors) == {"dies", "unusable", "broken"}
@@ -165,7 +167,7 @@ def test_a_process_that_dies_takes_no_other_input_with_it(tmp_path: Path) -> Non
 
 @contextmanager
 def started(*words: str | Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A program that is killed at the end."""
+    """Start a program that is killed at the end."""
     paths = os.pathsep.join([str(ROOT / "test" / "helpers"), *filter(None, [os.environ.get("PYTHONPATH")])])
     environment = os.environ | {"PYTHONPATH": paths, "NUMBA_NUM_THREADS": "1"}
     command = [sys.executable, "-m", *map(str, words)]
@@ -186,7 +188,7 @@ def wait(holds: Callable[[], bool], seconds: float = 120.0) -> None:
 
 @contextmanager
 def cluster(place: Path) -> Iterator[str]:
-    """The address of a scheduler without workers, which is written down at `place`."""
+    """Start a scheduler without workers that writes its address to `place`; return the address."""
     options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", place)
     with started("dask", "scheduler", *options):
         wait(lambda: place.exists() and place.read_text().endswith("}"))
@@ -194,7 +196,7 @@ def cluster(place: Path) -> Iterator[str]:
 
 
 def worker(place: Path) -> AbstractContextManager[subprocess.Popen[bytes]]:
-    """A worker of the scheduler that is written down at `place`."""
+    """Start a worker of the scheduler whose address is at `place`."""
     local = ("--host", "127.0.0.1", "--no-dashboard", "--scheduler-file", place)
     return started("dask", "worker", "--nthreads", "1", "--no-nanny", *local)
 
@@ -217,10 +219,10 @@ def test_all_results_arrive_although_a_worker_is_killed(tmp_path: Path) -> None:
 
 def test_results_that_die_with_their_worker_are_made_again(tmp_path: Path) -> None:
     names = [f"leaves_a_mark{k}" for k in range(6)]
-    tasks = [Task(work, Path(name), Plan(tmp_path)) for name in names]
+    tasks = [BatchTask(work, Path(name), Plan(tmp_path)) for name in names]
     place = tmp_path / "scheduler.json"
     with cluster(place) as address, worker(place) as dead:
-        answers = on_cluster(tasks, address)
+        answers = run_on_cluster(tasks, address)
         first, found = next(answers)
         wait(lambda: all((tmp_path / name).exists() for name in names))
         dead.kill()
@@ -236,6 +238,6 @@ def test_results_that_die_with_their_worker_are_made_again(tmp_path: Path) -> No
 
 def test_a_cluster_without_workers_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scans = write_scans(tmp_path / "scans", 1)
-    monkeypatch.setattr("flowing_puppet_ros.cli.batch.cluster.IDLE_SECONDS", 0.3)
+    monkeypatch.setattr("flowing_puppet_ros.cli.batch.cluster.MAX_IDLE_S", 0.3)
     with cluster(tmp_path / "scheduler.json") as address:
         assert main(["fit", str(scans), "--out", str(tmp_path / "out"), "--scheduler", address, *FAST]) == 1

@@ -15,11 +15,11 @@ from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints, write_
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 MODEL = DeformableStructures.load()
-JOINTS = MODEL.likely().joints * 70 + [110, 60]
+JOINTS = MODEL.likely_puppet().joints * 70 + [110, 60]
 
 
 def poses_file(path: Path, shift: float) -> Path:
-    """A poses.json of two images whose second person is off by `shift` pixels and has a solution that is not."""
+    """Write a poses.json of two images whose second person is off by `shift` pixels and has a solution that is not."""
     right = JOINTS.tolist()
     frames = []
     for index, moved in enumerate((JOINTS, JOINTS + np.array([shift, 0.0]))):
@@ -48,6 +48,7 @@ def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.Captur
     assert figures["wrists within 10 px"] == 50 and figures["wrists of the best solution"] == 100
 
 
+@pytest.mark.slow
 def test_one_command_measures_every_method(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for number in (1, 2):
         assert cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((90, 100, 3), 60 * number, np.uint8))

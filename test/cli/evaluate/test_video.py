@@ -12,13 +12,13 @@ import pytest
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.evaluate.video.errors import (
     TrackedPerson,
-    calibration,
     calibration_error,
-    clip_errors,
-    gain,
-    summary,
+    measure_calibration,
+    measure_clip,
+    measure_gain,
+    summarise,
 )
-from flowing_puppet_ros.evaluate.video.methods import Located, median_filtered
+from flowing_puppet_ros.evaluate.video.methods import LocatedPerson, filter_by_median
 from flowing_puppet_ros.evaluate.video.truth import find_clips, read_people
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -87,6 +87,7 @@ def test_rows_from_given_keypoints_are_measured_and_kept(
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["init-default"]["wrists_20_px"] > 50.0
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_bytes_of_one(clips: tuple[Path, Path, Path], tmp_path: Path) -> None:
     folder, truth, init = clips
     texts = []
@@ -112,31 +113,31 @@ def true_people(frames: int) -> dict[int, list[Keypoints]]:
 def test_figures_of_known_misses() -> None:
     misses = [0.0, 0.0, 15.0, 0.0]
     track = {k: [person(miss, 0.95 if miss == 0 else 0.35)] for k, miss in enumerate(misses)}
-    errors = clip_errors(track, true_people(5), (320, 240))
-    figures = summary({"a": errors})
+    errors = measure_clip(track, true_people(5), (320, 240))
+    figures = summarise({"a": errors})
     assert figures["elbows_10_px"] == 60.0, "three of five: one is off, one frame has nobody"
     assert figures["wrists_20_px"] == 80.0
-    np.testing.assert_allclose(sorted(errors.shake["wrist"]), [15, 15, 30, 30], atol=1e-9)
-    rows = calibration({"a": errors})
+    np.testing.assert_allclose(sorted(errors.jitter["wrist"]), [15, 15, 30, 30], atol=1e-9)
+    rows = measure_calibration({"a": errors})
     assert [(row["confidence"], row["right"], row["joints"]) for row in rows] == [(0.35, 1.0, 4.0), (0.95, 1.0, 12.0)]
     assert calibration_error(rows) == pytest.approx((4 * 0.65 + 12 * 0.05) / 16, abs=1e-3)
-    perfect = clip_errors({k: [person(0.0)] for k in range(5)}, true_people(5), (320, 240))
-    points, low, high = gain({"a": perfect, "b": errors}, {"a": errors, "b": errors}, "elbow", 10.0)
+    perfect = measure_clip({k: [person(0.0)] for k in range(5)}, true_people(5), (320, 240))
+    points, low, high = measure_gain({"a": perfect, "b": errors}, {"a": errors, "b": errors}, "elbow", 10.0)
     assert points == 20.0
     assert (low, high) == (0.0, 40.0)
 
 
 def test_joints_outside_the_image_are_not_asked_and_the_nearest_puppet_answers() -> None:
-    errors = clip_errors({0: [person(100.0), person(1.0)]}, true_people(1), (320, 240))
+    errors = measure_clip({0: [person(100.0), person(1.0)]}, true_people(1), (320, 240))
     assert len(errors.distance["wrist"]) == 2
     np.testing.assert_allclose(errors.distance["wrist"], 1.0)
     narrow = int(PUPPET.joints[[MODEL.joint_names.index("right_wrist")], 0][0]) + 2
-    assert len(clip_errors({0: [person(1.0)]}, true_people(1), (narrow, 240)).distance["wrist"]) == 1
+    assert len(measure_clip({0: [person(1.0)]}, true_people(1), (narrow, 240)).distance["wrist"]) == 1
 
 
 def test_the_median_filter_mends_one_frame_and_keeps_ends() -> None:
-    track = [[Located("a1", np.full((1, 2), x), np.ones(1))] for x in (1.0, 50.0, 3.0, 4.0)]
-    assert [people[0].joints[0, 0] for people in median_filtered(track)] == [1.0, 3.0, 4.0, 4.0]
+    track = [[LocatedPerson("a1", np.full((1, 2), x), np.ones(1))] for x in (1.0, 50.0, 3.0, 4.0)]
+    assert [people[0].joints[0, 0] for people in filter_by_median(track)] == [1.0, 3.0, 4.0, 4.0]
 
 
 def test_truths_in_every_form(clips: tuple[Path, Path, Path], tmp_path: Path) -> None:
@@ -144,7 +145,7 @@ def test_truths_in_every_form(clips: tuple[Path, Path, Path], tmp_path: Path) ->
     found = find_clips(folder)
     assert list(found) == ["a", "b"]
     people = read_people(truth, found)
-    assert people["b"][4][0].usable()["left_wrist"][0] == pytest.approx(PUPPET.joints[-3, 0] - 4.0)
+    assert people["b"][4][0].select_usable()["left_wrist"][0] == pytest.approx(PUPPET.joints[-3, 0] - 4.0)
     row = [[1.0, 2.0, 1.0]] * len(MODEL.joint_names)
     tool = tmp_path / "tool.json"
     tool.write_text(

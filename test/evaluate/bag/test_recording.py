@@ -10,12 +10,12 @@ from flowing_puppet_ros.evaluate.bag.recording import (
     CameraRecord,
     Recording,
     body_joints,
+    find_nearest,
     frontality,
+    match_track_to_detections,
     namespace,
-    nearest,
     puppet_joints,
-    track_and_detections,
-    triangulated,
+    triangulate_detections,
 )
 from flowing_puppet_ros.evaluate.joints import LIMB_JOINTS
 from flowing_puppet_ros.multiview.camera import Camera
@@ -27,7 +27,7 @@ def person(joints: dict[str, tuple[float, float]], confidence: float = 0.8) -> S
 
 
 def camera(x: float) -> Camera:
-    """A camera at (x, 0, 0) looking along +y, image down is -z."""
+    """Make a camera at (x, 0, 0) that looks along +y; image down is -z."""
     rotation = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
     matrix = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
     return Camera(matrix, np.zeros(5), (640, 480), rotation, -rotation @ [x, 0, 0])
@@ -55,15 +55,15 @@ def test_nearest_compares_common_joints_only() -> None:
     here = {"left_knee": np.array([10.0, 10]), "left_hip": np.array([10.0, 5])}
     far = {"left_knee": np.array([30.0, 10])}
     near = {"left_hip": np.array([11.0, 5]), "nose": np.array([900.0, 900])}
-    assert nearest(here, [far, near]) == 1 and nearest(here, [{}, far]) == 1
-    assert nearest(here, [{}]) is None and nearest(here, []) is None
+    assert find_nearest(here, [far, near]) == 1 and find_nearest(here, [{}, far]) == 1
+    assert find_nearest(here, [{}]) is None and find_nearest(here, []) is None
 
 
 def test_the_track_is_compared_with_the_detection_at_its_place() -> None:
     record = CameraRecord("/a")
     record.puppets = {1: [person({"left_knee": (10, 10)})], 2: [], 3: [person({"left_knee": (12, 10)})]}
     record.detections = {1: [person({"LKnee": (90, 10)}), person({"LKnee": (11, 10)})]}
-    frames, reference = track_and_detections(record)
+    frames, reference = match_track_to_detections(record)
     assert list(frames) == [1, 3] and reference[1]["left_knee"].tolist() == [11, 10] and 3 not in reference
 
 
@@ -88,7 +88,9 @@ def test_triangulated_takes_the_person_of_the_body() -> None:
         stranger = person({name: (float(p[0]) + 200, float(p[1]) - 50) for name, p in zip(body, pixels, strict=True)})
         record.detections = {1: [stranger, man], 2: [man] if index == 0 else []}
         recording.cameras[record.namespace] = record
-    found = triangulated(recording, {1: {name: point + 0.05 for name, point in body.items()}, 2: body, 3: body})
+    found = triangulate_detections(
+        recording, {1: {name: point + 0.05 for name, point in body.items()}, 2: body, 3: body}
+    )
     assert list(found) == [1]
     for name, point in body.items():
         assert found[1][name] == pytest.approx(point, abs=1e-5)

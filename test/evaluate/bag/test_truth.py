@@ -10,8 +10,14 @@ import pytest
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
-from flowing_puppet_ros.evaluate.bag.timing import timing
-from flowing_puppet_ros.evaluate.bag.truth import People, Person, matched, read_truth, to_surface
+from flowing_puppet_ros.evaluate.bag.timing import measure_timing
+from flowing_puppet_ros.evaluate.bag.truth import (
+    PeopleByStamp,
+    PersonGeometry,
+    distance_to_surface,
+    match_bodies,
+    read_truth,
+)
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header
 from flowing_puppet_ros.stream.messages.images import make_image
@@ -20,20 +26,20 @@ FACTORY = BagMessageFactory()
 NO_FACES = np.zeros((0, 3), np.int64)
 
 
-def at(x: float) -> Person:
-    return Person({"left_knee": np.array([x, 0.0, 0.5]), "left_hip": np.array([x, 0.0, 0.9])})
+def at(x: float) -> PersonGeometry:
+    return PersonGeometry({"left_knee": np.array([x, 0.0, 0.5]), "left_hip": np.array([x, 0.0, 0.9])})
 
 
 def test_every_true_person_has_a_body_of_their_own_or_none() -> None:
-    truth = People({1: [at(0.0), at(1.0)], 2: [at(0.0), at(1.0)], 3: [at(0.0)]}, NO_FACES)
+    truth = PeopleByStamp({1: [at(0.0), at(1.0)], 2: [at(0.0), at(1.0)], 3: [at(0.0)]}, NO_FACES)
     # Both true people are nearest to the body at 0.6 m; stamp 2 has one body, stamp 3 none.
-    found = People({1: [at(1.5), at(0.6)], 2: [at(0.9)], 9: [at(0.0)]}, NO_FACES)
+    found = PeopleByStamp({1: [at(1.5), at(0.6)], 2: [at(0.9)], 9: [at(0.0)]}, NO_FACES)
     places = [
-        (stamp, None if body is None else body.joints["left_knee"][0]) for stamp, _, body in matched(found, truth)
+        (stamp, None if body is None else body.joints["left_knee"][0]) for stamp, _, body in match_bodies(found, truth)
     ]
     assert places == [(1, 0.6), (1, 1.5), (2, None), (2, 0.9), (3, None)]
-    strangers = People({3: [Person({"nose": np.zeros(3)})]}, NO_FACES)
-    assert [body for _, _, body in matched(strangers, truth)] == [None] * 5
+    strangers = PeopleByStamp({3: [PersonGeometry({"nose": np.zeros(3)})]}, NO_FACES)
+    assert [body for _, _, body in match_bodies(strangers, truth)] == [None] * 5
 
 
 def test_several_people_a_stamp_are_read(tmp_path: Path) -> None:
@@ -47,7 +53,7 @@ def test_distance_to_a_surface_is_to_its_inside_too() -> None:
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     points = np.array([[0.4, 0.3, 0.2], [0.5, 0.5, -0.4], [2.0, 0.5, 0.0]])
-    assert to_surface(points, square, faces) == pytest.approx((0.2 + 0.4 + 1.0) / 3)
+    assert distance_to_surface(points, square, faces) == pytest.approx((0.2 + 0.4 + 1.0) / 3)
 
 
 def test_latency_and_drops(tmp_path: Path) -> None:
@@ -70,7 +76,7 @@ def test_latency_and_drops(tmp_path: Path) -> None:
         header = make_header(FACTORY, 5, "lidar")
         writer.write("/lidar/bodies", 210 * millisecond, FACTORY.make(bodies, header=header))
     with open_bag(tmp_path / "in.mcap") as given, open_bag(tmp_path / "out.mcap") as made:
-        figures = timing(given, made)
+        figures = measure_timing(given, made)
     assert figures["latency of puppets, median s"] == pytest.approx(0.06)
     assert figures["latency of bodies, median s"] == pytest.approx(0.2)
     assert (figures["images"], figures["images dropped"]) == (3, 1)

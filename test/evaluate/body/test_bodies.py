@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.cli import main
-from flowing_puppet_ros.evaluate.body.bodies import drawn_scans, is_flipped, scored_fit, seen_vertices, summary
+from flowing_puppet_ros.evaluate.body.bodies import draw_scans, find_visible_vertices, is_flipped, score_fit, summarise
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
-from flowing_puppet_ros.evaluate.body.synthetic_scans import Scene, box
-from flowing_puppet_ros.evaluate.tables import text_table, write_csv
+from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, make_box
+from flowing_puppet_ros.evaluate.tables import format_table, write_csv
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 LEARN = pytest.mark.skipif(not (find_spec("anny") and find_spec("body_models")), reason="needs the extra learn")
@@ -50,12 +50,12 @@ class _Oracle:
 def _scored(model: StitchedPuppet, source: BodySource, scan: Any, vertices: np.ndarray) -> Any:
     oracle: Any = _Oracle(model, vertices)
     body, scene, cloud = scan
-    return scored_fit(oracle, body, scene, cloud, source.joint_names)[1]
+    return score_fit(oracle, body, scene, cloud, source.joint_names)[1]
 
 
 @LEARN
 def test_scores_are_the_distance_to_the_truth(source: BodySource, model: StitchedPuppet) -> None:
-    scan = next(drawn_scans("single", source, 1, 0))
+    scan = next(draw_scans("single", source, 1, 0))
     truth = scan[0].template_vertices("neutral")
     exact = _scored(model, source, scan, truth)
     moved = _scored(model, source, scan, truth + np.array([0.0, 0.03, 0.04]))
@@ -66,7 +66,7 @@ def test_scores_are_the_distance_to_the_truth(source: BodySource, model: Stitche
     assert moved.visible_error == pytest.approx(0.05)
     assert not moved.flipped
     assert turned.flipped
-    figures = summary([exact, moved, turned])
+    figures = summarise([exact, moved, turned])
     assert figures["vertex_median_cm"] == pytest.approx(5)
     assert (figures["bodies"], figures["flipped"], figures["unreliable"]) == (3, 1, 3)
     assert figures["bad"] == figures["bad_unreliable"] == 2
@@ -74,28 +74,28 @@ def test_scores_are_the_distance_to_the_truth(source: BodySource, model: Stitche
 
 @LEARN
 def test_only_seen_vertices_count_as_visible(source: BodySource) -> None:
-    body, scene, cloud = next(drawn_scans("single", source, 1, 1))
+    body, scene, cloud = next(draw_scans("single", source, 1, 1))
     truth = body.template_vertices("neutral")
-    seen = seen_vertices(scene, truth, cloud.viewpoint)
+    seen = find_visible_vertices(scene, truth, cloud.viewpoint)
     assert 0.2 < seen.mean() < 0.6
     assert cloud.viewpoint is not None
     ahead = truth.mean(axis=0) - cloud.viewpoint
     assert (truth[seen] @ ahead).mean() < (truth[~seen] @ ahead).mean()
-    assert seen_vertices(scene, truth, None).all()
+    assert find_visible_vertices(scene, truth, None).all()
 
 
 @LEARN
 @pytest.mark.parametrize("kind", ["whole", "lidar"])
 def test_scans_are_drawn_by_the_seed(source: BodySource, kind: str) -> None:
-    first, again = (list(drawn_scans(kind, source, 2, seed)) for seed in (7, 7))
+    first, again = (list(draw_scans(kind, source, 2, seed)) for seed in (7, 7))
     for (_, _, cloud), (_, _, same) in zip(first, again, strict=True):
         np.testing.assert_array_equal(cloud.points, same.points)
     assert np.abs(first[0][0].vertices - first[1][0].vertices).max() > 0.05
 
 
 def test_a_block_hides_its_back() -> None:
-    vertices, faces = box(np.zeros(3), np.ones(3), np.eye(3))
-    seen = seen_vertices(Scene(vertices, faces), vertices * 0.999, np.array([5.0, 0.2, 0.3]))
+    vertices, faces = make_box(np.zeros(3), np.ones(3), np.eye(3))
+    seen = find_visible_vertices(RaycastScene(vertices, faces), vertices * 0.999, np.array([5.0, 0.2, 0.3]))
     np.testing.assert_array_equal(seen, vertices[:, 0] > 0)
 
 
@@ -107,16 +107,17 @@ def test_the_mirrored_body_is_flipped(model: StitchedPuppet) -> None:
 
 def test_tables_line_up(tmp_path: Path) -> None:
     rows = [{"kind": "whole", "cm": 1.23456, "flipped": True}, {"kind": "a", "cm": 12.0, "flipped": False}]
-    assert text_table(rows) == "kind      cm  flipped\nwhole  1.235      yes\na         12       no"
+    assert format_table(rows) == "kind      cm  flipped\nwhole  1.235      yes\na         12       no"
     write_csv(tmp_path / "rows.csv", rows)
     with (tmp_path / "rows.csv").open() as file:
         assert [row["cm"] for row in csv.DictReader(file)] == ["1.23456", "12.0"]
 
 
+@pytest.mark.slow
 @LEARN
 def test_the_command_writes_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    quick = ["--particles", "4", "--iterations", "1", "--restarts", "0", "--refine-iterations", "1"]
-    quick += ["--local-iterations", "0", "--lm-steps", "0", "--cloud-points", "400"]
+    quick = ["--particles", "4", "--iterations", "1", "--restarts", "0", "--gauss-newton-steps", "1"]
+    quick += ["--local-iterations", "0", "--levenberg-steps", "0", "--max-points", "400"]
     assert (
         main(["evaluate", "bodies", "--kind", "whole", "--count", "1", "--out", str(tmp_path), "--json", *quick]) == 0
     )

@@ -10,7 +10,13 @@ import pytest
 
 from flowing_puppet_ros.body.scans.scan import write_ply
 from flowing_puppet_ros.cli import main
-from flowing_puppet_ros.evaluate.body.correspondence import PairError, cumulative, read_fitted, scan_pairs, summary
+from flowing_puppet_ros.evaluate.body.correspondence import (
+    PairError,
+    cumulative_percent,
+    pair_scans,
+    read_fitted_scans,
+    summarise,
+)
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 UNIT = 0.01  # metres: the meshes are in centimetres
@@ -22,7 +28,7 @@ def model() -> StitchedPuppet:
 
 
 def _write(folder: Path, model: StitchedPuppet, name: str, state: BodyState) -> None:
-    """A mesh in centimetres and its fit."""
+    """Write a mesh in centimetres and its fit."""
     (folder / "scans").mkdir(exist_ok=True)
     (folder / "fits").mkdir(exist_ok=True)
     vertices = model.vertices(state)
@@ -49,6 +55,7 @@ def _run(folder: Path, *flags: str) -> int:
     return main(["evaluate", "correspondence", str(folder / "scans"), "--fits", str(folder / "fits"), *flags])
 
 
+@pytest.mark.slow
 def test_true_fits_give_true_correspondence(people: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert _run(people, "--pairs", "all", "--json", "--out", str(people / "out")) == 0
     runs = json.loads(capsys.readouterr().out)
@@ -71,7 +78,7 @@ def test_errors_are_in_the_unit_of_the_fit(tmp_path: Path, model: StitchedPuppet
     state = model.rest_state()
     _write(tmp_path, model, "anna0", state)
     _write(tmp_path, model, "anna1", state)
-    scans, _ = read_fitted(tmp_path / "scans", tmp_path / "fits", None)
+    scans, _ = read_fitted_scans(tmp_path / "scans", tmp_path / "fits", None)
     assert scans[0].subject == "anna"
     assert scans[0].metres == pytest.approx(UNIT, rel=1e-4)
     assert scans[0].stature == pytest.approx(np.ptp(model.vertices(state)[:, 2]), rel=1e-6)
@@ -86,6 +93,7 @@ def test_a_crossed_fit_is_seen(tmp_path: Path, model: StitchedPuppet, capsys: py
     assert json.loads(capsys.readouterr().out)["fits"]["intra mean_percent_of_stature"] > 5
 
 
+@pytest.mark.slow
 def test_vertex_lists_name_the_common_points(
     people: Path, model: StitchedPuppet, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -104,10 +112,10 @@ def test_vertex_lists_name_the_common_points(
 
 
 def test_pairs_with_the_first(people: Path) -> None:
-    scans, _ = read_fitted(people / "scans", people / "fits", None)
-    intra = [(a.name, b.name) for a, b in scan_pairs(scans, every=False, inter=False)]
+    scans, _ = read_fitted_scans(people / "scans", people / "fits", None)
+    intra = [(a.name, b.name) for a, b in pair_scans(scans, every=False, inter=False)]
     assert intra == [("tr_reg_001", "tr_reg_000"), ("tr_reg_011", "tr_reg_010")]
-    inter = [(a.name, b.name) for a, b in scan_pairs(scans, every=False, inter=True)]
+    inter = [(a.name, b.name) for a, b in pair_scans(scans, every=False, inter=True)]
     assert ("tr_reg_001", "tr_reg_010") in inter
     assert len(inter) == 4
 
@@ -117,19 +125,19 @@ def test_figures_of_known_errors() -> None:
         PairError("a", "b", True, np.array([0.0, 0.01, 0.03]), 2.0),
         PairError("c", "b", True, np.full(3, 0.06), 2.0),
     ]
-    figures = summary(pairs)
+    figures = summarise(pairs)
     assert figures["mean_cm"] == pytest.approx((4 / 3 + 6) / 2)
     assert figures["worst_percent_of_stature"] == pytest.approx(3)
     assert figures["share_within_2_cm"] == pytest.approx(2 / 6)
-    np.testing.assert_allclose(cumulative(pairs, np.array([0.0, 0.03, 0.1])), [100 / 6, 50, 100])
+    np.testing.assert_allclose(cumulative_percent(pairs, np.array([0.0, 0.03, 0.1])), [100 / 6, 50, 100])
 
 
 @pytest.mark.parametrize(
     ("flags", "spoil", "sentence"),
     [
-        ([], "fits/tr_reg_000.npz", "no fit; make it with"),
+        ([], "fits/tr_reg_000.npz", "not a fit; make one with"),
         (["--subject", "(x)"], None, "finds no subject"),
-        (["--subject", "("], None, "no regular expression"),
+        (["--subject", "("], None, "not a regular expression"),
         (["--vts", "nowhere"], None, "cannot be read as vertex numbers"),
     ],
 )

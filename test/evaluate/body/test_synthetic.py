@@ -12,14 +12,14 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.body.synthetic_scans import (
     DepthSettings,
-    Scene,
-    box,
-    depth_view,
-    furnished,
-    lidar_view,
-    sensor_place,
-    surface_samples,
-    whole_scan,
+    RaycastScene,
+    draw_sensor_position,
+    make_box,
+    make_furniture,
+    sample_surface,
+    scan_depth,
+    scan_lidar,
+    scan_whole,
 )
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -39,21 +39,21 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> BodySource:
 
 
 @pytest.fixture
-def block() -> Scene:
+def block() -> RaycastScene:
     """A box the size of a person, standing on the ground."""
-    return Scene(*box(np.array([0, 0, SIZE[2] / 2]), SIZE, np.eye(3)))
+    return RaycastScene(*make_box(np.array([0, 0, SIZE[2] / 2]), SIZE, np.eye(3)))
 
 
 def test_boxes_are_closed_and_look_outward() -> None:
-    vertices, faces = box(np.array([1.0, 2.0, 3.0]), SIZE, np.eye(3))
+    vertices, faces = make_box(np.array([1.0, 2.0, 3.0]), SIZE, np.eye(3))
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
     assert volume == pytest.approx(SIZE.prod())
 
 
 def test_samples_lie_on_the_surface_evenly() -> None:
-    vertices, faces = box(np.zeros(3), SIZE, np.eye(3))
-    points, normals = surface_samples(vertices, faces, np.random.default_rng(0), 20000)
+    vertices, faces = make_box(np.zeros(3), SIZE, np.eye(3))
+    points, normals = sample_surface(vertices, faces, np.random.default_rng(0), 20000)
     np.testing.assert_allclose((np.abs(points) / (SIZE / 2)).max(axis=1), 1)
     np.testing.assert_allclose((points * normals).sum(axis=1), np.abs(normals) @ (SIZE / 2))
     top = SIZE[0] * SIZE[1] / (2 * (SIZE[0] * SIZE[1] + SIZE[0] * SIZE[2] + SIZE[1] * SIZE[2]))
@@ -61,19 +61,19 @@ def test_samples_lie_on_the_surface_evenly() -> None:
 
 
 def test_a_whole_scan_shows_nothing_from_within() -> None:
-    outer, faces = box(np.zeros(3), SIZE, np.eye(3))
-    inner = box(np.zeros(3), SIZE / 2, np.eye(3))[0]
-    scene = Scene(np.concatenate([outer, inner]), np.concatenate([faces, faces + len(outer)]))
-    scan = whole_scan(scene, np.random.default_rng(0), 500)
+    outer, faces = make_box(np.zeros(3), SIZE, np.eye(3))
+    inner = make_box(np.zeros(3), SIZE / 2, np.eye(3))[0]
+    scene = RaycastScene(np.concatenate([outer, inner]), np.concatenate([faces, faces + len(outer)]))
+    scan = scan_whole(scene, np.random.default_rng(0), 500)
     np.testing.assert_allclose((np.abs(scan.points) / (SIZE / 2)).max(axis=1), 1)
     assert len(scan.points) == 500
     assert scan.normals is not None
     assert len(np.unique(scan.normals.round(3), axis=0)) == 6
 
 
-def test_a_depth_view_shows_the_near_side(block: Scene) -> None:
+def test_a_depth_view_shows_the_near_side(block: RaycastScene) -> None:
     eye = np.array([3.0, 0.3, 0.9])
-    view = depth_view(block, np.random.default_rng(0), eye, DepthSettings(noise=0.005, step=0.005, points=4000))
+    view = scan_depth(block, np.random.default_rng(0), eye, DepthSettings(noise=0.005, step=0.005, points=4000))
     assert len(view.points) == 4000
     assert view.points[:, 0].mean() == pytest.approx(SIZE[0] / 2, abs=0.02)
     assert np.percentile(np.abs(view.points[:, 0] - SIZE[0] / 2), 90) == pytest.approx(1.645 * 0.005, abs=0.004)
@@ -81,9 +81,9 @@ def test_a_depth_view_shows_the_near_side(block: Scene) -> None:
     assert np.ptp(view.points[:, 1]) == pytest.approx(SIZE[1], abs=0.03)
 
 
-def test_lidar_points_lie_on_rings(block: Scene) -> None:
+def test_lidar_points_lie_on_rings(block: RaycastScene) -> None:
     eye = np.array([8.0, 0.0, 1.7])
-    view = lidar_view(block, np.random.default_rng(0), eye, noise=0.02)
+    view = scan_lidar(block, np.random.default_rng(0), eye, noise=0.02)
     rays = view.points - eye
     elevation = np.degrees(np.arctan2(rays[:, 2], np.hypot(rays[:, 0], rays[:, 1])))
     rings = np.unique((elevation - elevation.min()).round(3))
@@ -94,12 +94,12 @@ def test_lidar_points_lie_on_rings(block: Scene) -> None:
     assert 500 < front.sum() < 900
 
 
-def test_surroundings_are_told_from_the_person(block: Scene) -> None:
+def test_surroundings_are_told_from_the_person(block: RaycastScene) -> None:
     rng = np.random.default_rng(1)
-    eye = sensor_place(rng, block.vertices, (2.5, 2.5), (1.2, 1.2))
+    eye = draw_sensor_position(rng, block.vertices, (2.5, 2.5), (1.2, 1.2))
     assert np.hypot(*eye[:2]) == pytest.approx(2.5)
-    scene = Scene(block.vertices, block.triangles, furnished(rng, block.vertices, eye))
-    view = depth_view(scene, rng, eye, DepthSettings(points=100000))
+    scene = RaycastScene(block.vertices, block.triangles, make_furniture(rng, block.vertices, eye))
+    view = scan_depth(scene, rng, eye, DepthSettings(points=100000))
     inside = (np.abs(view.points - [0, 0, 0.9]) < SIZE / 2 + 0.03).all(axis=1)
     assert view.on_person.sum() > 5000
     assert inside[view.on_person].all()
@@ -111,7 +111,7 @@ def test_surroundings_are_told_from_the_person(block: Scene) -> None:
 def test_bodies_stand_and_their_template_is_on_them(source: BodySource) -> None:
     model = StitchedPuppet.load()
     for hard in (False, True):
-        body = source.body(np.random.default_rng(2), hard)
+        body = source.draw_body(np.random.default_rng(2), hard)
         truth = body.template_vertices("neutral")
         assert body.vertices[:, 2].min() == pytest.approx(0)
         assert body.hard is hard
@@ -122,7 +122,7 @@ def test_bodies_stand_and_their_template_is_on_them(source: BodySource) -> None:
 
 @LEARN
 def test_bodies_are_drawn_by_the_seed(source: BodySource) -> None:
-    first, again, other = (source.body(np.random.default_rng(seed), hard=True).vertices for seed in (3, 3, 4))
+    first, again, other = (source.draw_body(np.random.default_rng(seed), hard=True).vertices for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 0.05
 
@@ -130,8 +130,8 @@ def test_bodies_are_drawn_by_the_seed(source: BodySource) -> None:
 @LEARN
 def test_motion_is_smooth_and_goes_through_the_captured_frames(source: BodySource) -> None:
     # Both need four frames of capture, so that both draw the same ones.
-    fast = source.motion(np.random.default_rng(5), 7, 60.0)
-    slow = source.motion(np.random.default_rng(5), 3, 20.0)
+    fast = source.draw_motion(np.random.default_rng(5), 7, 60.0)
+    slow = source.draw_motion(np.random.default_rng(5), 3, 20.0)
     for captured, reached in zip(slow, fast[::3], strict=True):
         level = captured.joints - reached.joints
         np.testing.assert_allclose(level, np.tile([0.0, 0.0, level[0, 2]], (len(level), 1)), atol=1e-9)
@@ -140,10 +140,11 @@ def test_motion_is_smooth_and_goes_through_the_captured_frames(source: BodySourc
     assert np.abs(np.diff(steps, axis=0)).max() < 0.02
 
 
+@pytest.mark.slow
 @LEARN
 def test_poses_of_people_need_motion_capture() -> None:
     source = BodySource()
     with pytest.raises(InputError, match="--mocap"):
-        source.body(np.random.default_rng(0), hard=False)
+        source.draw_body(np.random.default_rng(0), hard=False)
     with pytest.raises(InputError, match="longer motion capture"):
-        source.motion(np.random.default_rng(0), 4, 20.0)
+        source.draw_motion(np.random.default_rng(0), 4, 20.0)

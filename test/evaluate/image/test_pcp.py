@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.image.pcp import PosedSticks, Tally, correct_parts, match_people
-from flowing_puppet_ros.evaluate.image.pcp_truth import images_of, read_truth
+from flowing_puppet_ros.evaluate.image.pcp import PosedSticks, Tally, check_parts, match_people
+from flowing_puppet_ros.evaluate.image.pcp_truth import open_true_images, read_stick_truth
 from flowing_puppet_ros.image.formats.stickmen import STICKS, sticks_from_joints, write_sticks
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 MODEL = DeformableStructures.load()
-TRUTH = sticks_from_joints(MODEL.joint_names, MODEL.likely().joints * 150 + 200)
+TRUTH = sticks_from_joints(MODEL.joint_names, MODEL.likely_puppet().joints * 150 + 200)
 LENGTH = np.linalg.norm(TRUTH[:, 1] - TRUTH[:, 0], axis=1)
 
 
@@ -27,7 +27,7 @@ def answer(sticks: np.ndarray, *others: np.ndarray) -> PosedSticks:
 
 def test_the_truth_itself_is_correct_either_way_round() -> None:
     for sticks in (TRUTH, TRUTH[:, ::-1]):
-        strict, loose = correct_parts(sticks, TRUTH)
+        strict, loose = check_parts(sticks, TRUTH)
         assert strict.all() and loose.all()
 
 
@@ -40,7 +40,7 @@ def test_one_end_off_counts_strictly_to_half_the_length_and_loosely_to_the_whole
     axis = (TRUTH[part, 1] - TRUTH[part, 0]) / LENGTH[part]
     side = np.array([-axis[1], axis[0]])
     moved[part, 1] += share * LENGTH[part] * (abs(np.cos(angle)) * axis + np.sin(angle) * side)
-    strict, loose = correct_parts(moved, TRUTH)
+    strict, loose = check_parts(moved, TRUTH)
     assert strict[part] == (share <= 0.5) or abs(share - 0.5) < 1e-6
     assert loose[part]
     assert np.delete(strict, part).all()
@@ -50,7 +50,7 @@ def test_strict_is_never_kinder_than_loose() -> None:
     rng = np.random.default_rng(0)
     kinder = 0
     for _ in range(200):
-        strict, loose = correct_parts(TRUTH + rng.normal(0, 20, TRUTH.shape), TRUTH)
+        strict, loose = check_parts(TRUTH + rng.normal(0, 20, TRUTH.shape), TRUTH)
         assert not (strict & ~loose).any()
         kinder += int((loose & ~strict).sum())
     assert kinder > 20
@@ -59,11 +59,11 @@ def test_strict_is_never_kinder_than_loose() -> None:
 def test_unknown_estimates_are_wrong_and_unknown_truth_is_left_out() -> None:
     unknown = TRUTH.copy()
     unknown[STICKS.index("left_lower_arm"), 1] = np.nan
-    strict, _ = correct_parts(unknown, TRUTH)
+    strict, _ = check_parts(unknown, TRUTH)
     assert strict.sum() == 5
     tally = Tally()
     tally.add([answer(TRUTH)], [unknown])
-    figures = tally.figures()
+    figures = tally.summarise()
     assert figures["strict lower arms"] == 100 and tally.known.sum() == 5
     assert figures["wrists within 20 px"] == 100 and tally.ends.tolist() == [2, 1]
 
@@ -76,7 +76,7 @@ def test_people_are_matched_by_place_and_strangers_are_not_found() -> None:
     tally = Tally()
     tally.add([far], [TRUTH])
     tally.add([here], [TRUTH])
-    assert tally.figures()["found"] == 50 and tally.figures()["loose total"] == 50
+    assert tally.summarise()["found"] == 50 and tally.summarise()["loose total"] == 50
 
 
 def test_wrists_of_the_best_solution() -> None:
@@ -84,7 +84,7 @@ def test_wrists_of_the_best_solution() -> None:
     wrong[[STICKS.index("left_lower_arm"), STICKS.index("right_lower_arm")], 1] += 60
     tally = Tally(pixels=10)
     tally.add([answer(wrong, TRUTH)], [TRUTH])
-    figures = tally.figures()
+    figures = tally.summarise()
     assert figures["wrists within 10 px"] == 0 and figures["wrists of the best solution"] == 100
     assert figures["elbows within 10 px"] == 100
 
@@ -97,22 +97,22 @@ def test_numbers_are_those_in_the_names_of_images(tmp_path: Path) -> None:
     for number in (7, 12, 100):
         picture(tmp_path / f"frame{number:04d}.png", number)
     write_sticks(tmp_path / "sticks.txt", {12: [TRUTH], 100: [TRUTH, TRUTH + 5]})
-    seen = list(images_of(tmp_path, read_truth(tmp_path / "sticks.txt")))
+    seen = list(open_true_images(tmp_path, read_stick_truth(tmp_path / "sticks.txt")))
     assert [(int(frame.image[0, 0, 0]), len(people)) for frame, people in seen] == [(12, 1), (100, 2)]
     np.testing.assert_allclose(seen[0][1][0], TRUTH, atol=0.01)
     write_sticks(tmp_path / "sticks.txt", {3: [TRUTH]})
     with pytest.raises(InputError, match="no image number 3"):
-        list(images_of(tmp_path, read_truth(tmp_path / "sticks.txt")))
+        list(open_true_images(tmp_path, read_stick_truth(tmp_path / "sticks.txt")))
 
 
 def test_keypoints_count_images_and_leave_out_what_they_lack(tmp_path: Path) -> None:
     for name in ("b.png", "a.png"):
         picture(tmp_path / name, ord(name[0]))
     names = [name for name in MODEL.joint_names if name != "left_wrist"]
-    joints = [[*MODEL.likely().joints[MODEL.joint_names.index(name)], 1.0] for name in names]
+    joints = [[*MODEL.likely_puppet().joints[MODEL.joint_names.index(name)], 1.0] for name in names]
     path = tmp_path / "keypoints.json"
     path.write_text(json.dumps({"joint_names": names, "frames": {"1": [joints], "0": []}}))
-    ((frame, (sticks,)),) = images_of(tmp_path, read_truth(path))
+    ((frame, (sticks,)),) = open_true_images(tmp_path, read_stick_truth(path))
     assert int(frame.image[0, 0, 0]) == ord("b")
     assert np.isnan(sticks).any(axis=(1, 2)).tolist() == [stick == "left_lower_arm" for stick in STICKS]
 
@@ -123,13 +123,13 @@ def test_annotations_name_images_and_frames_of_clips(tmp_path: Path) -> None:
     for value in range(0, 250, 50):
         writer.write(np.full((32, 32, 3), value, np.uint8))
     writer.release()
-    joints = np.column_stack([MODEL.likely().joints, np.ones(len(MODEL.joint_names))])
+    joints = np.column_stack([MODEL.likely_puppet().joints, np.ones(len(MODEL.joint_names))])
     joints[MODEL.joint_names.index("right_elbow"), 2] = 0
     person = {"joints": joints.tolist(), "gender": "neutral", "view": "front"}
     images = {"one.png": [person], "clip.avi#1": [person], "clip.avi#3": [person, person], "clip.avi#4": []}
     path = tmp_path / "annotations.json"
     path.write_text(json.dumps({"joint_names": MODEL.joint_names, "images": images}))
-    seen = list(images_of(tmp_path, read_truth(path)))
+    seen = list(open_true_images(tmp_path, read_stick_truth(path)))
     assert [len(people) for _, people in seen] == [1, 1, 2]
     assert [
         abs(int(frame.image[8, 8, 0]) - value) < 8 for (frame, _), value in zip(seen, (50, 50, 150), strict=True)
@@ -145,6 +145,6 @@ def test_broken_truth_is_one_sentence(tmp_path: Path, text: str) -> None:
     path = tmp_path / "truth.json"
     path.write_text(text)
     with pytest.raises(InputError):
-        read_truth(path)
+        read_stick_truth(path)
     with pytest.raises(InputError):
-        read_truth(tmp_path / "missing.json")
+        read_stick_truth(tmp_path / "missing.json")

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.cli import main
-from flowing_puppet_ros.evaluate.output import run_names
-from flowing_puppet_ros.evaluate.video.tracks import joint_misses, read_tracks
+from flowing_puppet_ros.evaluate.output import name_runs
+from flowing_puppet_ros.evaluate.video.tracks import measure_misses, read_tracks
 from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
 
 NAMES = ["left_wrist", "right_wrist", "neck"]
@@ -42,7 +42,7 @@ def test_distances_misses_and_unknown_joints(tmp_path: Path) -> None:
         2: [[[505, 500, 1], [510, 500, 1], [500, 510, 1]], [[10, 10, 1], [50, 58, 1], [30, 30, 1]]],
     }
     _files(tmp_path, {0: [far, near], 2: [near, far]}, truth)
-    misses = joint_misses(read_tracks(tmp_path / "tracks.json").frames, read_keypoints(tmp_path / "truth.json"))
+    misses = measure_misses(read_tracks(tmp_path / "tracks.json").frames, read_keypoints(tmp_path / "truth.json"))
     assert misses.names == tuple(NAMES[:1] + NAMES[2:] + NAMES[1:2])
     ordered = misses.distance[:, [misses.names.index(name) for name in NAMES]]
     np.testing.assert_allclose(ordered[0], [5, np.nan, 1])
@@ -90,9 +90,9 @@ def test_jitter_is_of_one_person_in_successive_frames(tmp_path: Path) -> None:
 
 
 def test_runs_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run_names([Path("x/a.json"), Path("y/b.json")]) == ["a", "b"]
-    assert run_names([Path("x/a.json"), Path("y/a.json")]) == ["x/a", "y/a"]
-    assert run_names([Path("x/a.json"), Path("z/x/a.mcap")]) == ["x/a.json", "z/x/a.mcap"]
+    assert name_runs([Path("x/a.json"), Path("y/b.json")]) == ["a", "b"]
+    assert name_runs([Path("x/a.json"), Path("y/a.json")]) == ["x/a", "y/a"]
+    assert name_runs([Path("x/a.json"), Path("z/x/a.mcap")]) == ["x/a.json", "z/x/a.mcap"]
     _files(tmp_path, {}, {0: []})
     assert _run(tmp_path, str(tmp_path / "tracks.json")) == 2
     assert "named twice" in capsys.readouterr().err
@@ -101,11 +101,11 @@ def test_runs_are_told_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str])
 @pytest.mark.parametrize(
     ("tracks", "flags", "sentence"),
     [
-        ("{}", [], "is no tracks.json"),
+        ("{}", [], "is not a tracks.json"),
         (
             '{"joint_names": ["left_wrist"], "frames": [{"index": 0, "puppets": [{"joints": 3}]}]}',
             [],
-            "is no tracks.json",
+            "is not a tracks.json",
         ),
         ('{"joint_names": ["left_ear"], "frames": []}', [], "no joint in common"),
         (None, [], "cannot be read"),

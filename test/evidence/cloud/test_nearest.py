@@ -32,7 +32,7 @@ def test_near_and_far_the_answer_is_exact(points: np.ndarray, queries: np.ndarra
 
 
 def test_directions_count_as_lengths() -> None:
-    """Two sheets a centimetre apart that look to either side: the nearer one is not the one that agrees."""
+    """Two sheets a centimetre apart that face opposite ways: the nearer one is not the one that agrees."""
     level = np.random.default_rng(1).random((400, 2))
     points = np.vstack([np.c_[level, np.zeros(400)], np.c_[level, np.full(400, 0.01)]])
     normals = np.repeat([[0, 0, -1.0], [0, 0, 1.0]], 400, axis=0)

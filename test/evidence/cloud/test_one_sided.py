@@ -1,10 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one side says of a body, against a wall that is easy to reckon with and against plain loops."""
+"""Costs of a one-sided view, against a wall with known answers and against plain loops."""
 
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.evidence.cloud.one_sided import HIDDEN, MISS, OneSidedView, distances, mean_distance
+from flowing_puppet_ros.evidence.cloud.one_sided import (
+    MAX_DISTANCE_M,
+    OCCLUSION_DEPTH_M,
+    OneSidedView,
+    distances,
+    mean_distance,
+)
 
 SENSOR = np.array([1.0, -2.0, 0.5])
 SPACING = 0.01
@@ -12,12 +18,12 @@ SPACING = 0.01
 
 @pytest.fixture(scope="module")
 def wall() -> OneSidedView:
-    """A wall of 1 m by 1 m, two metres before the sensor along x, with a point every centimetre."""
+    """A wall of 1 m by 1 m, two metres in front of the sensor along x, with a point every centimetre."""
     y, z = np.meshgrid(np.arange(-0.5, 0.505, SPACING), np.arange(-0.5, 0.505, SPACING))
     return OneSidedView.build(np.stack([np.full(y.size, 2.0), y.ravel(), z.ravel()], axis=1) + SENSOR, SENSOR)
 
 
-def test_points_are_before_behind_or_beside_the_wall(wall: OneSidedView) -> None:
+def test_points_are_in_front_of_behind_or_beside_the_wall(wall: OneSidedView) -> None:
     beside, behind = wall.compare(
         SENSOR + np.array([[1.5, 0.1, 0.1], [2.3, 0.1, 0.1], [2.0, 0.8, 0.0], [4.0, 1.6, 0.0]])
     )
@@ -26,8 +32,9 @@ def test_points_are_before_behind_or_beside_the_wall(wall: OneSidedView) -> None
     # 0.3 m beside the edge, less what may still be between two points of the wall; twice that twice as far away.
     np.testing.assert_allclose(beside[2], [0, 0.3, 0], atol=2.5 * SPACING)
     np.testing.assert_allclose(beside[3], 2 * beside[2], atol=1e-9)
-    hidden = wall.hidden(
-        SENSOR + np.array([[2 + 2 * HIDDEN, 0, 0], [2 + HIDDEN / 2, 0, 0], [1.9, 0, 0], [3.0, 2.0, 0]])
+    hidden = wall.find_hidden(
+        SENSOR
+        + np.array([[2 + 2 * OCCLUSION_DEPTH_M, 0, 0], [2 + OCCLUSION_DEPTH_M / 2, 0, 0], [1.9, 0, 0], [3.0, 2.0, 0]])
     )
     assert hidden.tolist() == [True, False, False, False]
 
@@ -37,11 +44,11 @@ def test_only_what_contradicts_the_view_costs(wall: OneSidedView) -> None:
     cases = (
         ([2.0, 0, 0], toward, 0.0),
         ([2.03, 0, 0], toward, 0.03),
-        ([2.5, 0, 0], toward, HIDDEN),
+        ([2.5, 0, 0], toward, OCCLUSION_DEPTH_M),
         ([2.5, 0, 0], away, 0.0),
         ([1.9, 0, 0], away, 0.1),
-        ([1.0, 0, 0], toward, MISS),
-        ([2.0, 3.0, 0], toward, MISS),
+        ([1.0, 0, 0], toward, MAX_DISTANCE_M),
+        ([2.0, 3.0, 0], toward, MAX_DISTANCE_M),
     )
     points = np.array([[SENSOR + place] for place, _, _ in cases])
     cost, facing = wall.misfit(points, np.array([[normal] for _, normal, _ in cases]))
@@ -70,6 +77,8 @@ def test_nearest_distances_are_those_of_plain_loops() -> None:
     allowed = rng.random((3, 20)) < 0.5
     allowed[2] = False
     gaps = np.linalg.norm(points[:, None] - targets[None, :, None], axis=3)
-    expected = np.minimum(np.where(allowed[:, None], gaps, np.inf).min(axis=2), MISS)
+    expected = np.minimum(np.where(allowed[:, None], gaps, np.inf).min(axis=2), MAX_DISTANCE_M)
     np.testing.assert_allclose(distances(targets, points, allowed), expected)
-    np.testing.assert_allclose(mean_distance(points, targets), np.minimum(gaps.min(axis=1), MISS).mean(axis=1))
+    np.testing.assert_allclose(
+        mean_distance(points, targets), np.minimum(gaps.min(axis=1), MAX_DISTANCE_M).mean(axis=1)
+    )

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Colour models on pictures whose colours are known."""
+"""Colour models on pictures of known colours."""
 
 import numpy as np
 import pytest
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evidence.image.colour import BINS, LIMIT, ColourImage, SkinColour, torso_map
+from flowing_puppet_ros.evidence.image.colour import BINS, MAX_LOG_RATIO, ColourImage, SkinColour, torso_map
 
 RED, BLUE, GREEN, GREY = (200, 60, 60), (50, 60, 190), (70, 170, 60), (120, 120, 120)
 RNG = np.random.default_rng(0)
@@ -68,21 +68,21 @@ def test_learned_skin_is_looked_up() -> None:
 
 
 @pytest.mark.parametrize("head", [box(500, 500, 520, 520), np.full((40, 2), np.nan), box(10, 10, 11, 11)])
-def test_faces_out_of_sight_change_nothing(head: np.ndarray) -> None:
+def test_faces_outside_the_image_change_nothing(head: np.ndarray) -> None:
     colours = ColourImage.of(SCENE)
     skin = SkinColour(np.linspace(-1, 1, BINS * BINS))
     np.testing.assert_array_equal(skin.map(colours, head).values, skin.map(colours).values)
     assert not torso_map(colours, head, head).values.any()
 
 
-def test_grey_images_say_nothing() -> None:
+def test_grey_images_are_neutral() -> None:
     grey = RNG.integers(0, 255, (60, 80)).astype(np.uint8)
     values = torso_map(ColourImage.of(grey), box(20, 20, 50, 50), box(25, 5, 45, 20)).values
     assert np.ptp(values) < 0.01 and np.abs(values).max() < 0.01
 
 
 def test_limits_and_tiny_images() -> None:
-    assert np.abs(torso_map(ColourImage.of(SCENE), TORSO, HEAD).values).max() <= LIMIT
+    assert np.abs(torso_map(ColourImage.of(SCENE), TORSO, HEAD).values).max() <= MAX_LOG_RATIO
     one = ColourImage.of(np.full((1, 1, 3), 9, np.uint8))
     assert one.histogram.sum() == pytest.approx(1.0)
     assert torso_map(one, TORSO, HEAD).values.shape == (1, 1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hand evidence: boxes turn with the forearm, shipped filters tell drawn hands, bad places say nothing."""
+"""Hand evidence: boxes rotate with the forearm, shipped filters recognise drawn hands, bad positions are neutral."""
 
 from pathlib import Path
 
@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evidence.image.hands import HandDetectors, HandField, HandMaps, hand_score, mirrored
+from flowing_puppet_ros.evidence.image.hands import HandDetectors, HandField, HandMaps, hand_score, mirror
 from flowing_puppet_ros.evidence.image.likelihood import ImageEvidence, PartLikelihood
-from flowing_puppet_ros.learn.likelihood.samples import Posed
-from flowing_puppet_ros.learn.thesis_loop.hands import HandSettings, learn
+from flowing_puppet_ros.learn.likelihood.samples import PosedPerson
+from flowing_puppet_ros.learn.thesis_loop.hands import HandSettings, learn_hands
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 SCALE = 180.0
@@ -29,24 +29,24 @@ def arm(angle: float, size: int = 300) -> np.ndarray:
     return image
 
 
-def scene(image: np.ndarray) -> ImageEvidence:
-    return PartLikelihood.load().scene(image)
+def evidence(image: np.ndarray) -> ImageEvidence:
+    return PartLikelihood.load().prepare(image)
 
 
 def test_a_box_that_turns_with_the_image_reads_the_same() -> None:
     middle = np.array([[149.5, 149.5]])
-    flat = HandField.of_image(scene(arm(0.0)), SCALE).describe(middle, np.zeros(1), 7.0)[0]
+    flat = HandField.of_image(evidence(arm(0.0)), SCALE).describe(middle, np.zeros(1), 7.0)[0]
     for quarter in (1, 2, 3):
         turned = np.ascontiguousarray(np.rot90(arm(0.0), -quarter))
-        field = HandField.of_image(scene(turned), SCALE)
+        field = HandField.of_image(evidence(turned), SCALE)
         again = field.describe(middle, np.array([quarter * np.pi / 2]), 7.0)[0]
         np.testing.assert_allclose(again, flat, atol=0.05)
-    mirror = HandField.of_image(scene(np.ascontiguousarray(arm(0.0)[::-1])), SCALE)
-    np.testing.assert_allclose(mirrored(mirror.describe(middle, np.zeros(1), 7.0))[0], flat, atol=0.05)
+    mirrored = HandField.of_image(evidence(np.ascontiguousarray(arm(0.0)[::-1])), SCALE)
+    np.testing.assert_allclose(mirror(mirrored.describe(middle, np.zeros(1), 7.0))[0], flat, atol=0.05)
 
 
 def test_the_shipped_filters_know_where_a_drawn_hand_is() -> None:
-    maps = HandMaps.of(HandDetectors.load(), scene(arm(0.7)), [], SCALE)
+    maps = HandMaps.of(HandDetectors.load(), evidence(arm(0.7)), [], SCALE)
     along = 40.0 * np.array([[np.cos(0.7), np.sin(0.7)]])
     middle = np.full((1, 2), 149.5)
     y, x = np.mgrid[30:270:8, 30:270:8]
@@ -72,9 +72,9 @@ def test_motion_shows_in_the_flow_field_alone() -> None:
     assert np.isfinite(HandField.of_flow([flow], SCALE).describe(WRIST, np.zeros(1), 7.0)).all()
 
 
-def test_bad_places_say_nothing_and_foreshortened_forearms_may_point_anywhere() -> None:
+def test_bad_positions_are_neutral_and_foreshortened_forearms_may_point_anywhere() -> None:
     image = arm(0.0)
-    maps = HandMaps.of(HandDetectors.load(), scene(image), [np.zeros((300, 300, 2), np.float32)], SCALE)
+    maps = HandMaps.of(HandDetectors.load(), evidence(image), [np.zeros((300, 300, 2), np.float32)], SCALE)
     wrist = np.array([[np.nan, 1.0], [149.5, 149.5], [1e9, -1e9], [149.5, 149.5]])
     elbow = np.array([[0.0, 0.0], [149.5, 149.5], [0.0, 0.0], [110.0, 149.5]])
     score = hand_score(maps, wrist, elbow, SCALE)
@@ -93,8 +93,9 @@ def test_arrays_come_back(tmp_path: Path) -> None:
         HandDetectors.load("none")
 
 
+@pytest.mark.slow
 def test_learning_finds_what_drawn_hands_have_in_common() -> None:
-    """Filters learned on drawn arms of some directions judge arms of others."""
+    """Filters learned on drawn arms of some directions recognise arms of others."""
     model = DeformableStructures.load()
     puppet = model.puppet_from_joints(model.mean_joints() * SCALE + [80.0, 30.0], SCALE)
     wrist, elbow = (model.joint_names.index(f"left_{name}") for name in ("wrist", "elbow"))
@@ -107,12 +108,12 @@ def test_learning_finds_what_drawn_hands_have_in_common() -> None:
         image = arm(angle, 160)
         shape = model.puppet_from_joints(joints, SCALE)
         seen = np.isin(np.arange(len(joints)), (wrist, elbow)).astype(float)
-        people.append(Posed(f"v{k}.avi", image, shape, seen, image))
-    learned, boxes = learn(model, lambda: people, HandSettings(wrong=4), lambda _: None)
+        people.append(PosedPerson(f"v{k}.avi", image, shape, seen, image))
+    learned, boxes = learn_hands(model, lambda: people, HandSettings(wrong=4), lambda _: None)
     assert boxes.right.sum() == 84
-    maps = HandMaps.of(learned, scene(arm(0.5, 160)), [], SCALE)
+    maps = HandMaps.of(learned, evidence(arm(0.5, 160)), [], SCALE)
     elbows = np.array([[79.5 - 40 * np.cos(0.5), 79.5 - 40 * np.sin(0.5)], [70.0, 20.0]])
     score = hand_score(maps, np.array([[79.5, 79.5], [40.0, 40.0]]), elbows, SCALE)
     assert score[0] > score[1] + 2.0
     with pytest.raises(InputError, match="too few wrists"):
-        learn(model, lambda: people[:3], HandSettings(wrong=4), lambda _: None)
+        learn_hands(model, lambda: people[:3], HandSettings(wrong=4), lambda _: None)

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.evidence.image.hog import DIMENSIONS, OUTSIDE, hog
+from flowing_puppet_ros.evidence.image.hog import DIMENSIONS, OUTSIDE_INDEX, hog
 
 
 def plain_hog(image: np.ndarray, cell: int) -> np.ndarray:
@@ -79,4 +79,4 @@ def test_images_smaller_than_a_cell_have_no_cells(shape: tuple[int, int, int]) -
 def test_flat_images_have_no_gradients() -> None:
     features = hog(np.full((18, 18, 3), 77, np.uint8), 6)
     assert features.shape == (3, 3, DIMENSIONS)
-    assert not features.any() and not features[..., OUTSIDE].any()
+    assert not features.any() and not features[..., OUTSIDE_INDEX].any()

@@ -7,15 +7,15 @@ import pytest
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.features import (
-    CELL,
+    CELL_PX,
     CHANNELS,
-    LARGEST,
+    LEVELS_PER_OCTAVE,
+    MAX_LEVEL_PIXELS,
     ORDERS,
-    STEPS,
     ImageFeatures,
     OrientationMap,
 )
-from flowing_puppet_ros.evidence.image.outline import grown, mirrored_order
+from flowing_puppet_ros.evidence.image.outline import grow, mirror_order
 from flowing_puppet_ros.evidence.image.steered_hog import SIDES, descriptors
 
 SIZE = 64
@@ -61,7 +61,7 @@ def brute_force(level: OrientationMap, contour: np.ndarray, place: int, side: in
     return value
 
 
-@pytest.mark.parametrize("number", [0, -STEPS, 3])
+@pytest.mark.parametrize("number", [0, -LEVELS_PER_OCTAVE, 3])
 @pytest.mark.parametrize("mirror", [False, True])
 def test_descriptors_equal_the_definition(number: int, mirror: bool) -> None:
     level = ImageFeatures.of(blobs()).level(number)
@@ -144,32 +144,38 @@ def test_broken_contours_have_no_descriptors() -> None:
 
 def test_levels_follow_the_cell_and_the_size_of_the_image() -> None:
     features = ImageFeatures.of(blobs())
-    np.testing.assert_array_equal(features.levels_of(CELL * np.array([1.0, 2.0, 1.1, 8.0])), [0, STEPS, 1, 3 * STEPS])
-    np.testing.assert_array_equal(features.levels_of(np.array([1e-6, 1e6]))[0], -STEPS)
+    np.testing.assert_array_equal(
+        features.find_levels(CELL_PX * np.array([1.0, 2.0, 1.1, 8.0])), [0, LEVELS_PER_OCTAVE, 1, 3 * LEVELS_PER_OCTAVE]
+    )
+    np.testing.assert_array_equal(features.find_levels(np.array([1e-6, 1e6]))[0], -LEVELS_PER_OCTAVE)
     large = ImageFeatures.of(np.zeros((3000, 4000, 3), np.uint8))
-    finest = int(large.levels_of(np.array([0.1]))[0])
-    assert 12e6 * 4.0 ** (-finest / STEPS) <= LARGEST < 12e6 * 4.0 ** (-(finest - 1) / STEPS)
+    finest = int(large.find_levels(np.array([0.1]))[0])
+    assert (
+        12e6 * 4.0 ** (-finest / LEVELS_PER_OCTAVE)
+        <= MAX_LEVEL_PIXELS
+        < 12e6 * 4.0 ** (-(finest - 1) / LEVELS_PER_OCTAVE)
+    )
     assert features.level(100).values.shape == (1, 1, CHANNELS)
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 1), (1, 50, 3), (2, 3)])
 def test_tiny_images_have_maps(shape: tuple[int, ...]) -> None:
     features = ImageFeatures.of(np.full(shape, 90, np.uint8))
-    for number in (-STEPS, 0, 9):
+    for number in (-LEVELS_PER_OCTAVE, 0, 9):
         assert np.isfinite(features.level(number).values).all()
 
 
 @pytest.mark.parametrize("image", [np.zeros((0, 5, 3), np.uint8), np.zeros((4, 4, 4), np.uint8), np.zeros((4, 4))])
 def test_other_arrays_are_refused_in_a_sentence(image: np.ndarray) -> None:
-    with pytest.raises(InputError, match="RGB or grey uint8"):
+    with pytest.raises(InputError, match=r"^an image must be .*, this one is"):
         ImageFeatures.of(image)
 
 
 def test_grown_contours_lie_outside_by_the_distance() -> None:
     angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
     circle = 10 * np.column_stack([np.cos(angle), np.sin(angle)])
-    for contour in (circle, mirrored_order(circle)):
-        (larger,) = grown(contour[None], np.array([3.0]))
+    for contour in (circle, mirror_order(circle)):
+        (larger,) = grow(contour[None], np.array([3.0]))
         np.testing.assert_allclose(np.hypot(*larger.T), 13.0, atol=1e-9)
-    np.testing.assert_array_equal(mirrored_order(mirrored_order(circle)), circle)
-    np.testing.assert_array_equal(mirrored_order(circle)[0], circle[0])
+    np.testing.assert_array_equal(mirror_order(mirror_order(circle)), circle)
+    np.testing.assert_array_equal(mirror_order(circle)[0], circle[0])

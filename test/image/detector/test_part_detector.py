@@ -19,27 +19,27 @@ from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, Pa
 from flowing_puppet_ros.image.detector.part_filters import (
     COLUMNS,
     DIMENSIONS,
-    LEFT,
-    OUTSIDE,
+    NECK_COLUMN,
+    NECK_ROW,
+    OUTSIDE_INDEX,
     PARTS,
     ROWS,
-    UP,
-    window_at,
+    extract_window,
 )
 from flowing_puppet_ros.image.detector.proposals import propose
 from flowing_puppet_ros.image.detector.root_filters import (
     RootFilters,
     correlate,
     make_level,
+    make_pyramid,
     non_max_suppression,
-    pyramid,
     window_iou,
 )
 from flowing_puppet_ros.image.detector.skin_features import skin_features
 from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
-ANYBODY = DetectorSettings(least_confidence=0.0)
+ANYBODY = DetectorSettings(min_confidence=0.0)
 
 
 @pytest.fixture(scope="module")
@@ -103,12 +103,14 @@ def test_a_mode_scores_what_its_wrist_does(person: PersonDetection) -> None:
     assert min(wrists) == pytest.approx(found[1], abs=0.5)
 
 
+@pytest.mark.slow
 def test_same_picture_same_people(detector: PartDetector) -> None:
     image, _, _ = painted.picture(np.random.default_rng(4))
     one, two = (detector.detect(image.copy(), ANYBODY) for _ in range(2))
     assert [p.keypoints.xy.tobytes() for p in one] == [p.keypoints.xy.tobytes() for p in two]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 4])
 def test_in_the_mirror_image_the_same_person_is_found_with_the_sides_swapped(detector: PartDetector, seed: int) -> None:
     image, _, _ = painted.picture(np.random.default_rng(seed), 40.0)
@@ -119,7 +121,7 @@ def test_in_the_mirror_image_the_same_person_is_found_with_the_sides_swapped(det
     np.testing.assert_allclose(joints, person.keypoints.xy, atol=0.5)
     assert person.pose.window.mirror != mirrored.pose.window.mirror
     for side, other in (("left", "right"), ("right", "left")):
-        arms, turned = person.arms(side, 3), mirrored.arms(other, 3)
+        arms, turned = person.arm_hypotheses(side, 3), mirrored.arm_hypotheses(other, 3)
         turned[..., 0] = image.shape[1] - 1 - turned[..., 0]
         np.testing.assert_allclose(turned, arms, atol=0.5)
         wrists = arms[:, 1]
@@ -127,12 +129,13 @@ def test_in_the_mirror_image_the_same_person_is_found_with_the_sides_swapped(det
         np.testing.assert_allclose(score, person.joint_score(f"{side}_wrist", wrists), atol=0.05)
 
 
+@pytest.mark.slow
 def test_people_are_reported_once_and_surest_first(detector: PartDetector) -> None:
     people = detector.detect(painted.picture(np.random.default_rng(5))[0], ANYBODY)
     assert [p.confidence for p in people] == sorted((p.confidence for p in people), reverse=True)
     for i, one in enumerate(people):
         assert all(np.linalg.norm(one.neck - two.neck) >= 0.5 * max(one.scale, two.scale) for two in people[:i])
-    few = detector.detect(painted.picture(np.random.default_rng(5))[0], DetectorSettings(most_people=1))
+    few = detector.detect(painted.picture(np.random.default_rng(5))[0], DetectorSettings(max_people=1))
     assert len(few) <= 1
 
 
@@ -187,7 +190,7 @@ def test_two_joints_in_one_place_do_not_make_a_person_small(
     placement = person.pose.placement.copy()
     placement[PARTS.index(lost[0]), 1:] = placement[PARTS.index(lost[1]), 1:]
     collapsed = replace(person.pose, placement=placement)
-    whole, changed = (detector.ranking.corrected_scale(pose, 40.0) for pose in (person.pose, collapsed))
+    whole, changed = (detector.scorer.correct_scale(pose, 40.0) for pose in (person.pose, collapsed))
     assert 0.85 * whole < changed < whole
 
 
@@ -197,10 +200,11 @@ def test_ten_people_are_no_more_work_than_asked(detector: PartDetector) -> None:
     for index in range(10):
         joints = painted.joints_at((50.0 + 88 * index, 90.0 + 20 * (index % 3)), 36.0, rng)
         painted.paint(image, joints, 36.0, rng)
-    people = detector.detect(image, DetectorSettings(most_people=5, least_confidence=0.0))
+    people = detector.detect(image, DetectorSettings(max_people=5, min_confidence=0.0))
     assert len(people) == 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 1), (1, 400, 3), (7, 9), (24, 24, 3), (400, 9), (240, 320)])
 @pytest.mark.parametrize("kind", ["black", "noise"])
 def test_images_of_any_size_without_a_person(detector: PartDetector, shape: tuple[int, ...], kind: str) -> None:
@@ -214,7 +218,7 @@ def test_images_of_any_size_without_a_person(detector: PartDetector, shape: tupl
 def test_a_hundred_megapixels_are_shrunk(detector: PartDetector) -> None:
     image = np.zeros((10_000, 10_000), np.uint8)
     image[4000:6000, 4000:6000] = 200
-    for found in detector.detect(image, DetectorSettings(largest_side=200, places=1)):
+    for found in detector.detect(image, DetectorSettings(max_side=200, max_candidates=1)):
         assert found.scale > 100
 
 
@@ -223,7 +227,7 @@ def test_a_hundred_megapixels_are_shrunk(detector: PartDetector) -> None:
     [np.zeros((0, 4, 3), np.uint8), np.zeros((4, 4, 4), np.uint8), np.zeros((9, 9)), np.zeros(9, np.uint8), None],
 )
 def test_what_is_no_image_is_one_sentence(detector: PartDetector, image: np.ndarray) -> None:
-    with pytest.raises(InputError, match="image to look for people"):
+    with pytest.raises(InputError, match="an image must be"):
         detector.detect(image)
 
 
@@ -256,7 +260,7 @@ def test_responses_are_correlations() -> None:
 
 
 def test_levels_cover_the_scales() -> None:
-    scales = [at.scale for at in pyramid(np.zeros((60, 80, 3), np.uint8), 12.0)]
+    scales = [at.scale for at in make_pyramid(np.zeros((60, 80, 3), np.uint8), 12.0)]
     assert scales[0] == pytest.approx(12.0) and 60 < scales[-1] <= 80
     np.testing.assert_allclose(np.diff(np.log2(scales)), 0.25)
 
@@ -267,21 +271,21 @@ def test_windows_move_with_the_person(x: int, y: int) -> None:
     rng = np.random.default_rng(2)
     image = rng.integers(0, 256, (160, 160, 3), dtype=np.uint8)
     moved = np.roll(image, (y, x), axis=(0, 1))
-    one = window_at(image, (80.5, 80.5), (80.5, 70.5), 20.0)
-    two = window_at(moved, (80.5 + x, 80.5 + y), (80.5 + x, 70.5 + y), 20.0)
+    one = extract_window(image, (80.5, 80.5), (80.5, 70.5), 20.0)
+    two = extract_window(moved, (80.5 + x, 80.5 + y), (80.5 + x, 70.5 + y), 20.0)
     inner = slice(12, 30)
     np.testing.assert_allclose(one.features[inner, inner, :31], two.features[inner, inner, :31], atol=1e-5)
-    np.testing.assert_allclose(two.points_of(np.array([LEFT, UP])), [80.5 + x, 80.5 + y])
-    np.testing.assert_allclose(two.cells_of(two.points_of(np.array([3.0, 4.0]))), [3.0, 4.0])
+    np.testing.assert_allclose(two.to_points(np.array([NECK_COLUMN, NECK_ROW])), [80.5 + x, 80.5 + y])
+    np.testing.assert_allclose(two.to_cells(two.to_points(np.array([3.0, 4.0]))), [3.0, 4.0])
 
 
 def test_windows_beyond_the_image_are_marked() -> None:
     image = np.full((40, 40), 90, np.uint8)
-    window = window_at(image, (20.0, 20.0), (20.0, 15.0), 40.0)
+    window = extract_window(image, (20.0, 20.0), (20.0, 15.0), 40.0)
     assert window.features.shape == (ROWS, COLUMNS, DIMENSIONS + 4)
-    inside = window.features[..., OUTSIDE] == 0
+    inside = window.features[..., OUTSIDE_INDEX] == 0
     assert 81 <= inside.sum() <= 100
-    assert not window_at(image, (900.0, 900.0), (900.0, 890.0), 40.0).features[..., :OUTSIDE].any()
+    assert not extract_window(image, (900.0, 900.0), (900.0, 890.0), 40.0).features[..., :OUTSIDE_INDEX].any()
 
 
 def test_overlap_of_windows_and_suppression(detector: PartDetector) -> None:

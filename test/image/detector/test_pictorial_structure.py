@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from flowing_puppet_ros.image.detector.pictorial_structure import (
     FilterTree,
-    best_placement,
     distance_transform,
+    find_best_placement,
     pass_down,
     pass_up,
-    score_of,
+    score_placement,
 )
 
 
@@ -57,20 +57,21 @@ def all_placements(tree: FilterTree) -> list[np.ndarray]:
     return [np.array(rows) for rows in itertools.product(*states)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_best_placement_and_marginals_agree_with_brute_force(seed: int) -> None:
     tree, unary = random_tree(np.random.default_rng(seed))
     placements = all_placements(tree)
-    scores = np.array([score_of(tree, unary, placement) for placement in placements])
+    scores = np.array([score_placement(tree, unary, placement) for placement in placements])
     beliefs = pass_down(tree, pass_up(tree, unary))
-    best = best_placement(tree, beliefs)
-    assert score_of(tree, unary, best) == pytest.approx(scores.max(), abs=1e-4)
+    best = find_best_placement(tree, beliefs)
+    assert score_placement(tree, unary, best) == pytest.approx(scores.max(), abs=1e-4)
     assert beliefs.down is not None
     marginals = beliefs.up + beliefs.down
     for part in range(4):
         for layer, y, x in [(int(tree.first[part]), 1, 2), (int(tree.first[part + 1]) - 1, 0, 0)]:
             fits = [i for i, placement in enumerate(placements) if tuple(placement[part]) == (layer, x, y)]
             assert marginals[layer, y, x] == pytest.approx(scores[fits].max(), abs=1e-4)
-            fixed = best_placement(tree, beliefs, (part, layer, x, y))
+            fixed = find_best_placement(tree, beliefs, (part, layer, x, y))
             assert tuple(fixed[part]) == (layer, x, y)
-            assert score_of(tree, unary, fixed) == pytest.approx(scores[fits].max(), abs=1e-4)
+            assert score_placement(tree, unary, fixed) == pytest.approx(scores[fits].max(), abs=1e-4)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.formats.annotations import HIDDEN, Annotations, source_of
+from flowing_puppet_ros.image.formats.annotations import HIDDEN_CONFIDENCE, Annotations, source_video
 
 NAMES = ["neck", "belly"]
 
@@ -43,11 +43,11 @@ def folder(tmp_path: Path) -> Path:
 def test_folder_of_the_annotation_tool(folder: Path) -> None:
     annotations = Annotations.load(folder / "annotations.json")
     assert len(annotations) == 3
-    image, empty, frame = annotations.frames()
+    image, empty, frame = annotations.read_frames()
     assert (image.file, image.index, len(image.people)) == ("street/a#1b.png", 0, 2)
     assert tuple(image.image[0, 0]) == (255, 0, 0), "RGB"
     assert (image.people[0].gender, image.people[0].view) == ("female", "back")
-    np.testing.assert_array_equal(image.people[0].keypoints.confidence, [1.0, HIDDEN])
+    np.testing.assert_array_equal(image.people[0].keypoints.confidence, [1.0, HIDDEN_CONFIDENCE])
     np.testing.assert_array_equal(image.people[0].keypoints.xy, [[3, 4], [5.5, 6]])
     assert (empty.index, empty.people) == (1, ())
     assert (frame.index, frame.people[0].gender, frame.people[0].view) == (4, "neutral", None)
@@ -62,19 +62,19 @@ def test_joints_a_clip(folder: Path) -> None:
     path = folder / "joints.json"
     path.write_text(json.dumps({"joint_names": NAMES, "clips": clips}))
     annotations = Annotations.load(path, folder)
-    assert [(f.file[0], f.index) for f in annotations.frames()] == [("B", 0), ("B", 2), ("B", 3), ("w", 0)]
-    assert [(f.file[0], f.index) for f in annotations.frames(2)] == [("B", 0), ("B", 3), ("w", 0)]
-    first = next(iter(annotations.frames()))
+    assert [(f.file[0], f.index) for f in annotations.read_frames()] == [("B", 0), ("B", 2), ("B", 3), ("w", 0)]
+    assert [(f.file[0], f.index) for f in annotations.read_frames(2)] == [("B", 0), ("B", 3), ("w", 0)]
+    first = next(iter(annotations.read_frames()))
     np.testing.assert_array_equal(first.people[0].keypoints.confidence, [0.25, 0.0])
     assert Annotations.load(path).folder == folder / "clips"
 
 
 def test_clips_of_one_source_are_left_out_together() -> None:
     names = ["A_b_clap_u_nm_np1_fr_med_0.avi", "A_b_shoot_bow_u_cm_np1_ri_goo_12.avi", "A_clap_u_nm_np1_fr_med_0.avi"]
-    assert [source_of(name) for name in names] == ["A_b", "A_b", "A"]
-    assert source_of("holiday/walk.mp4") == "holiday/walk"
+    assert [source_video(name) for name in names] == ["A_b", "A_b", "A"]
+    assert source_video("holiday/walk.mp4") == "holiday/walk"
     everything = Annotations(Path(), {name: {} for name in names})
-    assert list(everything.without_sources_of(Annotations(Path(), {names[0]: {}})).people) == [names[2]]
+    assert list(everything.exclude_sources_of(Annotations(Path(), {names[0]: {}})).people) == [names[2]]
 
 
 @pytest.mark.parametrize(
@@ -100,4 +100,4 @@ def test_missing_files_and_frames_are_named(folder: Path) -> None:
         path = folder / "other.json"
         path.write_text(json.dumps({"joint_names": NAMES, "images": {key: []}}))
         with pytest.raises(InputError, match=message):
-            list(Annotations.load(path).frames())
+            list(Annotations.load(path).read_frames())

@@ -66,7 +66,7 @@ def test_broken_frames_are_told_of_and_left_out_when_somebody_listens(tmp_path: 
     said: list[str] = []
     assert [frame.index for frame in open_frames(tmp_path, said.append)] == [0, 1, 3]
     assert len(said) == 1
-    assert "2.png is no readable image" in said[0]
+    assert "2.png is not a readable image" in said[0]
     with pytest.raises(InputError, match=r"2\.png"):
         list(open_frames(tmp_path))
 

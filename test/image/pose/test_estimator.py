@@ -58,7 +58,7 @@ class PaintedScene:
 class PaintedLikelihood:
     """Makes painted scenes."""
 
-    def scene(self, image: np.ndarray) -> PaintedScene:
+    def prepare(self, image: np.ndarray) -> PaintedScene:
         return PaintedScene(image)
 
 
@@ -91,7 +91,7 @@ class GuessingDetector:
 
 def standing() -> np.ndarray:
     """Joints (15,2) of a person who stands in the middle of a 320 x 320 image, the right arm held up sideways."""
-    joints = MODEL.likely().joints * SCALE + [160, 110]
+    joints = MODEL.likely_puppet().joints * SCALE + [160, 110]
     shoulder = joints[NAMES.index("right_shoulder")]
     joints[ELBOW] = shoulder + np.array([-28, 5])
     joints[WRIST] = joints[ELBOW] + [-8, -26]
@@ -214,7 +214,7 @@ def test_seen_from_behind_left_is_left(joints: np.ndarray) -> None:
 
 def test_someone_seen_from_the_side_gets_that_view() -> None:
     sides = MultiViewStructures.load()
-    profile = sides.at("E").likely().joints * SCALE + [160, 110]
+    profile = sides.at("E").likely_puppet().joints * SCALE + [160, 110]
     given = [keypoints(profile, list(NAMES))]
     image = np.zeros((320, 320), np.uint8)
     (person,) = PoseEstimator([MODEL], None, None, QUICK, [sides]).estimate(image, given)

@@ -7,8 +7,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import multivariate_normal
 
-from flowing_puppet_ros.image.pose.particle_search import elbows
-from flowing_puppet_ros.image.pose.particles import PairwiseGaussian, Particles, joint_rows, particles_of, world_points
+from flowing_puppet_ros.image.pose.particle_search import place_elbows
+from flowing_puppet_ros.image.pose.particles import (
+    PairwiseGaussian,
+    PartParticles,
+    joint_rows,
+    particles_from_puppets,
+    world_points,
+)
 from flowing_puppet_ros.model.ds.joints import PART_JOINTS
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PairLayout
@@ -18,9 +24,9 @@ SPRING = 0.04
 FRONT = np.array([1.0, 1.0])
 
 
-def particles(rng: np.random.Generator, count: int) -> Particles:
+def particles(rng: np.random.Generator, count: int) -> PartParticles:
     size = MODEL.shapes[0].basis.shape[2]
-    return Particles(
+    return PartParticles(
         rng.uniform(0, 200, (count, 2)),
         rng.uniform(-3, 3, count),
         rng.uniform(80, 120, count),
@@ -102,14 +108,14 @@ def test_a_part_between_two_places_reaches_both() -> None:
 def test_puppets_become_particles_at_their_joints() -> None:
     rng = np.random.default_rng(3)
     puppet = MODEL.puppet_from_joints(MODEL.sample(rng).joints * 110 + 150, 110.0)
-    groups = particles_of([puppet, puppet], MODEL.bone, FRONT)
+    groups = particles_from_puppets([puppet, puppet], MODEL.bone, FRONT)
     for part, group in enumerate(groups):
         ends = world_points(MODEL.shapes[part], group, joint_rows(MODEL.shapes[part])[:2])
         expected = puppet.joints[MODEL.bone[part]]
         np.testing.assert_allclose(ends[0], expected, atol=0.03 * 110)
     # From behind, x is negated and so are the particles'.
     behind = MODEL.puppet_from_joints(puppet.joints * [-1, 1], 110.0, "back")
-    mirrored = particles_of([behind], MODEL.bone, np.array([-1.0, 1.0]))
+    mirrored = particles_from_puppets([behind], MODEL.bone, np.array([-1.0, 1.0]))
     np.testing.assert_allclose(mirrored[2].center[0], groups[2].center[0])
     np.testing.assert_allclose(mirrored[2].shape[0], groups[2].shape[0], atol=1e-9)
 
@@ -118,7 +124,7 @@ def test_puppets_become_particles_at_their_joints() -> None:
 @given(st.floats(-200, 200), st.floats(-200, 200), st.floats(20, 60), st.floats(20, 60), st.integers(0, 99))
 def test_elbows_keep_arms_no_longer_than_they_are(x: float, y: float, upper: float, lower: float, seed: int) -> None:
     shoulder, wrist = np.zeros((8, 2)), np.tile([x, y], (8, 1))
-    elbow = elbows(shoulder, wrist, np.full(8, upper), np.full(8, lower), np.random.default_rng(seed))
+    elbow = place_elbows(shoulder, wrist, np.full(8, upper), np.full(8, lower), np.random.default_rng(seed))
     first = np.hypot(*elbow.T)
     second = np.hypot(*(wrist - elbow).T)
     reach = np.hypot(x, y)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.flow.affine import transform
+from flowing_puppet_ros.flow.affine import apply_affine
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.pose.evidence import KeypointPerson
 from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FlowingEnergy, FrameEvidence, propagate_joints
@@ -39,28 +39,30 @@ def bodies(count: int, view: View = "front") -> np.ndarray:
 def test_vectors_are_bodies_and_bodies_vectors(view: View) -> None:
     body = FRONT if view == "front" else UpperBodyParameters(MODEL, "back")
     joints = bodies(20, view)
-    vectors = body.vectors(joints, np.full(20, SCALE))
-    back, scale = body.joints(vectors, body.legs_of(joints[0]))
+    vectors = body.to_vectors(joints, np.full(20, SCALE))
+    back, scale = body.to_joints(vectors, body.leg_offsets(joints[0]))
     np.testing.assert_allclose(scale, SCALE)
     for name in ("neck", "belly", "face", "right_wrist", "left_wrist", "right_elbow", "left_elbow"):
         np.testing.assert_allclose(back[:, NAMES.index(name)], joints[:, NAMES.index(name)], atol=0.02 * SCALE)
     shoulders = [NAMES.index(f"{side}_shoulder") for side in ("right", "left")]
     np.testing.assert_allclose(back[:, shoulders], joints[:, shoulders], atol=0.05 * SCALE)
-    again = body.vectors(back, scale)
-    np.testing.assert_allclose(body.joints(again, body.legs_of(joints[0]))[0], back, atol=0.02 * SCALE)
+    again = body.to_vectors(back, scale)
+    np.testing.assert_allclose(body.to_joints(again, body.leg_offsets(joints[0]))[0], back, atol=0.02 * SCALE)
 
 
 def test_bounds_are_learned_and_hold_most_bodies() -> None:
-    vectors = FRONT.vectors(bodies(40), np.full(40, SCALE))
-    box = FRONT.box(vectors[0])
+    vectors = FRONT.to_vectors(bodies(40), np.full(40, SCALE))
+    box = FRONT.make_bounds(vectors[0])
     limbs = slice(1, 2 * len(PARTS))
     inside = (vectors[:, limbs] >= box.low[limbs]) & (vectors[:, limbs] <= box.high[limbs])
     assert inside.mean() > 0.96
     assert (box.high > box.low).all()
     head = PARTS.index("head")
     assert box.high[head] - box.low[head] < 2.5, "heads do not turn upside down"
-    assert FRONT.free(PARTS).all()
-    assert not FRONT.free(PARTS[:4])[[PARTS.index("left_upper_arm"), len(PARTS) + PARTS.index("left_lower_arm")]].any()
+    assert FRONT.select_values(PARTS).all()
+    assert not FRONT.select_values(PARTS[:4])[
+        [PARTS.index("left_upper_arm"), len(PARTS) + PARTS.index("left_lower_arm")]
+    ].any()
 
 
 def moving(shift: tuple[float, float], turn: float, shape_of: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -71,11 +73,11 @@ def moving(shift: tuple[float, float], turn: float, shape_of: np.ndarray) -> tup
     affine = np.column_stack([linear, centre - linear @ centre + shift])
     y, x = np.mgrid[:240, :320].astype(float)
     places = np.stack([x, y], axis=2).reshape(1, -1, 2)
-    motion = (transform(affine, places) - places).reshape(240, 320, 2)
+    motion = (apply_affine(affine, places) - places).reshape(240, 320, 2)
     inverse = np.linalg.inv(linear)
     away = (places - affine[:, 2]) @ inverse.T - places
     fields = []
-    for field, contour in ((motion, shape_of), (away.reshape(240, 320, 2), transform(affine, shape_of[None])[0])):
+    for field, contour in ((motion, shape_of), (away.reshape(240, 320, 2), apply_affine(affine, shape_of[None])[0])):
         mask = np.zeros((240, 320), np.uint8)
         cv2.fillPoly(mask, [np.round(contour).astype(np.int32)], 1)
         fields.append(np.where(mask[..., None] > 0, field, 0.0).astype(np.float32))
@@ -87,16 +89,16 @@ def test_motions_by_sums_are_those_of_the_flow() -> None:
     torso = puppet.contours[0]
     forward, backward, affine = moving((6.0, -3.0), 0.05, torso)
     moments = FlowMoments.of((forward, backward), GRID, np.zeros(2), np.array([319.0, 239.0]))
-    found, weight = moments.affine(np.stack([torso, torso + 1000.0]))
-    np.testing.assert_allclose(transform(found[0], torso[None])[0], transform(affine, torso[None])[0], atol=0.7)
+    found, weight = moments.fit_affine(np.stack([torso, torso + 1000.0]))
+    np.testing.assert_allclose(apply_affine(found[0], torso[None])[0], apply_affine(affine, torso[None])[0], atol=0.7)
     assert weight[0] > 500
     assert weight[1] == 0.0
     np.testing.assert_allclose(found[1], np.eye(2, 3), atol=1e-9)
     half = ImageScale((640, 480), (320, 240))
     twice = FlowMoments.of((forward, backward), half, np.zeros(2), np.array([639.0, 479.0]))
     large = (torso + 0.5) * 2 - 0.5
-    expected = (transform(affine, torso[None])[0] + 0.5) * 2 - 0.5
-    np.testing.assert_allclose(transform(twice.affine(large[None])[0][0], large[None])[0], expected, atol=1.5)
+    expected = (apply_affine(affine, torso[None])[0] + 0.5) * 2 - 0.5
+    np.testing.assert_allclose(apply_affine(twice.fit_affine(large[None])[0][0], large[None])[0], expected, atol=1.5)
 
 
 def test_puppets_are_carried_joint_by_joint() -> None:
@@ -111,8 +113,8 @@ def test_puppets_are_carried_joint_by_joint() -> None:
     np.testing.assert_allclose(moved[inside & upper], np.tile([4.0, 2.0], (int(np.sum(inside & upper)), 1)), atol=0.5)
 
 
-class Told:
-    """A detection that knows the true joints, and a false pose besides."""
+class GivenDetection:
+    """A detection with the true joints and an additional false pose."""
 
     def __init__(self, joints: np.ndarray, modes: Sequence[np.ndarray]) -> None:
         self._given = KeypointPerson(Keypoints(NAMES, joints, np.ones(len(NAMES))), 0.4 * SCALE)
@@ -127,7 +129,7 @@ class Told:
 
 
 def clip(lost: int) -> tuple[list[InitialPose], list[FrameEvidence], np.ndarray]:
-    """Five images of somebody who moves 3 px an image; in the image `lost` the detector says nothing of the arms."""
+    """Five images of a person moving by 3 px per image; in the image `lost` the detector misses the arms."""
     first = bodies(1)[0]
     truth = first + 3.0 * np.arange(5)[:, None, None] * [1.0, 0.0]
     false = truth.copy()
@@ -135,8 +137,8 @@ def clip(lost: int) -> tuple[list[InitialPose], list[FrameEvidence], np.ndarray]
     flow = np.full((240, 320, 2), (3.0, 0.0), np.float32)
     frames = []
     for t, joints in enumerate(truth):
-        told = Told(np.full_like(joints, np.nan) if t == lost else joints, [false[t]])
-        frames.append(FrameEvidence(None, None, told))
+        given = GivenDetection(np.full_like(joints, np.nan) if t == lost else joints, [false[t]])
+        frames.append(FrameEvidence(None, None, given))
     for a, b in pairwise(frames):
         a.after = FlowMoments.of((flow, -flow), GRID, np.zeros(2), np.array([319.0, 239.0]))
         b.before = FlowMoments.of((-flow, flow), GRID, np.zeros(2), np.array([319.0, 239.0]))
@@ -147,6 +149,7 @@ def clip(lost: int) -> tuple[list[InitialPose], list[FrameEvidence], np.ndarray]
 QUICK = {"particles": 20, "carried": 4, "rounds": 2, "seeds": 1, "iterations": 3}
 
 
+@pytest.mark.slow
 def test_the_loop_finds_the_arms_and_repeats_itself() -> None:
     starts, frames, truth = clip(lost=9)
     energy = EnergySettings(prior_weight=0.01)
@@ -161,6 +164,7 @@ def test_the_loop_finds_the_arms_and_repeats_itself() -> None:
     assert more[2].sum() <= runs[0][2].sum() + 1e-9, "of several seeds the best is taken"
 
 
+@pytest.mark.slow
 def test_an_image_that_tells_nothing_learns_from_its_neighbours() -> None:
     starts, frames, truth = clip(lost=2)
     loop = ThesisLoop(MODEL, "front", LoopSettings(**QUICK), EnergySettings(prior_weight=0.01))
@@ -183,7 +187,7 @@ def test_the_energy_adds_the_evidence_at_the_carried_puppet() -> None:
     right, wrong = truth[1:2], truth[1:2] + 10.0
     terms = FlowingEnergy(FRONT, frames, EnergySettings(backward=False)).terms(1, np.concatenate([right, wrong]),
                                                                               np.full(2, SCALE))[2]  # fmt: skip
-    assert terms[0, 3] > terms[1, 3], "the true puppet is carried onto the next image's detection"
+    assert terms[0, 3] > terms[1, 3], "the true puppet is propagated onto the next image's detection"
     assert energies["two"][2][0, 3] <= energies["forward"][2][0, 3] <= 0.0
     assert (
         not FlowingEnergy(FRONT, frames, EnergySettings(backward=False)).terms(4, truth[4:], np.array([SCALE]))[2].any()
@@ -192,16 +196,16 @@ def test_the_energy_adds_the_evidence_at_the_carried_puppet() -> None:
 
 def test_wrists_go_where_hands_are_and_arms_follow() -> None:
     joints = bodies(1)
-    vectors = np.repeat(FRONT.vectors(joints, np.full(1, SCALE)), 50, axis=0)
-    box, legs = FRONT.box(vectors[0]), FRONT.legs_of(joints[0])
+    vectors = np.repeat(FRONT.to_vectors(joints, np.full(1, SCALE)), 50, axis=0)
+    box, legs = FRONT.make_bounds(vectors[0]), FRONT.leg_offsets(joints[0])
     neck = joints[0, NAMES.index("neck")]
     places = neck + np.array([[40.0, 60.0], [-40.0, 60.0]])
     moves = WristProposals(FRONT, box, legs, places, (np.array([1.0, 1.0]), np.array([0.0, 1.0])))
     moved = moves(vectors, np.random.default_rng(0))
     assert ((moved >= box.low) & (moved <= box.high)).mean() > 0.9
-    after, _ = FRONT.joints(moved, legs)
+    after, _ = FRONT.to_joints(moved, legs)
     wrists = after[:, [NAMES.index("right_wrist"), NAMES.index("left_wrist")]]
     reached = np.linalg.norm(wrists[:, :, None] - places, axis=3).min(axis=2) < 1.0
     assert reached.any(axis=1).all()
     trunk = [NAMES.index(name) for name in ("neck", "belly", "face")]
-    np.testing.assert_allclose(after[:, trunk], np.repeat(FRONT.joints(vectors[:1], legs)[0][:, trunk], 50, axis=0))
+    np.testing.assert_allclose(after[:, trunk], np.repeat(FRONT.to_joints(vectors[:1], legs)[0][:, trunk], 50, axis=0))

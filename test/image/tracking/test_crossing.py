@@ -11,11 +11,13 @@ from flowing_puppet_ros.image.tracking.appearance import torso_appearances
 from flowing_puppet_ros.image.tracking.association import associate
 from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
 
+pytestmark = pytest.mark.slow
+
 Place = tuple[float, float]
 
 
-def whose(result: object, truth: dict[str, np.ndarray]) -> dict[str, str]:
-    """Name -> id of the puppet nearest to each person's joints."""
+def match_ids(result: object, truth: dict[str, np.ndarray]) -> dict[str, str]:
+    """Map each name to the id of the puppet nearest to the joints."""
     puppets = result.puppets  # type: ignore[attr-defined]
     found = {}
     for name, joints in truth.items():
@@ -31,12 +33,12 @@ def test_people_who_cross_keep_their_ids() -> None:
         left, right = pose(0, (60 + 10 * time, 118)), pose(0, (260 - 10 * time, 122))
         result = follower.step(draw(left, right), time, [detection(left), detection(right)])
         if time == 0:
-            ids = whose(result, {"left": left, "right": right})
+            ids = match_ids(result, {"left": left, "right": right})
     assert len(set(ids.values())) == 2
-    assert whose(result, {"left": left, "right": right}) == ids
+    assert match_ids(result, {"left": left, "right": right}) == ids
 
 
-def test_who_is_hidden_for_ten_images_keeps_the_id() -> None:
+def test_a_person_hidden_for_ten_images_keeps_the_id() -> None:
     follower = tracker()
     ids = {}
     for time in range(22):
@@ -45,8 +47,8 @@ def test_who_is_hidden_for_ten_images_keeps_the_id() -> None:
         seen = [detection(passing)] if hidden else [detection(still), detection(passing)]
         result = follower.step(draw(still, passing), time, seen)
         if time == 0:
-            ids = whose(result, {"still": still, "passing": passing})
-    assert whose(result, {"still": still, "passing": passing}) == ids
+            ids = match_ids(result, {"still": still, "passing": passing})
+    assert match_ids(result, {"still": still, "passing": passing}) == ids
     assert len(result.puppets) == 2
 
 
@@ -70,14 +72,14 @@ def test_people_in_different_clothes_keep_their_ids_where_one_hides_the_other(me
         seen = [detection(people[name]) for name in (order[1:] if hidden else order)]
         result = follower.step(image, time, seen)
         if time == 3:
-            ids = whose(result, people)
+            ids = match_ids(result, people)
     assert len(set(ids.values())) == 2
-    assert whose(result, people) == ids
+    assert match_ids(result, people) == ids
     assert len(result.puppets) == 2
 
 
-def test_of_two_who_stand_as_near_the_clothes_tell_whose_the_detection_is() -> None:
-    """Joints alone would give the detections to the others, by a few millimetres."""
+def test_at_equal_distance_the_appearance_decides_who_was_detected() -> None:
+    """Joints alone would swap the detections, by a few millimetres."""
     image = draw(pose(0, (90, 118)), pose(0, (230, 118)), shirts=[RED, BLUE])
     red, blue = torso_appearances(NAMES, image, [pose(0, (90, 118)), pose(0, (230, 118))])
     assert red is not None and blue is not None
@@ -86,7 +88,7 @@ def test_of_two_who_stand_as_near_the_clothes_tell_whose_the_detection_is() -> N
     people[1].mean += 0.5
     found = [(people[1].mean + 0.2, np.ones(len(joints))), (joints - 0.2, np.ones(len(joints)))]
     assert associate(people, found, 0.5)[0] == {0: 1, 1: 0}
-    for person, clothes in zip(people, (red, blue), strict=True):
-        person.update_appearance(clothes.colours)
+    for person, appearance in zip(people, (red, blue), strict=True):
+        person.update_appearance(appearance.colours)
     assert associate(people, found, 0.5, [red, blue])[0] == {0: 0, 1: 1}
     assert associate(people, found, 0.5, [blue, red])[0] == {0: 1, 1: 0}

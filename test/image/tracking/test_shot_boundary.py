@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cuts are told from motion, pans, brightening and still pictures."""
+"""Cuts are distinguished from motion, pans, brightening and still pictures."""
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ def scene(seed: int) -> np.ndarray:
 
 
 def cut(before: np.ndarray, after: np.ndarray) -> bool:
-    return is_cut(colour_histogram(before), colour_histogram(after), FLOW.at_working_scale(before, after))
+    return is_cut(colour_histogram(before), colour_histogram(after), FLOW.estimate_at_working_scale(before, after))
 
 
 def test_another_scene_is_a_cut() -> None:

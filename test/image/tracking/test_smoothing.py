@@ -128,7 +128,7 @@ def test_a_drawn_persons_noisy_joints_come_closer_and_calmer() -> None:
 
 
 def test_people_come_and_go() -> None:
-    follower, clip = tracker(missed_detections=1), OfflineSmoother(CapsuleModel(), SETTINGS)  # type: ignore[arg-type]
+    follower, clip = tracker(max_missed_detections=1), OfflineSmoother(CapsuleModel(), SETTINGS)  # type: ignore[arg-type]
     one, other = pose(0, (90, 118)), pose(0, (230, 118))
     seen = [[], [one], [one, other], [one, other], [other], [other], []]
     for t, people in enumerate(seen):

@@ -100,7 +100,7 @@ def test_two_people_keep_their_ids_whatever_the_order_of_detections() -> None:
         result = follower.step(draw(first, second), time, people[:: 1 if time % 2 == 0 else -1])
         assert [puppet.id for puppet in result.puppets] == ["a1", "a2"]
         assert result.puppets[0].joints[:, 0].mean() < result.puppets[1].joints[:, 0].mean()
-    labels = result.labels()
+    labels = result.render_part_labels()
     assert labels.shape == (240, 320)
     assert labels.max() <= 10
     assert (labels[:, :140] == 1).any()
@@ -115,7 +115,7 @@ def test_a_second_detection_of_a_person_starts_nobody() -> None:
 
 
 def test_people_end_when_missed_often_and_ids_are_not_used_again() -> None:
-    follower = tracker(missed_detections=2)
+    follower = tracker(max_missed_detections=2)
     image = draw(pose(0))
     follower.step(image, 0, [detection(pose(0))])
     counts = [len(follower.step(image, time, []).puppets) for time in range(1, 4)]
@@ -126,7 +126,7 @@ def test_people_end_when_missed_often_and_ids_are_not_used_again() -> None:
 
 
 def test_people_end_when_unseen_for_long_or_outside_the_image() -> None:
-    follower = tracker(unseen_images=2)
+    follower = tracker(max_unmatched_images=2)
     image = draw(pose(0))
     follower.step(image, 0, [detection(pose(0))])
     assert [len(follower.step(image, time).puppets) for time in range(1, 4)] == [1, 1, 0]
@@ -154,7 +154,7 @@ def test_joints_outside_the_image_keep_a_low_confidence() -> None:
     outside = puppet.joints[:, 1] > SIZE[1]
     assert outside.any()
     assert puppet.confidence[outside].max() < 0.1 < puppet.confidence[~outside].min()
-    assert result.labels().shape == (240, 320)
+    assert result.render_part_labels().shape == (240, 320)
 
 
 def test_unknown_joints_are_completed_and_doubtful() -> None:
@@ -183,7 +183,7 @@ def test_nearer_parts_cover_farther_ones_in_depth_and_labels() -> None:
     (puppet,) = result.puppets
     index = CapsuleModel.tree.index
     assert puppet.depth[index("left_lower_arm")] > puppet.depth[index("torso")]
-    assert result.labels()[84, 155] == index("left_lower_arm") + 1
+    assert result.render_part_labels()[84, 155] == index("left_lower_arm") + 1
 
 
 def test_larger_people_are_nearer() -> None:
@@ -192,8 +192,8 @@ def test_larger_people_are_nearer() -> None:
     result = follower.step(draw(far, near), 0, [detection(near), detection(far)])
     if len(result.puppets) == 2:
         alone = tracker().step(draw(near), 0, [detection(near)])
-        inside = alone.labels() > 0
-        np.testing.assert_array_equal(result.labels()[inside], alone.labels()[inside])
+        inside = alone.render_part_labels() > 0
+        np.testing.assert_array_equal(result.render_part_labels()[inside], alone.render_part_labels()[inside])
 
 
 def test_ids_begin_with_the_seed() -> None:

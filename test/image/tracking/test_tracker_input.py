@@ -96,7 +96,7 @@ def test_bad_detections_neither_start_nor_disturb_anybody(bad: Keypoints) -> Non
 
 def test_random_input_never_breaks_the_tracker() -> None:
     chance = np.random.default_rng(8)
-    follower = tracker(most_people=3)
+    follower = tracker(max_people=3)
     image = draw(pose(0))
     for time in range(40):
         people = []
@@ -110,7 +110,7 @@ def test_random_input_never_breaks_the_tracker() -> None:
             assert np.isfinite(puppet.joints).all()
             assert np.isfinite(puppet.energy)
             assert ((puppet.confidence >= 0) & (puppet.confidence <= 1)).all()
-        result.labels()
+        result.render_part_labels()
 
 
 @pytest.mark.parametrize("image", [np.zeros((0, 0, 3), np.uint8), np.zeros((9, 9), np.uint8), np.zeros((50, 50, 3))])

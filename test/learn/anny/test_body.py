@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.learn.anny.body import STATURE_LIMITS, AnnyBody
+from flowing_puppet_ros.learn.anny.body import STATURE_LIMITS_M, AnnyBody
 from flowing_puppet_ros.learn.anny.poses import FROM_MOCAP, MOCAP_JOINTS, PoseSampler
-from flowing_puppet_ros.learn.anny.segmentation import part_of_vertex
+from flowing_puppet_ros.learn.anny.segmentation import assign_vertices_to_parts
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
@@ -27,15 +27,15 @@ def poses(body: AnnyBody) -> PoseSampler:
 
 
 def test_resting_bones_leave_the_body_at_rest(body: AnnyBody) -> None:
-    rest = body.rest(body.mean_phenotype())
+    rest = body.make_rest_body(body.mean_phenotype())
     vertices, joints = body.pose(rest, np.tile(np.eye(3), (len(body.bone_names), 1, 1)))
     np.testing.assert_allclose(vertices, rest.vertices, atol=1e-6)
     np.testing.assert_allclose(joints, rest.joints, atol=1e-12)
 
 
 def test_people_face_forward_with_their_left_at_y(body: AnnyBody) -> None:
-    rest = body.rest(body.sample_phenotype(np.random.default_rng(0)))
-    named = body.landmarks(rest.vertices, rest.joints)
+    rest = body.make_rest_body(body.sample_phenotype(np.random.default_rng(0)))
+    named = body.locate_landmarks(rest.vertices, rest.joints)
     assert named["nose"][0] > named["left_ear"][0] + 0.05
     assert named["left_wrist"][1] > 0.2
     assert named["left_toe"][0] > named["left_heel"][0] + 0.15
@@ -44,7 +44,7 @@ def test_people_face_forward_with_their_left_at_y(body: AnnyBody) -> None:
 
 
 def test_a_mirrored_pose_gives_the_mirror_image(body: AnnyBody, poses: PoseSampler) -> None:
-    rest = body.rest(body.mean_phenotype())
+    rest = body.make_rest_body(body.mean_phenotype())
     pose = poses.sample(np.random.default_rng(1), 1)[0]
     mirrored = (MIRROR[:, None] * pose * MIRROR)[body.mirror_bone]
     vertices, image = body.pose(rest, pose)[0], body.pose(rest, mirrored)[0]
@@ -52,16 +52,17 @@ def test_a_mirrored_pose_gives_the_mirror_image(body: AnnyBody, poses: PoseSampl
 
 
 def test_a_chosen_subset_is_the_same_as_all(body: AnnyBody, poses: PoseSampler) -> None:
-    rest, pose = body.rest(body.mean_phenotype()), poses.sample(np.random.default_rng(2), 2)
+    rest, pose = body.make_rest_body(body.mean_phenotype()), poses.sample(np.random.default_rng(2), 2)
     ids = np.array([5, 700, 9000])
     np.testing.assert_allclose(body.pose(rest, pose, ids)[0], body.pose(rest, pose)[0][:, ids], atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gender", ["neutral", "female", "male"])
 def test_people_are_adults(gender: str) -> None:
     body, rng = AnnyBody(gender), np.random.default_rng(3)
-    statures = [body.rest(body.sample_phenotype(rng)).stature for _ in range(12)]
-    assert STATURE_LIMITS[0] - 0.01 < min(statures) < max(statures) < STATURE_LIMITS[1] + 0.01
+    statures = [body.make_rest_body(body.sample_phenotype(rng)).stature for _ in range(12)]
+    assert STATURE_LIMITS_M[0] - 0.01 < min(statures) < max(statures) < STATURE_LIMITS_M[1] + 0.01
 
 
 def test_unknown_gender_is_one_sentence() -> None:
@@ -70,9 +71,9 @@ def test_unknown_gender_is_one_sentence() -> None:
 
 
 def test_t_pose_of_the_motion_capture_stretches_the_arms(body: AnnyBody, poses: PoseSampler) -> None:
-    rest = body.rest(body.mean_phenotype())
+    rest = body.make_rest_body(body.mean_phenotype())
     rotations = poses.retarget(np.zeros((1, MOCAP_JOINTS, 3)))[0]
-    joints = body.landmarks(*body.pose(rest, rotations))
+    joints = body.locate_landmarks(*body.pose(rest, rotations))
     for side, sign in (("left", 1), ("right", -1)):
         for upper, lower in (("shoulder", "elbow"), ("elbow", "wrist")):
             bone = joints[f"{side}_{lower}"] - joints[f"{side}_{upper}"]
@@ -84,8 +85,8 @@ def test_t_pose_of_the_motion_capture_stretches_the_arms(body: AnnyBody, poses: 
 def test_motion_capture_turns_the_same_limb_the_same_way(body: AnnyBody, poses: PoseSampler) -> None:
     frames = np.zeros((1, MOCAP_JOINTS, 3))
     frames[0, 3] = [np.radians(80), 0, 0]  # left knee, about the axis that points left; matrices act on row vectors
-    rest = body.rest(body.mean_phenotype())
-    before, after = (body.landmarks(*body.pose(rest, poses.retarget(f)[0])) for f in (0 * frames, frames))
+    rest = body.make_rest_body(body.mean_phenotype())
+    before, after = (body.locate_landmarks(*body.pose(rest, poses.retarget(f)[0])) for f in (0 * frames, frames))
     shin = [j["left_ankle"] - j["left_knee"] for j in (before, after)]
     turn = FROM_MOCAP @ rotation.exp(frames[0, 3]).T @ FROM_MOCAP.T
     np.testing.assert_allclose(shin[1], turn @ shin[0], atol=1e-6)
@@ -103,7 +104,7 @@ def test_broken_motion_capture_is_one_sentence(body: AnnyBody, tmp_path: Path) -
 
 
 def test_segmentation_is_symmetric_and_whole(body: AnnyBody) -> None:
-    part = part_of_vertex(body)
+    part = assign_vertices_to_parts(body)
     assert set(part) == set(range(16))
     mirror = np.array(PartTree.from_parents(SP_PARENTS).mirror)
     np.testing.assert_array_equal(mirror[part[body.mirror_vertex]], part)
@@ -114,7 +115,7 @@ def test_stitched_puppet_can_be_any_anny_body(body: AnnyBody, poses: PoseSampler
     model, ids = StitchedPuppet.load("neutral"), load("sp", "neutral")["anny_vertex"]
     rng = np.random.default_rng(1234)
     for pose in poses.sample(rng, 4):
-        target = body.pose(body.rest(body.sample_phenotype(rng)), pose, ids)[0]
+        target = body.pose(body.make_rest_body(body.sample_phenotype(rng)), pose, ids)[0]
         fitted = model.vertices(_closest_state(model, target))
         assert np.linalg.norm(fitted - target, axis=1).mean() < 0.008
         assert np.linalg.norm(fitted - target, axis=1).max() < 0.06

@@ -4,11 +4,11 @@
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.learn.ds.contour import closed_contour, resample_sides, silhouette
+from flowing_puppet_ros.learn.ds.contour import fill_silhouette, resample_sides, trace_contour
 
 
 def disc(radius: float, center: tuple[float, float] = (0.0, 0.0), count: int = 90) -> tuple[np.ndarray, np.ndarray]:
-    """A fan of triangles: points (count + 1, 2), triangles (count, 3)."""
+    """Return a fan of triangles: points (count + 1, 2), triangles (count, 3)."""
     angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
     rim = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     around = np.arange(count)
@@ -17,7 +17,7 @@ def disc(radius: float, center: tuple[float, float] = (0.0, 0.0), count: int = 9
 
 
 def capsule(length: float, radius: float, bulge: float = 0.0, count: int = 400) -> np.ndarray:
-    """Outline (4 * count, 2) around a bone on the x axis; `bulge` widens the side of positive y in the middle."""
+    """Return the outline (4 * count, 2) of a bone on the x axis; `bulge` widens the side of positive y midway."""
     x = np.linspace(-length / 2, length / 2, count)
     cap = np.linspace(-np.pi / 2, np.pi / 2, count)
     right = np.stack([length / 2 + radius * np.cos(cap), radius * np.sin(cap)], axis=1)
@@ -28,7 +28,7 @@ def capsule(length: float, radius: float, bulge: float = 0.0, count: int = 400) 
 def test_silhouette_covers_the_pixels_inside_any_triangle() -> None:
     rng = np.random.default_rng(0)
     points, triangles = rng.uniform(-5, 35, (12, 2)), rng.integers(0, 12, (6, 3), dtype=np.int32)
-    mask = silhouette(points, triangles, (30, 40))
+    mask = fill_silhouette(points, triangles, (30, 40))
     y, x = np.mgrid[:30, :40]
     expected = np.zeros((30, 40), bool)
     for face in triangles:
@@ -45,7 +45,7 @@ def test_silhouette_covers_the_pixels_inside_any_triangle() -> None:
 
 def test_closed_contour_follows_the_rim_of_a_disc() -> None:
     points, triangles = disc(0.1, (0.7, -0.3))
-    contour = closed_contour(points, triangles)
+    contour = trace_contour(points, triangles)
     radius = np.linalg.norm(contour - (0.7, -0.3), axis=1)
     assert abs(radius - 0.1).max() < 0.003
     steps = np.linalg.norm(np.diff(contour, axis=0, append=contour[:1]), axis=1)
@@ -54,13 +54,13 @@ def test_closed_contour_follows_the_rim_of_a_disc() -> None:
 
 def test_closed_contour_takes_the_largest_piece() -> None:
     (large, first), (small, second) = disc(0.1), disc(0.03, (0.4, 0.0))
-    contour = closed_contour(np.vstack([large, small]), np.vstack([first, second + len(large)]))
+    contour = trace_contour(np.vstack([large, small]), np.vstack([first, second + len(large)]))
     assert contour[:, 0].max() < 0.11
 
 
 def test_closed_contour_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="covers no area"):
-        closed_contour(np.zeros((3, 2)), np.array([[0, 1, 2]]))
+        trace_contour(np.zeros((3, 2)), np.array([[0, 1, 2]]))
 
 
 def test_sides_are_sampled_evenly_between_the_crossings_of_the_bone_line() -> None:

@@ -29,12 +29,12 @@ TORSO = {
 
 
 def width(bend: float) -> float:
-    """Half the width of a cardboard upper arm: it swells as the elbow bends."""
+    """Return half the width of a cardboard upper arm, which swells as the elbow bends."""
     return 0.04 + 0.02 * (1 - np.cos(bend))
 
 
 def ellipse(start: np.ndarray, end: np.ndarray, half_width: float) -> np.ndarray:
-    """Closed outline around a bone, 3 cm longer at both ends."""
+    """Return the closed outline around a bone, 3 cm longer at both ends."""
     angle = np.linspace(0, 2 * np.pi, 400, endpoint=False)
     axis = (end - start) / np.linalg.norm(end - start)
     across = np.array([-axis[1], axis[0]])
@@ -43,7 +43,7 @@ def ellipse(start: np.ndarray, end: np.ndarray, half_width: float) -> np.ndarray
 
 
 def cardboard(rng: np.random.Generator) -> tuple[Projection, dict[str, float]]:
-    """A flat person in a random pose, with the bend of each elbow."""
+    """Make a flat person in a random pose; also return the bend of each elbow."""
     joints = {name: np.array(xy) * rng.normal(1, 0.02) for name, xy in TORSO.items()}
     joints["face"] = joints["neck"] + [rng.normal(0, 0.01), -0.15]
     bends = {}
@@ -70,12 +70,12 @@ def cardboard(rng: np.random.Generator) -> tuple[Projection, dict[str, float]]:
 def training() -> TrainingSet:
     rng = np.random.default_rng(0)
     people = [cardboard(rng)[0] for _ in range(200)]
-    return collect(TREE, [image for one in people for image in (one, one.mirrored())])
+    return collect(TREE, [image for one in people for image in (one, one.mirror())])
 
 
 @pytest.fixture(scope="module")
 def model(training: TrainingSet) -> DeformableStructures:
-    return fit.fit("neutral", training)
+    return fit.fit_puppet("neutral", training)
 
 
 def test_parts_are_aligned_to_their_bones(training: TrainingSet) -> None:
@@ -114,12 +114,13 @@ def test_arms_swell_with_the_bend_of_unseen_poses(model: DeformableStructures) -
     assert abs(np.mean(errors)) < 0.002
 
 
+@pytest.mark.slow
 def test_views_have_torsos_of_their_own_and_limbs_in_common() -> None:
     rng = np.random.default_rng(1)
     people = [cardboard(rng)[0] for _ in range(30)]
 
     def narrowed(image: Projection, factor: float) -> Projection:
-        """The person of cardboard with shoulders and hips drawn in, arms and legs moved along with them."""
+        """Narrow shoulders and hips of a cardboard person, and move arms and legs along with them."""
         joints = {}
         for name, xy in image.joints.items():
             side, _, joint = name.partition("_")
@@ -136,7 +137,7 @@ def test_views_have_torsos_of_their_own_and_limbs_in_common() -> None:
     sets = [collect(TREE, [narrowed(one, factor) for one in people]) for factor in factors]
     sides = MultiViewStructures.from_arrays("neutral", 10, fit_views(sets, 4))
     left, right = (sides.views[0].joint_names.index(f"{side}_shoulder") for side in ("left", "right"))
-    widths = [view.likely().joints[left, 0] - view.likely().joints[right, 0] for view in sides.views]
+    widths = [view.likely_puppet().joints[left, 0] - view.likely_puppet().joints[right, 0] for view in sides.views]
     np.testing.assert_allclose(widths, 0.36 * factors, atol=0.02)
     for view, training in zip(sides.views, sets, strict=True):
         middle = training.joints[:, :2].mean(axis=1, keepdims=True)
@@ -186,10 +187,10 @@ def test_camera_keeps_left_on_the_right_and_up_on_top() -> None:
 
 def test_mirror_image_exchanges_sides() -> None:
     person, _ = cardboard(np.random.default_rng(4))
-    mirrored = person.mirrored()
+    mirrored = person.mirror()
     np.testing.assert_allclose(mirrored.joints["left_wrist"], person.joints["right_wrist"] * [-1, 1])
     np.testing.assert_allclose(mirrored.contours["torso"], person.contours["torso"] * [-1, 1])
-    np.testing.assert_allclose(mirrored.mirrored().joints["left_knee"], person.joints["left_knee"])
+    np.testing.assert_allclose(mirrored.mirror().joints["left_knee"], person.joints["left_knee"])
 
 
 @pytest.mark.parametrize(
@@ -213,11 +214,12 @@ def test_unusable_arguments_are_told_before_any_work(tmp_path: Path, flag: str, 
         command.run(arguments)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     find_spec("anny") is None or find_spec("body_models") is None, reason="the Anny body is for learning"
 )
 def test_projected_bodies_hold_their_joints() -> None:
-    people = samples.People("female", 14)
+    people = samples.BodySampler("female", 14)
     first, again = (samples.make_training_set(people, 4, np.random.default_rng(3)) for _ in range(2))
     np.testing.assert_array_equal(first.joints, again.joints)
     assert first.joint_names == JOINT_NAMES[14] and len(first.joints) == 8

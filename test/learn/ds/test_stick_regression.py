@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.formats.keypoints import SHOULDER_OUTWARDS, TRUNK_LOWERED, joints_from_keypoints
+from flowing_puppet_ros.image.formats.keypoints import SHOULDER_SPREAD, TRUNK_DROP, joints_from_keypoints
 from flowing_puppet_ros.image.formats.stick_regression import TORSO, UPPER_ARMS, StickRegression
 from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints, write_sticks
 from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
@@ -23,10 +23,10 @@ SCALE = 140.0
 
 @pytest.fixture(scope="module")
 def joints(body: AnnyBody) -> np.ndarray:
-    """Joints (20,J,2) px of posed bodies before random cameras."""
+    """Joints (20, J, 2) px of posed bodies before random cameras."""
     rng = np.random.default_rng(11)
-    vertices, bones = body.pose(body.rest(body.mean_phenotype()), PoseSampler(body, None).sample(rng, 20))
-    marks = body.landmarks(vertices, bones)
+    vertices, bones = body.pose(body.make_rest_body(body.mean_phenotype()), PoseSampler(body, None).sample(rng, 20))
+    marks = body.locate_landmarks(vertices, bones)
     seen = []
     for k in range(20):
         camera = RandomCamera.draw(rng, CameraView())
@@ -37,7 +37,7 @@ def joints(body: AnnyBody) -> np.ndarray:
 def test_joints_and_scale_of_bodies_come_back_from_their_sticks(joints: np.ndarray) -> None:
     scales, off = [], []
     for one in joints:
-        found, scale = REGRESSION(sticks_from_joints(MODEL.joint_names, one), marked=False)
+        found, scale = REGRESSION(sticks_from_joints(MODEL.joint_names, one), is_marked=False)
         scales.append(scale / SCALE)
         off.append(np.linalg.norm(found - one, axis=1) / SCALE)
     by_joint = dict(zip(MODEL.joint_names, np.median(off, axis=0), strict=True))
@@ -52,25 +52,25 @@ def test_joints_and_scale_of_bodies_come_back_from_their_sticks(joints: np.ndarr
 def test_marked_sticks_are_mapped_to_the_puppets_shoulders(joints: np.ndarray) -> None:
     own = sticks_from_joints(MODEL.joint_names, joints[0])
     marked = own.copy()
-    trunk = (own[TORSO, 1] - own[TORSO, 0]) * TRUNK_LOWERED
+    trunk = (own[TORSO, 1] - own[TORSO, 0]) * TRUNK_DROP
     marked[TORSO] -= trunk
     left, right = (own[k, 0] for k in UPPER_ARMS)
-    inwards = SHOULDER_OUTWARDS / (1 + 2 * SHOULDER_OUTWARDS) * (left - right)
+    inwards = SHOULDER_SPREAD / (1 + 2 * SHOULDER_SPREAD) * (left - right)
     marked[UPPER_ARMS[0], 0] = left - trunk - inwards
     marked[UPPER_ARMS[1], 0] = right - trunk + inwards
     found, _ = REGRESSION(marked)
-    direct, _ = REGRESSION(own, marked=False)
+    direct, _ = REGRESSION(own, is_marked=False)
     np.testing.assert_allclose(found, direct, atol=0.01 * SCALE)
 
 
 def test_people_seen_from_behind_and_with_unknown_ends(joints: np.ndarray) -> None:
     sticks = sticks_from_joints(MODEL.joint_names, joints[1])
     mirrored = joints[1] * (-1.0, 1.0) + (320.0, 0.0)
-    back, _ = REGRESSION(sticks_from_joints(MODEL.joint_names, mirrored), marked=False)
-    front, _ = REGRESSION(sticks, marked=False)
+    back, _ = REGRESSION(sticks_from_joints(MODEL.joint_names, mirrored), is_marked=False)
+    front, _ = REGRESSION(sticks, is_marked=False)
     np.testing.assert_allclose(back * (-1.0, 1.0) + (320.0, 0.0), front, atol=1e-6)
     sticks[3, 1] = np.nan
-    found, _ = REGRESSION(sticks, marked=False)
+    found, _ = REGRESSION(sticks, is_marked=False)
     assert np.isfinite(found).all()
     with pytest.raises(InputError, match="scale"):
         REGRESSION(np.full((6, 2, 2), np.nan))

@@ -11,11 +11,17 @@ import pytest
 
 from flowing_puppet_ros.cli.evaluate import likelihood
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.image.likelihood import Ranks, rank, table
+from flowing_puppet_ros.evaluate.image.likelihood import Ranks, format_ranks, rank_limbs
 from flowing_puppet_ros.image.formats.annotations import Annotations
 from flowing_puppet_ros.learn.likelihood import command
-from flowing_puppet_ros.learn.likelihood.samples import WRONG_METRES, Moves, Posed, posed_people, wrong_contours
-from flowing_puppet_ros.learn.likelihood.training import LikelihoodSettings, learn
+from flowing_puppet_ros.learn.likelihood.samples import (
+    MIN_WRONG_DISTANCE_M,
+    ContourPerturbation,
+    PosedPerson,
+    perturb_contours,
+    pose_people,
+)
+from flowing_puppet_ros.learn.likelihood.training import LikelihoodSettings, learn_likelihood
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 SKIN, WIDTHS = (190, 140, 115), {"torso": 0.30, "head": 0.17, "upper_arm": 0.10, "lower_arm": 0.085}
@@ -27,7 +33,7 @@ def model() -> DeformableStructures:
 
 
 def drawn_person(model: DeformableStructures, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """An image (180, 220, 3) RGB of thick lines for limbs before a mottled wall, and the joints (15, 2) px."""
+    """Draw thick lines for limbs before a mottled wall; return the image (180, 220, 3) and the joints (15, 2) px."""
     joints = 130 * (model.mean_joints() - model.mean_joints()[0]) + (110, 60) + rng.normal(0, 4, 2)
     names = model.joint_names
     for side in ("right", "left"):
@@ -73,28 +79,30 @@ def flags(module: object, *words: str) -> argparse.Namespace:
 
 
 @pytest.fixture(scope="module")
-def people(model: DeformableStructures, album: Path) -> list[Posed]:
-    return list(posed_people(Annotations.load(album / "annotations.json"), model, 1))
+def people(model: DeformableStructures, album: Path) -> list[PosedPerson]:
+    return list(pose_people(Annotations.load(album / "annotations.json"), model, 1))
 
 
-def test_it_ranks_right_limbs_of_new_drawings_first(model: DeformableStructures, people: list[Posed]) -> None:
+@pytest.mark.slow
+def test_it_ranks_right_limbs_of_new_drawings_first(model: DeformableStructures, people: list[PosedPerson]) -> None:
     said: list[str] = []
-    learned = learn(model, people[:30], LikelihoodSettings(wrong=4), said.append)
+    learned = learn_likelihood(model, people[:30], LikelihoodSettings(wrong=4), said.append)
     assert len(said) == 4 and learned.counts["upper_arm"] == learned.counts["torso"] == 60
-    ranks = rank(model, learned.likelihood, iter(people[30:]), 20, 1)
+    ranks = rank_limbs(model, learned.likelihood, iter(people[30:]), 20, 1)
     assert set(ranks) == {"torso", "head", "upper_arm", "lower_arm"}
     for kind, variants in ranks.items():
-        everything = variants["all"].row()
+        everything = variants["all"].summarise()
         assert everything[0] > 0.85 and everything[1] <= 4, f"{kind}: {everything}"
-    beaten = ranks["lower_arm"]["only skin"].row()[0]
-    assert 0.7 < beaten < ranks["lower_arm"]["all"].row()[0] + 0.05
-    without, only = (ranks["upper_arm"][f"contour, {word} on"].row()[0] for word in ("without", "only"))
+    beaten = ranks["lower_arm"]["only skin"].summarise()[0]
+    assert 0.7 < beaten < ranks["lower_arm"]["all"].summarise()[0] + 0.05
+    without, only = (ranks["upper_arm"][f"contour, {word} on"].summarise()[0] for word in ("without", "only"))
     assert only > 0.7 and without > 0.6
-    again = learn(model, people[:30], LikelihoodSettings(wrong=4), said.append).likelihood.to_arrays()
+    again = learn_likelihood(model, people[:30], LikelihoodSettings(wrong=4), said.append).likelihood.to_arrays()
     for name, values in learned.likelihood.to_arrays().items():
         np.testing.assert_array_equal(again[name], values)
 
 
+@pytest.mark.slow
 def test_the_command_writes_weights_and_a_card(album: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "new" / "weights"
     words = (str(album / "annotations.json"), "--wrong", "2", "--out", str(out))
@@ -112,7 +120,7 @@ def test_too_little_is_refused_in_a_sentence(model: DeformableStructures, album:
     with pytest.raises(InputError, match=r"show 8 torsos; learning needs at least 20"):
         command.run(flags(command, str(few), "--out", str(tmp_path)))
     words = (str(album / "annotations.json"), "--leave-out", str(album / "annotations.json"), "--out", str(tmp_path))
-    with pytest.raises(InputError, match="has no person whose joints tell a scale"):
+    with pytest.raises(InputError, match="has no person whose joints determine a scale"):
         command.run(flags(command, *words))
 
 
@@ -127,16 +135,16 @@ def test_the_table_of_the_evaluation(album: Path, capsys: pytest.CaptureFixture[
 
 def test_ranks_are_told_as_they_are() -> None:
     ranks = Ranks(np.array([0.0, 1.0, 0.5, 10.0]), 10)
-    assert ranks.row() == pytest.approx((1 - 11.5 / 40, 1.75, 0.5, 0.75))
-    assert "| head | all | 4 | 71.2 % | 1.75 of 11 | 50 % | 75 % |" in table({"head": {"all": ranks}})
+    assert ranks.summarise() == pytest.approx((1 - 11.5 / 40, 1.75, 0.5, 0.75))
+    assert "| head | all | 4 | 71.2 % | 1.75 of 11 | 50 % | 75 % |" in format_ranks({"head": {"all": ranks}})
 
 
 @pytest.mark.parametrize("part", range(6))
 def test_wrong_contours_are_wrong_and_moves_rigid_when_asked(model: DeformableStructures, part: int) -> None:
     puppet = model.puppet_from_joints(100 * model.mean_joints(), 100.0)
     rng = np.random.default_rng(part)
-    wrong = wrong_contours(model, puppet, part, 30, Moves(far=0.3), rng)
-    assert np.hypot(*np.moveaxis(wrong - puppet.contours[part], 2, 0)).mean(axis=1).min() > 100 * WRONG_METRES
-    rigid = wrong_contours(model, puppet, part, 10, Moves(stretch=0.0), rng)
+    wrong = perturb_contours(model, puppet, part, 30, ContourPerturbation(far=0.3), rng)
+    assert np.hypot(*np.moveaxis(wrong - puppet.contours[part], 2, 0)).mean(axis=1).min() > 100 * MIN_WRONG_DISTANCE_M
+    rigid = perturb_contours(model, puppet, part, 10, ContourPerturbation(stretch=0.0), rng)
     edges = np.linalg.norm(np.diff(rigid, axis=1), axis=2)
     np.testing.assert_allclose(edges, np.tile(np.linalg.norm(np.diff(puppet.contours[part], axis=0), axis=1), (10, 1)))

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 
-from flowing_puppet_ros.learn.sp.decimate import boundary_vertices, decimate
+from flowing_puppet_ros.learn.sp.decimate import decimate, find_boundary_vertices
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def test_closed_surface_stays_closed(sphere: tuple[np.ndarray, np.ndarray]) -> N
     used = np.unique(coarse)
     assert len(used) == 300
     assert len(coarse) == 2 * 300 - 4
-    assert not boundary_vertices(len(points), coarse).any()
+    assert not find_boundary_vertices(len(points), coarse).any()
     normals = _normals(points, coarse)
     assert np.all(np.einsum("ij,ij->i", normals, points[coarse].mean(axis=1)) > 0), "a face was turned over"
 
@@ -48,7 +48,7 @@ def test_boundary_stays_and_can_be_welded(sphere: tuple[np.ndarray, np.ndarray])
     points, faces = sphere
     half = faces[points[faces, 1].mean(axis=1) > 1e-9]
     coarse = _run(points, half, 150)
-    edge = boundary_vertices(len(points), coarse)
+    edge = find_boundary_vertices(len(points), coarse)
     assert np.abs(points[edge, 1]).max() < 1e-12
     flat = np.abs(points[:, 1]) < 1e-12
     sides = np.concatenate([coarse[:, [0, 1]], coarse[:, [1, 2]], coarse[:, [2, 0]]])

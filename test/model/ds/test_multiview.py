@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The puppet of nine views: what turns with the torso, what stays, and how well joints tell the view."""
+"""The puppet of nine views: what rotates with the torso, what stays, and how well joints determine the view."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def neutral() -> MultiViewStructures:
 
 def shoulder_width(model: DeformableStructures) -> float:
     """Signed: positive when the person's left shoulder is on the right of the image."""
-    joints = model.likely().joints
+    joints = model.likely_puppet().joints
     return float(
         joints[model.joint_names.index("left_shoulder"), 0] - joints[model.joint_names.index("right_shoulder"), 0]
     )
@@ -51,7 +51,7 @@ def test_feet_point_where_the_torso_faces(sides: MultiViewStructures) -> None:
     """Only the torso knows the view: upper and lower legs carry it down to the feet."""
     reach = []
     for view in sides.views:
-        puppet = view.likely()
+        puppet = view.likely_puppet()
         toes = 0.0
         for side in ("left", "right"):
             ankle = puppet.joints[view.joint_names.index(f"{side}_ankle"), 0]
@@ -65,7 +65,7 @@ def test_feet_point_where_the_torso_faces(sides: MultiViewStructures) -> None:
 
 def test_west_is_east_in_the_mirror(neutral: MultiViewStructures) -> None:
     for first, second in zip(neutral.views, neutral.views[::-1], strict=True):
-        a, b = first.likely().joints, second.likely().joints * [-1, 1]
+        a, b = first.likely_puppet().joints, second.likely_puppet().joints * [-1, 1]
         order = [first.joint_names.index(mirrored_name(name)) for name in first.joint_names]
         assert np.linalg.norm(a - b[order], axis=1).max() < 0.12
 
@@ -81,8 +81,8 @@ def test_limbs_are_the_same_in_every_view(sides: MultiViewStructures) -> None:
                 assert not np.array_equal(view.pairwise[part - 1].mean, sides.views[0].pairwise[part - 1].mean)
 
 
-def test_joints_of_another_model_tell_which_side_is_seen(neutral: MultiViewStructures) -> None:
-    """Puppets of the male model, judged by the neutral one: the view is right or the next one."""
+def test_joints_of_another_model_determine_the_view(neutral: MultiViewStructures) -> None:
+    """Puppets of the male model, evaluated by the neutral one: the view is right or the next one."""
     other, rng = MultiViewStructures.load("male"), np.random.default_rng(0)
     misses, certain = [], []
     for index, name in enumerate(VIEW_NAMES):
@@ -126,7 +126,7 @@ def test_far_limbs_lie_behind_the_torso(neutral: MultiViewStructures) -> None:
     assert depth_order(model, "front", 0.1) == depth_order(model)
 
 
-def test_files_hold_what_learning_gave() -> None:
+def test_files_hold_what_was_learned() -> None:
     arrays = weights.load("ds", "neutral-10-views")
     again = MultiViewStructures.from_arrays("neutral", 10, arrays)
     np.testing.assert_array_equal(again.views[3].mean_joints(), MultiViewStructures.load().views[3].mean_joints())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shipped 2D puppets: anatomy, symmetries, and what they make of poses that were written down by hand."""
+"""The shipped 2D puppets: anatomy, symmetries, and the poses they infer from joints written down by hand."""
 
 import cv2
 import numpy as np
@@ -81,6 +81,7 @@ def test_mean_puppet_has_human_proportions(model: DeformableStructures) -> None:
     assert 0.25 < np.linalg.norm(joint["left_knee"] - joint["left_hip"]) < 0.5
 
 
+@pytest.mark.slow
 def test_samples_hold_together(model: DeformableStructures) -> None:
     rng = np.random.default_rng(5)
     for _ in range(40):
@@ -184,7 +185,7 @@ def test_scale_of_a_person_with_foreshortened_limbs(model: DeformableStructures)
     assert model.estimate_scale(np.where(upper[:, None], joints, np.nan), sure) == pytest.approx(scale, rel=0.1)
 
 
-def test_view_is_told_from_the_sides(model: DeformableStructures) -> None:
+def test_view_is_estimated_from_the_sides(model: DeformableStructures) -> None:
     joints, sure = standing(model), np.ones(len(model.joint_names))
     assert model.estimate_view(joints, sure) == "front"
     assert model.estimate_view(joints * [-1, 1], sure) == "back"
@@ -229,7 +230,7 @@ def test_a_hidden_hand_extends_the_forearm_wherever_it_points(view: View, degree
     assert np.linalg.norm(hand - joints[index["left_wrist"]] - 0.08 * SCALE * reach) < 0.02 * SCALE
 
 
-def test_doubtful_joints_pull_less(neutral: DeformableStructures) -> None:
+def test_uncertain_joints_pull_less(neutral: DeformableStructures) -> None:
     joints, index = standing(neutral), {name: k for k, name in enumerate(neutral.joint_names)}
     joints[index["left_hip"]] = np.nan
     wrong = joints.copy()
@@ -266,7 +267,7 @@ def test_arrays_round_trip(neutral: DeformableStructures) -> None:
     np.testing.assert_array_equal(np.vstack(first.contours), np.vstack(second.contours))
 
 
-def test_bad_input_is_told_in_one_sentence(neutral: DeformableStructures) -> None:
+def test_bad_input_is_refused_in_one_sentence(neutral: DeformableStructures) -> None:
     joints, sure = standing(neutral), np.ones(15)
     with pytest.raises(InputError, match=r"needs \(15, 2\)"):
         neutral.puppet_from_joints(joints[:5], SCALE)

@@ -13,9 +13,10 @@ from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyOutputSettings
+from flowing_puppet_ros.stream.components.ros4hri import Ros4HriSettings
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header, rotation_matrix
-from flowing_puppet_ros.stream.messages.ros4hri_skeleton import MOVING
+from flowing_puppet_ros.stream.messages.ros4hri_skeleton import MOVING_JOINTS
 
 FACTORY = BagMessageFactory()
 ALL = {"body_meshes", "body_vertices"}
@@ -38,8 +39,8 @@ def header(tenths: int) -> Any:
     return make_header(FACTORY, 10**9 + tenths * TENTH, "lidar")
 
 
-def outputs(model: StitchedPuppet, **settings: Any) -> BodyOutputs:
-    return BodyOutputs(BodyOutputSettings(**settings), FACTORY, model)
+def outputs(model: StitchedPuppet, humans: bool = False, **settings: Any) -> BodyOutputs:
+    return BodyOutputs(BodyOutputSettings(**settings), Ros4HriSettings(publish=humans), FACTORY, model)
 
 
 def markers(made: list[tuple[str, Any]]) -> list[tuple[int, int]]:
@@ -47,7 +48,7 @@ def markers(made: list[tuple[str, Any]]) -> list[tuple[int, int]]:
 
 
 def test_everything_has_the_stamp_and_frame_of_the_cloud(model: StitchedPuppet) -> None:
-    made = outputs(model).make(header(3), [("b1", body(model, (2, 0, 1)))], wanted=ALL)
+    made = outputs(model).make(header(3), [("b1", body(model, (2, 0, 1)))], subscribed=ALL)
     found = dict(made)
     assert [name for name, _ in made].count("body_topology") == 1
     for name in ("bodies", "part_poses", "body_vertices"):
@@ -60,23 +61,25 @@ def test_everything_has_the_stamp_and_frame_of_the_cloud(model: StitchedPuppet) 
 
 
 def test_meshes_come_at_their_rate_and_go_at_once(model: StitchedPuppet) -> None:
-    shown, one, two = outputs(model, mesh_rate=5.0), ("b1", body(model, (2, 0, 1))), ("b2", body(model, (2, 1, 1)))
-    assert markers(shown.make(header(0), [one, two], wanted=ALL)) == [(1, 0), (2, 0)]
-    assert markers(shown.make(header(1), [one, two], wanted=ALL)) == []
-    assert markers(shown.make(header(2), [one], held=["b2"], wanted=ALL)) == [(1, 0)], "who is hidden is not lost"
-    assert markers(shown.make(header(3), [one], wanted=ALL)) == [(2, 2)]
-    assert markers(shown.make(header(4), [one, two], wanted=ALL)) == [(1, 0), (3, 0)], "no number is used again"
-    assert markers(shown.make(header(0), [one, two], wanted=ALL)) == [(1, 0), (3, 0)], "a recording starts again"
-    assert markers(shown.make(header(5), [], wanted=ALL)) == [(1, 2), (3, 2)]
-    every = outputs(model, mesh_rate=0.0)
-    assert all(markers(every.make(header(k), [one], wanted=ALL)) for k in range(3))
+    shown, one, two = outputs(model, max_mesh_rate=5.0), ("b1", body(model, (2, 0, 1))), ("b2", body(model, (2, 1, 1)))
+    assert markers(shown.make(header(0), [one, two], subscribed=ALL)) == [(1, 0), (2, 0)]
+    assert markers(shown.make(header(1), [one, two], subscribed=ALL)) == []
+    assert markers(shown.make(header(2), [one], hidden=["b2"], subscribed=ALL)) == [(1, 0)], "who is hidden is not lost"
+    assert markers(shown.make(header(3), [one], subscribed=ALL)) == [(2, 2)]
+    assert markers(shown.make(header(4), [one, two], subscribed=ALL)) == [(1, 0), (3, 0)], "no number is used again"
+    assert markers(shown.make(header(0), [one, two], subscribed=ALL)) == [(1, 0), (3, 0)], "a recording starts again"
+    assert markers(shown.make(header(5), [], subscribed=ALL)) == [(1, 2), (3, 2)]
+    every = outputs(model, max_mesh_rate=0.0)
+    assert all(markers(every.make(header(k), [one], subscribed=ALL)) for k in range(3))
 
 
 def test_the_preview_is_the_body_with_fewer_triangles(model: StitchedPuppet) -> None:
     volumes = []
     for triangles in (0, 2000, 1000):
         made = dict(
-            outputs(model, mesh_triangles=triangles).make(header(0), [("b1", body(model, (2, 0, 1)))], wanted=ALL)
+            outputs(model, max_mesh_triangles=triangles).make(
+                header(0), [("b1", body(model, (2, 0, 1)))], subscribed=ALL
+            )
         )
         (marker,) = made["body_meshes"].markers
         corners = np.array([(p.x, p.y, p.z) for p in marker.points]).reshape(-1, 3, 3)
@@ -87,7 +90,7 @@ def test_the_preview_is_the_body_with_fewer_triangles(model: StitchedPuppet) -> 
 
 def test_vertices_are_one_row_a_body_and_poses_one_block(model: StitchedPuppet) -> None:
     one, two = body(model, (2, 0, 1)), body(model, (2, 1, 1))
-    made = dict(outputs(model).make(header(0), [("b1", one), ("b2", two)], wanted=ALL))
+    made = dict(outputs(model).make(header(0), [("b1", one), ("b2", two)], subscribed=ALL))
     cloud = made["body_vertices"]
     assert (cloud.height, cloud.width) == (2, len(model.part_of_vertex))
     points, _ = decode_cloud(cloud)
@@ -119,13 +122,13 @@ def test_people_by_rep_155(model: StitchedPuppet) -> None:
     shown, one = outputs(model, humans=True), ("b1", body(model, (2, 0, 1)))
     found = dict(shown.make(header(0), [one]))
     states = found["/humans/bodies/b1/joint_states"]
-    assert states.name == [f"{name}_b1" for name in MOVING] and len(states.position) == 20
+    assert states.name == [f"{name}_b1" for name in MOVING_JOINTS] and len(states.position) == 20
     assert np.isfinite(states.position).all()
     assert found["/humans/bodies/tracked"].ids == ["b1"]
     assert 'name="body_b1"' in found["/humans/bodies/b1/urdf"].data
     again = dict(shown.make(header(1), [one]))
     assert "/humans/bodies/b1/urdf" not in again, "it is latched"
-    hidden = dict(shown.make(header(2), [], held=["b1"]))
+    hidden = dict(shown.make(header(2), [], hidden=["b1"]))
     assert hidden["/humans/bodies/tracked"].ids == ["b1"]
     gone = dict(shown.make(header(3), []))
     assert gone["/humans/bodies/b1/urdf"] is None and gone["/humans/bodies/b1/joint_states"] is None

@@ -9,7 +9,7 @@ import pytest
 
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
-from flowing_puppet_ros.evaluate.body.synthetic_scans import surface_samples
+from flowing_puppet_ros.evaluate.body.synthetic_scans import sample_surface
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
@@ -17,7 +17,7 @@ from flowing_puppet_ros.stream.messages.geometry import make_header
 
 FACTORY = BagMessageFactory()
 FRAME, STEP = 50_000_000, 0.03  # nanoseconds, metres
-SETTINGS: dict[str, Any] = {"track_points": 600, "track_steps": 2, "view": "full"}
+SETTINGS: dict[str, Any] = {"tracker.max_points": 600, "tracker.gauss_newton_steps": 2, "view": "full"}
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +29,7 @@ def found(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         seeds.append(seed)
         state = fitter.model.rest_state()
         there = replace(state, center=state.center + np.array([0.0, 0.0, 1.0]))
-        return fitter.result(there, fitter.cloud(points, normals, None))
+        return fitter.assess(there, fitter.prepare_cloud(points, normals, None))
 
     monkeypatch.setattr(BodyFitter, "fit", fit)
     return seeds
@@ -43,7 +43,7 @@ def clouds() -> list[Any]:
     made = []
     for frame in range(3):
         rng = np.random.default_rng(frame)
-        points, normals = surface_samples(standing + np.array([STEP * frame, 0, 1.0]), model.faces, rng, 600)
+        points, normals = sample_surface(standing + np.array([STEP * frame, 0, 1.0]), model.faces, rng, 600)
         header = make_header(FACTORY, (frame + 1) * FRAME, "map")
         made.append(make_cloud(FACTORY, header, points, normals))
     return made
@@ -55,10 +55,11 @@ def _pelvis(component: BodyFitterComponent, cloud: Any) -> np.ndarray:
     return np.array([place.x, place.y, place.z])
 
 
+@pytest.mark.slow
 def test_a_tracked_person_is_searched_for_once(clouds: list[Any], found: list[int]) -> None:
     for scene in (True, False):
         found.clear()
-        component = BodyFitterComponent(BodyFitterSettings(**SETTINGS, scene=scene), FACTORY)
+        component = BodyFitterComponent(BodyFitterSettings.from_mapping({**SETTINGS, "scene": scene}), FACTORY)
         pelvis = [_pelvis(component, cloud) for cloud in clouds]
         np.testing.assert_allclose(np.diff(pelvis, axis=0), np.tile([STEP, 0, 0], (2, 1)), atol=0.005)
         assert len(found) == 1
@@ -68,7 +69,7 @@ def test_a_tracked_person_is_searched_for_once(clouds: list[Any], found: list[in
 
 
 def test_without_tracking_every_cloud_is_searched(clouds: list[Any], found: list[int]) -> None:
-    component = BodyFitterComponent(BodyFitterSettings(**SETTINGS, track=False), FACTORY)
+    component = BodyFitterComponent(BodyFitterSettings.from_mapping({**SETTINGS, "track": False}), FACTORY)
     for cloud in clouds:
         _pelvis(component, cloud)
     assert found == [component.seed_of((frame + 1) * FRAME) for frame in range(3)]

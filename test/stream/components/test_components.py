@@ -46,10 +46,10 @@ def detections(recorded: dict[str, list[Any]]) -> dict[int, Any]:
 
 
 def tracker(**settings: Any) -> PuppetTrackerComponent:
-    return PuppetTrackerComponent(PuppetTrackerSettings(**settings), FACTORY)
+    return PuppetTrackerComponent(PuppetTrackerSettings.from_mapping(settings), FACTORY)
 
 
-def drive(component: Component, stream: Stream) -> Stream:
+def drive(component: Component[Any], stream: Stream) -> Stream:
     """Return everything that comes out, to the end."""
     found = [made for port, message in stream for made in component.handle(port, message)]
     return found + component.flush()
@@ -111,7 +111,7 @@ def test_lazy_outputs_are_made_on_demand_only(images: list[Any], detections: dic
     stream = interleaved(images[:2], detections, "detections")
     quiet = tracker()
     assert {port for port, _ in drive(quiet, stream)} == {"puppets"}
-    loud = tracker(overlay_side=96)
+    loud = tracker(overlay_max_side=96)
     for port in loud.outputs:
         if port.lazy:
             loud.set_subscribed(port.name, True)
@@ -159,10 +159,10 @@ def test_a_flow_topic_that_stops_is_told_of_and_made_up_for(images: list[Any], d
     found = puppets(drive(follower, stream))
     assert len(found) == 6
     assert follower.counters["images without flow"] == 3
-    assert [text for text in follower.drain_warnings() if "without the flow" in text]
+    assert [text for text in follower.report.drain_warnings() if "without the flow" in text]
 
 
-def test_flow_points_along_the_motion_and_starts_anew_after_a_jump_back() -> None:
+def test_flow_points_along_the_motion_and_restarts_after_a_jump_back() -> None:
     rng = np.random.default_rng(0)
     texture = np.repeat(np.repeat(rng.integers(0, 255, (40, 50), dtype=np.uint8), 4, 0), 4, 1)
     pictures = [texture[8:136, 8 - shift : 168 - shift] for shift in (0, 3, 6)]
@@ -176,8 +176,8 @@ def test_flow_points_along_the_motion_and_starts_anew_after_a_jump_back() -> Non
     for port, motion in (("flow/forward", (3, 0)), ("flow/backward", (-3, 0))):
         np.testing.assert_allclose(np.median(decode_flow(made[port]), axis=(0, 1)), motion, atol=0.2)
     assert component.handle("image", frames[2]) == []
-    assert "the flow starts anew" in component.drain_warnings()[0]
-    assert component.drain_warnings() == []
+    assert "the flow restarts" in component.report.drain_warnings()[0]
+    assert component.report.drain_warnings() == []
 
 
 def test_a_recording_that_starts_again_gives_the_same_joints(images: list[Any], detections: dict[int, Any]) -> None:
@@ -198,7 +198,7 @@ def test_bad_images_are_said_once_and_do_not_stop_the_others(images: list[Any]) 
     found = drive(component, [("image", images[0]), ("image", broken), ("image", broken), ("image", images[2])])
     assert stamps(found, "puppets") == [stamp_ns(images[0]), stamp_ns(images[2])]
     assert component.counters["unusable"] == 2
-    assert component.drain_warnings() == ["a compressed image of format 'jpeg' and 9 bytes cannot be decoded"]
+    assert component.report.drain_warnings() == ["a compressed image of format 'jpeg' and 9 bytes cannot be decoded"]
 
 
 @pytest.mark.parametrize("names", ["", "cam1", "cam1, cam1"])
@@ -224,7 +224,7 @@ def hull_stream(recorded: dict[str, list[Any]], skip: tuple[str, ...] = ()) -> S
 
 def test_the_order_of_the_inputs_of_a_hull_does_not_matter(recorded: dict[str, list[Any]]) -> None:
     stream = hull_stream(recorded)
-    settings = VisualHullSettings(cameras="cam1,cam2", every=1)
+    settings = VisualHullSettings(cameras="cam1,cam2", hull_every=1)
     found = []
     for order in (stream, stream[:3] + stream[:2:-1]):
         # Each input on its own comes in the order of its stamps, as a topic does.
@@ -251,15 +251,15 @@ def test_the_order_of_the_inputs_of_a_hull_does_not_matter(recorded: dict[str, l
     ],
 )
 def test_a_hull_says_what_it_misses(recorded: dict[str, list[Any]], skip: tuple[str, ...], sentence: str) -> None:
-    component = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2", every=1), FACTORY)
+    component = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2", hull_every=1), FACTORY)
     assert drive(component, hull_stream(recorded, skip)) == []
-    (warning,) = component.drain_warnings()
+    (warning,) = component.report.drain_warnings()
     assert warning.startswith(sentence)
     assert component.counters["unusable"] == 2
 
 
 def test_frames_that_come_after_the_first_images_place_the_hull(recorded: dict[str, list[Any]]) -> None:
-    component = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2", every=1), FACTORY)
+    component = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2", hull_every=1), FACTORY)
     stream = hull_stream(recorded)
     assert drive(component, [item for item in stream if item[0] != "/tf_static"]) == []
     component.reset()
@@ -277,7 +277,7 @@ def test_silhouettes_go_on_without_a_camera_that_is_dead_or_not_calibrated(recor
         made = drive(component, stream + (third if spoilt == "uncalibrated" else []))
         assert [port for port, _ in made] == ["silhouettes"] * 2
         assert all([each.camera for each in message.silhouettes] == ["cam1", "cam2"] for _, message in made)
-        warnings = component.drain_warnings()
+        warnings = component.report.drain_warnings()
         expected = ["cam3: the camera_info is uncalibrated (k is all zero); publish a calibrated camera_info"]
         assert warnings == (expected if spoilt == "uncalibrated" else [])
 
@@ -292,11 +292,11 @@ def test_silhouettes_that_cannot_be_used_are_one_sentence(recorded: dict[str, li
     hull = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2"), FACTORY)
     hull.set_subscribed("silhouettes", True)
     first, second = (message for _, message in drive(hull, hull_stream(recorded)))
-    fitter = BodyFitterComponent(BodyFitterSettings(outline_steps=2), FACTORY)
+    fitter = BodyFitterComponent(BodyFitterSettings.from_mapping({"silhouettes.gauss_newton_steps": 2}), FACTORY)
     first.silhouettes[1].info.width = 100
     made = dict(fitter.handle("silhouettes", first))
     assert made["bodies"].bodies == [] and made["bodies"].header == first.header
-    assert fitter.drain_warnings() == ["cam2: the mask is 192 x 240, its camera_info says 100 x 240"]
+    assert fitter.report.drain_warnings() == ["cam2: the mask is 192 x 240, its camera_info says 100 x 240"]
     made = dict(fitter.handle("silhouettes", second))
     assert [body.id for body in made["bodies"].bodies] == ["b1"]
     assert (fitter.counters["bodies"], fitter.counters["unusable"]) == (1, 1)

@@ -11,12 +11,14 @@ import pytest
 
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
-from flowing_puppet_ros.evaluate.body.synthetic_scans import Scene, box
+from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, make_box
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header
+
+pytestmark = pytest.mark.slow
 
 FACTORY, PERIOD = BagMessageFactory(), 0.1  # seconds
 CLOUDS, HEIGHT, SPEED = 44, 1.1, 0.45  # the camera's height in metres; metres a second
@@ -40,12 +42,12 @@ def _seen(model: StitchedPuppet, states: list[BodyState], rng: np.random.Generat
     """What the camera at the origin sees (N, 3) of two people on a floor, and how many points are the second."""
     around = [
         (model.vertices(states[0]), model.faces),
-        box(np.array([3.0, 0.0, -HEIGHT - 0.05]), np.array([8.0, 10.0, 0.1]), np.eye(3)),
+        make_box(np.array([3.0, 0.0, -HEIGHT - 0.05]), np.array([8.0, 10.0, 0.1]), np.eye(3)),
     ]
     y, z = np.meshgrid(np.linspace(-0.6, 0.6, 120), np.linspace(-0.55, 0.4, 100))
     rays = np.stack([np.ones(y.size), y.ravel(), z.ravel()], axis=1)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    distance, on_second = Scene(model.vertices(states[1]), model.faces, around).cast(np.zeros(3), rays)
+    distance, on_second = RaycastScene(model.vertices(states[1]), model.faces, around).cast(np.zeros(3), rays)
     hit = np.isfinite(distance)
     noisy = distance[hit] + 0.005 * rng.standard_normal(np.count_nonzero(hit))
     return rays[hit] * noisy[:, None], int(np.count_nonzero(on_second))
@@ -60,10 +62,12 @@ def test_two_people_who_pass_each_other_keep_their_ids(monkeypatch: pytest.Monke
         searched.append(points.mean(axis=0))
         state = min(truth, key=lambda pair: float(np.linalg.norm(pair[1] - searched[-1])))[0]
         state = replace(state, center=state.center + np.array([0.02, -0.02, 0.0]))
-        return fitter.result(state, fitter.cloud(points, normals, viewpoint))
+        return fitter.assess(state, fitter.prepare_cloud(points, normals, viewpoint))
 
     monkeypatch.setattr(BodyFitter, "fit", fit)
-    settings = BodyFitterSettings(view="single", cloud_points=800, track_steps=3, threads=1)
+    settings = BodyFitterSettings.from_mapping(
+        {"view": "single", "fitter.max_points": 800, "fitter.threads": 1, "tracker.gauss_newton_steps": 3}
+    )
     component = BodyFitterComponent(settings, FACTORY)
     errors: dict[str, list[float]] = {}
     owner: dict[str, int] = {}
@@ -86,4 +90,4 @@ def test_two_people_who_pass_each_other_keep_their_ids(monkeypatch: pytest.Monke
     assert len(far) > CLOUDS - 14
     assert max(map(max, errors.values())) < 0.2
     assert np.mean(near) < 0.06 and np.mean(far) < 0.08
-    assert component.drain_warnings() == []
+    assert component.report.drain_warnings() == []

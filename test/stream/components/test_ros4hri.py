@@ -16,16 +16,16 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.component import Port
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.components.ros4hri import (
-    SKELETON,
+    SKELETON2D_JOINTS,
     Ros4HriPublisher,
     Ros4HriSettings,
-    box_around,
+    bounding_box,
     make_skeleton2d,
-    name_component,
+    to_name_component,
 )
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image
-from flowing_puppet_ros.stream.messages.ros4hri_skeleton import JOINTS, MOVING, Skeleton, urdf
+from flowing_puppet_ros.stream.messages.ros4hri_skeleton import JOINTS, MOVING_JOINTS, Skeleton, make_urdf
 
 FACTORY = BagMessageFactory()
 HEADER = make_header(FACTORY, 1_500_000_000, "camera_optical_frame")
@@ -35,7 +35,7 @@ GOLDEN = Path(__file__).resolve().parents[3] / "bags" / "golden" / "golden.mcap"
 def test_a_persons_port_knows_its_topics() -> None:
     port = Port("/humans/bodies/{id}/roi", "hri_msgs/msg/NormalizedRegionOfInterest2D")
     assert port.per_person and not Port("roi", port.type).per_person
-    assert port.of("a1") == "/humans/bodies/a1/roi"
+    assert port.person_topic("a1") == "/humans/bodies/a1/roi"
     assert port.covers("/humans/bodies/a1/roi")
     for other in ("/humans/bodies//roi", "/humans/bodies/a/b/roi", "/humans/bodies/a1/cropped", "/humans/bodies/roi"):
         assert not port.covers(other)
@@ -48,7 +48,7 @@ def test_the_skeleton_has_the_order_of_the_constants() -> None:
         words = line.split("#")[0].split()
         if len(words) == 4 and words[2] == "=":
             constants[words[1].lower()] = int(words[3])
-    assert constants == {name: index for index, name in enumerate(SKELETON)}
+    assert constants == {name: index for index, name in enumerate(SKELETON2D_JOINTS)}
 
 
 def test_joints_are_normalised_clipped_and_unknown_ones_have_no_confidence() -> None:
@@ -68,29 +68,29 @@ def test_joints_are_normalised_clipped_and_unknown_ones_have_no_confidence() -> 
 
 
 def test_boxes_are_inside_the_image() -> None:
-    assert box_around(np.array([[2.2, 3.0], [7.0, 4.6]]), (20, 20)) == (2, 3, 8, 6)
-    assert box_around(np.array([[-9.0, 3.0], [90.0, 4.6]]), (20, 20)) == (0, 3, 20, 6)
-    assert box_around(np.array([[-9.0, 3.0], [-3.0, 4.6]]), (20, 20)) is None
+    assert bounding_box(np.array([[2.2, 3.0], [7.0, 4.6]]), (20, 20)) == (2, 3, 8, 6)
+    assert bounding_box(np.array([[-9.0, 3.0], [90.0, 4.6]]), (20, 20)) == (0, 3, 20, 6)
+    assert bounding_box(np.array([[-9.0, 3.0], [-3.0, 4.6]]), (20, 20)) is None
 
 
 @pytest.mark.parametrize(
     ("identity", "name"), [("a1", "a1"), ("7", "p7"), ("Jo-hn/3", "Jo_hn_3"), ("ä", "p_"), ("", "p")]
 )
 def test_ids_fit_into_names_of_topics(identity: str, name: str) -> None:
-    assert name_component(identity) == name
+    assert to_name_component(identity) == name
 
 
 def test_topics_end_with_their_person() -> None:
-    humans = Ros4HriPublisher(Ros4HriSettings(humans=True, humans_namespace="/crowd/"), FACTORY, "urdf")
+    humans = Ros4HriPublisher(Ros4HriSettings(publish=True, namespace="/crowd/"), FACTORY, "urdf")
     text = FACTORY.make("std_msgs/msg/String", data="x")
-    first = humans.publish(HEADER, ["a1", "a2"], {"a1": {"urdf": text}})
+    first = humans.make(HEADER, ["a1", "a2"], {"a1": {"urdf": text}})
     assert [(name, getattr(message, "ids", "-")) for name, message in first] == [
         ("/crowd/bodies/tracked", ["a1", "a2"]),
         ("/crowd/bodies/a1/urdf", "-"),
     ]
-    assert [name for name, _ in humans.publish(HEADER, ["a1"], {})] == ["/crowd/bodies/tracked"]
-    assert humans.publish(HEADER, [], {})[0] == ("/crowd/bodies/a1/urdf", None)
-    ((name, empty),) = humans.publish(HEADER, [], {})
+    assert [name for name, _ in humans.make(HEADER, ["a1"], {})] == ["/crowd/bodies/tracked"]
+    assert humans.make(HEADER, [], {})[0] == ("/crowd/bodies/a1/urdf", None)
+    ((name, empty),) = humans.make(HEADER, [], {})
     assert name == "/crowd/bodies/tracked" and empty.ids == []
     assert Ros4HriPublisher(Ros4HriSettings(), FACTORY, "urdf").ports == ()
 
@@ -109,7 +109,7 @@ def recorded() -> tuple[list[Any], dict[int, Any]]:
 
 def test_the_puppets_of_an_image_are_humans(recorded: tuple[list[Any], dict[int, Any]]) -> None:
     images, detections = recorded
-    component = PuppetTrackerComponent(PuppetTrackerSettings(humans=True), FACTORY)
+    component = PuppetTrackerComponent(PuppetTrackerSettings.from_mapping({"ros4hri.publish": True}), FACTORY)
     component.set_expected("detections", True)
     component.handle("detections", detections[stamp_ns(images[0])])
     made = dict(component.handle("image", images[0]))
@@ -136,12 +136,12 @@ def test_the_puppets_of_an_image_are_humans(recorded: tuple[list[Any], dict[int,
 
 def test_a_person_as_urdf() -> None:
     model = StitchedPuppet.load()
-    root = ET.fromstring(urdf("b1", Skeleton(model).origins(model.rest_state().shape)))
+    root = ET.fromstring(make_urdf("b1", Skeleton(model).joint_origins(model.rest_state().shape)))
     links = [link.attrib["name"] for link in root.findall("link")]
     joints = {joint.attrib["name"]: joint for joint in root.findall("joint")}
     assert len(set(links)) == len(links) == len(joints) + 1 and links[0] == "body_b1"
     assert {name.removesuffix("_b1") for name, joint in joints.items() if joint.attrib["type"] == "revolute"} == set(
-        MOVING
+        MOVING_JOINTS
     )
     assert {"torso", "head", "l_wrist", "r_wrist", "l_ankle", "r_ankle"} == {j.name for j in JOINTS if j.axis is None}
     for joint in joints.values():

@@ -47,7 +47,7 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
         lowest = fitter.model.vertices(state)[:, 2].min()
         middle = fitter.model.vertices(state).mean(axis=0)
         state.center[:] += [*(points.mean(axis=0) - middle)[:2], points[:, 2].min() - lowest]
-        return fitter.result(state, fitter.cloud(points, normals, viewpoint))
+        return fitter.assess(state, fitter.prepare_cloud(points, normals, viewpoint))
 
     monkeypatch.setattr(BodyFitter, "fit", fit)
     return middles
@@ -56,10 +56,14 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
 class Stage:
     """A component, and people who stand on a floor before it."""
 
-    def __init__(self, person: np.ndarray, floor: np.ndarray, **settings: Any) -> None:
+    def __init__(self, person: np.ndarray, floor: np.ndarray, settings: dict[str, Any] | None = None) -> None:
         self.person, self.floor = person, floor
         self.component = BodyFitterComponent(
-            BodyFitterSettings(view="full", cloud_points=1000, track_points=500, track_steps=2, threads=1, **settings),
+            BodyFitterSettings.from_mapping(
+                {"view": "full", "fitter.max_points": 1000, "fitter.threads": 1}
+                | {"tracker.max_points": 500, "tracker.gauss_newton_steps": 2}
+                | (settings or {})
+            ),
             FACTORY,
         )
         self.component.set_subscribed("body_meshes", True)
@@ -83,6 +87,7 @@ class Stage:
         return {place: ids[0] for place, ids in close.items() if ids}
 
 
+@pytest.mark.slow
 def test_new_people_are_searched_one_at_a_time_and_the_others_followed(
     person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
 ) -> None:
@@ -95,13 +100,14 @@ def test_new_people_are_searched_one_at_a_time_and_the_others_followed(
     assert sorted(everybody.values()) == ["b1", "b2", "b3", "b4", "b5"] and len(fits) == 5
     moved = stage.show(*[(x + 0.1, y) for x, y in crowd])
     assert list(moved.values()) == list(everybody.values())
-    assert stage.component.drain_warnings() == []
+    assert stage.component.report.drain_warnings() == []
 
 
+@pytest.mark.slow
 def test_who_is_hidden_for_a_while_keeps_the_id_and_who_is_gone_does_not(
     person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
 ) -> None:
-    stage = Stage(person, floor, hold=0.5, mesh_rate=0.0)
+    stage = Stage(person, floor, {"tracker.hold": 0.5, "output.max_mesh_rate": 0.0})
     stage.show((0, 0), (2, 0))
     first = stage.show((0, 0), (2, 0))
     for _ in range(3):
@@ -121,6 +127,7 @@ def test_who_is_hidden_for_a_while_keeps_the_id_and_who_is_gone_does_not(
     assert stage.show((2, 0)) == {(2, 0): "b4"}
 
 
+@pytest.mark.slow
 def test_people_who_touch_stay_two(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
     stage = Stage(person, floor)
     apart = [(0.0, -0.9), (0.0, 0.9)]
@@ -132,6 +139,7 @@ def test_people_who_touch_stay_two(person: np.ndarray, floor: np.ndarray, fits: 
     assert len(fits) == 2
 
 
+@pytest.mark.slow
 def test_after_a_stall_a_person_is_neither_cut_in_two_nor_taken_for_another(
     person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
 ) -> None:
@@ -147,8 +155,8 @@ def test_after_a_stall_a_person_is_neither_cut_in_two_nor_taken_for_another(
 def test_a_doubtful_body_is_searched_again_after_a_while(
     person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    result = BodyFitter.result
-    monkeypatch.setattr(BodyFitter, "result", lambda *known: replace(result(*known), reliable=False))
+    result = BodyFitter.assess
+    monkeypatch.setattr(BodyFitter, "assess", lambda *known: replace(result(*known), reliable=False))
     stage = Stage(person, floor)
     for searches in (1, 2, 3):
         for _ in range(2):
@@ -158,16 +166,17 @@ def test_a_doubtful_body_is_searched_again_after_a_while(
 
 
 def test_seeds_begin_ids(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
-    assert list(Stage(person, floor, seed=2).show((0, 0)).values()) == ["bc1"]
+    assert list(Stage(person, floor, {"fitter.seed": 2}).show((0, 0)).values()) == ["bc1"]
 
 
 def test_the_region_of_interest_leaves_people_out(
     person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
 ) -> None:
-    stage = Stage(person, floor, region_x_min=-1.0, region_x_max=1.0)
+    stage = Stage(person, floor, {"region.min_x": -1.0, "region.max_x": 1.0})
     assert list(stage.show((0, 0), (2, 0))) == [(0, 0)]
 
 
+@pytest.mark.slow
 def test_in_the_background_a_search_holds_nobody_up(
     person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -175,7 +184,7 @@ def test_in_the_background_a_search_holds_nobody_up(
 
     def slow(fitter: BodyFitter, *arguments: Any, **keywords: Any) -> BodyFit:
         assert gate.wait(60)
-        assert keywords["quick"] and not keywords["own_surface"], "nobody waits for the best there is"
+        assert keywords["quick"] and not keywords["nonrigid"], "nobody waits for the best there is"
         return quick(fitter, *arguments, **keywords)
 
     monkeypatch.setattr(BodyFitter, "fit", slow)
@@ -222,6 +231,7 @@ def test_what_goes_wrong_in_the_background_is_told_and_ends_nothing(
         assert list(stage.show((0, 0)).values()) == ["b1"]
 
 
+@pytest.mark.slow
 def test_goals_fit_everybody_and_touch_no_track(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
     stage = Stage(person, floor)
     message, found = stage.component.fit(stage.cloud((0, 0), (2, 1)), None, seed=0)
@@ -236,8 +246,11 @@ def test_goals_fit_everybody_and_touch_no_track(person: np.ndarray, floor: np.nd
 def test_clouds_that_cannot_show_people_are_one_sentence(person: np.ndarray) -> None:
     component = BodyFitterComponent(BodyFitterSettings(), FACTORY)
     millimetres = person * 1000 + 3000
-    for points, sentence in ((millimetres, "beyond the reach of 30 m; check the unit"), (person[:0], "no finite")):
+    for points, sentence in (
+        (millimetres, "beyond the segmentation.max_range of 30 m; check the unit"),
+        (person[:0], "no finite"),
+    ):
         made = dict(component.handle("points", make_cloud(FACTORY, make_header(FACTORY, 1, "map"), points)))
         assert made["bodies"].bodies == []
-        (warning,) = component.drain_warnings()
+        (warning,) = component.report.drain_warnings()
         assert sentence in warning

@@ -6,6 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPT = """
 import json, sys
@@ -27,7 +31,7 @@ factory = BagMessageFactory()
 components = {}
 for name, kind, settings in (
     ("flow", OpticalFlowComponent, {}), ("told", PuppetTrackerComponent, {}), ("cam1", PuppetTrackerComponent, {}),
-    ("cam2", PuppetTrackerComponent, {}), ("hull", VisualHullComponent, {"cameras": "cam1,cam2", "every": 1}),
+    ("cam2", PuppetTrackerComponent, {}), ("hull", VisualHullComponent, {"cameras": "cam1,cam2", "hull_every": 1}),
 ):
     component = components[name] = kind(kind.settings_type(**settings), factory)
     component.warm_up()

@@ -74,6 +74,7 @@ fields = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=400, deadline=None)
 @given(fields, sizes, sizes, st.integers(0, 40), sizes, st.booleans(), data, st.booleans())
 def test_point_clouds(

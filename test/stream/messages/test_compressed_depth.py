@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.messages.compressed_depth import LARGEST_PIXELS, unpack_depth
+from flowing_puppet_ros.stream.messages.compressed_depth import MAX_PIXELS, decode_compressed_depth
 from flowing_puppet_ros.stream.messages.images import decode_depth, decode_image
 
 
@@ -64,7 +64,7 @@ images = arrays(
 @given(images, st.sampled_from([png, rvl]), st.sampled_from(["16UC1; compressedDepth", "16UC1; compressedDepth png"]))
 def test_millimetres_come_back_as_they_were(pixels: np.ndarray, pack: Any, form: str) -> None:
     one = message(pack(pixels), form)
-    np.testing.assert_array_equal(unpack_depth(one), pixels)
+    np.testing.assert_array_equal(decode_compressed_depth(one), pixels)
     np.testing.assert_allclose(decode_depth(one), np.where(pixels > 0, pixels * 0.001, np.nan), rtol=1e-6)
 
 
@@ -87,10 +87,10 @@ def test_metres_come_back_from_inverse_depth(pack: Any) -> None:
     [
         (message(b""), "is empty"),
         (message(b"abc"), "neither PNG nor RVL"),
-        (message(png(np.ones((4, 5), np.uint16))[:-20]), "no whole PNG"),
-        (message(png(np.ones((4, 5), np.uint8))), "no whole PNG of 16 bits"),
+        (message(png(np.ones((4, 5), np.uint16))[:-20]), "not a whole 16-bit PNG"),
+        (message(png(np.ones((4, 5), np.uint8))), "not a whole 16-bit PNG"),
         (message(b"\x89PNG\r\n\x1a\n"), "0x0 is empty"),
-        (message(struct.pack("<II", 1 << 20, LARGEST_PIXELS)), "larger than 100 million"),
+        (message(struct.pack("<II", 1 << 20, MAX_PIXELS)), "larger than 100 million"),
         (message(rvl(np.full((9, 9), 7, np.uint16))[:-8]), "not whole"),
         (message(struct.pack("<III", 2, 2, 0)), "not whole"),
         (message(struct.pack("<III", 2, 2, 0x71000000)), "not whole"),

@@ -13,7 +13,7 @@ from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.depth_pairs import DepthPairs
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
-from flowing_puppet_ros.stream.messages.depth import MOST_POINTS, depth_cloud, depth_points
+from flowing_puppet_ros.stream.messages.depth import MAX_POINTS, back_project, make_depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header
 from flowing_puppet_ros.stream.messages.images import decode_depth, make_image
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, IMAGE
@@ -38,7 +38,7 @@ def test_both_encodings_give_metres_and_nan_where_unknown() -> None:
     np.testing.assert_allclose(decode_depth(millimetres), [[np.nan, 1.5], [65.535, 0.001]], rtol=1e-6)
     metres = depth(np.array([[np.nan, 1.5], [-1, np.inf]], np.float32), "32FC1")
     np.testing.assert_array_equal(decode_depth(metres), np.array([[np.nan, 1.5], [np.nan, np.nan]], np.float32))
-    with pytest.raises(InputError, match="depth comes as 16UC1"):
+    with pytest.raises(InputError, match="depth must be 16UC1"):
         decode_depth(depth(np.zeros((2, 2), np.uint8), "mono8"))
 
 
@@ -46,7 +46,7 @@ def test_both_encodings_give_metres_and_nan_where_unknown() -> None:
 @given(st.integers(0, 2**31), st.floats(20, 2000), st.integers(2, 30), st.integers(2, 40))
 def test_points_project_back_to_their_pixels(seed: int, focal: float, height: int, width: int) -> None:
     z = np.random.default_rng(seed).uniform(0.3, 8, (height, width)).astype(np.float32)
-    points = depth_points(z, camera(width, height, focal=focal))
+    points = back_project(z, camera(width, height, focal=focal))
     assert len(points) == height * width
     u, v = points[:, 0] / points[:, 2] * focal + (width - 1) / 2, points[:, 1] / points[:, 2] * focal + (height - 1) / 2
     np.testing.assert_allclose(u, np.tile(np.arange(width), height), atol=1e-2)
@@ -56,15 +56,15 @@ def test_points_project_back_to_their_pixels(seed: int, focal: float, height: in
 
 def test_the_projection_matrix_comes_before_the_camera_matrix() -> None:
     p = np.array([50.0, 0, 1, 0, 0, 50, 1, 0, 0, 0, 1, 0])
-    points = depth_points(np.ones((3, 3), np.float32), camera(3, 3, p=p))
+    points = back_project(np.ones((3, 3), np.float32), camera(3, 3, p=p))
     np.testing.assert_allclose(points[-1], [1 / 50, 1 / 50, 1], rtol=1e-6)
 
 
 def test_a_large_image_is_thinned_evenly_and_unknown_pixels_are_left_out() -> None:
     z = np.full((1080, 1920), 2.0, np.float32)
     z[:, :960] = np.nan
-    points = depth_points(z, camera(1920, 1080))
-    assert MOST_POINTS / 4 < len(points) <= MOST_POINTS
+    points = back_project(z, camera(1920, 1080))
+    assert MAX_POINTS / 4 < len(points) <= MAX_POINTS
     assert (points[:, 0] > 0).all()
 
 
@@ -72,13 +72,13 @@ def test_a_large_image_is_thinned_evenly_and_unknown_pixels_are_left_out() -> No
     ("fields", "sentence"),
     [
         ({"k": np.zeros(9)}, "uncalibrated"),
-        ({"k": np.array([math.nan, 0, 1, 0, math.nan, 1, 0, 0, 1])}, "no pinhole"),
+        ({"k": np.array([math.nan, 0, 1, 0, math.nan, 1, 0, 0, 1])}, "not those of a pinhole camera"),
         ({"size": (7, 3)}, "the depth image is 4x3, its camera_info says 7x3"),
     ],
 )
 def test_a_camera_info_that_does_not_fit_is_refused(fields: Any, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
-        depth_points(np.ones((3, 4), np.float32), camera(*fields.pop("size", (4, 3)), **fields))
+        back_project(np.ones((3, 4), np.float32), camera(*fields.pop("size", (4, 3)), **fields))
 
 
 def test_pairs_are_made_by_stamp_in_any_order_and_never_wait_for_long() -> None:
@@ -96,10 +96,10 @@ def test_pairs_are_made_by_stamp_in_any_order_and_never_wait_for_long() -> None:
 
 def test_the_cloud_has_the_header_of_the_image() -> None:
     image = depth(np.full((3, 4), 2.0, np.float32), "32FC1", 5)
-    cloud = depth_cloud(FACTORY, image, camera(4, 3))
+    cloud = make_depth_cloud(FACTORY, image, camera(4, 3))
     assert cloud.header == image.header
     assert decode_cloud(cloud)[0].shape == (12, 3)
     with pytest.raises(InputError, match="no camera_info came yet"):
-        depth_cloud(FACTORY, image, None)
+        make_depth_cloud(FACTORY, image, None)
     with pytest.raises(InputError, match="step"):
-        depth_cloud(FACTORY, FACTORY.make(IMAGE, encoding="32FC1", width=4, height=3), camera(4, 3))
+        make_depth_cloud(FACTORY, FACTORY.make(IMAGE, encoding="32FC1", width=4, height=3), camera(4, 3))

@@ -25,7 +25,8 @@ def test_stamps_come_back_to_the_nanosecond(nanoseconds: Any) -> None:
 def test_quaternions_agree_with_scipy(seed: Any) -> None:
     rotation = Rotation.random(rng=np.random.default_rng(seed))
     expected = rotation.as_quat(canonical=True)
-    found = geometry.quaternion(rotation.as_matrix())
+    message = geometry.make_quaternion(FACTORY, rotation.as_matrix())
+    found = np.array([message.x, message.y, message.z, message.w])
     assert found[3] >= 0
     assert min(np.abs(found - expected).max(), np.abs(found + expected).max()) < 1e-9
     np.testing.assert_allclose(geometry.rotation_matrix(3 * expected), rotation.as_matrix(), atol=1e-12)
@@ -55,23 +56,23 @@ def test_frames_multiply_along_the_tree() -> None:
     tree = geometry.FrameTree()
     tree.add(chain([("rig", "left", places[1], turns[1]), ("rig", "/right", places[2], turns[2])]))
     tree.add(chain([("world", "rig", places[0], turns[0])]))
-    assert tree.root("left") == "world"
+    assert tree.find_root("left") == "world"
     point = rng.normal(size=3)
     in_world = turns[0] @ (turns[1] @ point + places[1]) + places[0]
-    in_world_frame = tree.pose("left", "world")
+    in_world_frame = tree.lookup_pose("left", "world")
     assert in_world_frame is not None
     position, rotation = in_world_frame
     np.testing.assert_allclose(rotation @ point + position, in_world)
-    in_right_frame = tree.pose("left", "right")
+    in_right_frame = tree.lookup_pose("left", "right")
     assert in_right_frame is not None
     position, rotation = in_right_frame
     in_right = turns[2].T @ (turns[0].T @ (in_world - places[0]) - places[2])
     np.testing.assert_allclose(rotation @ point + position, in_right)
-    assert tree.pose("left", "moon") is None
+    assert tree.lookup_pose("left", "moon") is None
 
 
 def test_a_loop_of_frames_is_refused() -> None:
     tree = geometry.FrameTree()
     tree.add(chain([("a", "b", np.zeros(3), np.eye(3)), ("b", "a", np.zeros(3), np.eye(3))]))
     with pytest.raises(InputError, match="loop"):
-        tree.root("a")
+        tree.find_root("a")

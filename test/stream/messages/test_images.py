@@ -87,7 +87,7 @@ def test_bayer_mosaics_give_the_colours_back(pattern: Any) -> None:
 
 def test_compressed_images_are_rgb() -> None:
     rgb = ramp(16, 24)
-    jpeg = FACTORY.make("sensor_msgs/msg/CompressedImage", format="jpeg", data=images.jpeg(rgb, 98))
+    jpeg = FACTORY.make("sensor_msgs/msg/CompressedImage", format="jpeg", data=images.encode_jpeg(rgb, 98))
     assert np.abs(images.decode_image(jpeg).astype(int) - rgb).max() < 16
     png = cv2.imencode(".png", rgb[:, :, ::-1])[1].reshape(-1)
     lossless = FACTORY.make("sensor_msgs/msg/CompressedImage", format="png", data=png)
@@ -103,7 +103,7 @@ def test_broken_compressed_images_are_refused(data: Any) -> None:
 
 def test_half_a_colour_pair_is_refused() -> None:
     odd = message(np.zeros((12, 15, 2), np.uint8), "yuv422_yuy2")
-    with pytest.raises(InputError, match="15x12 is no whole yuv422_yuy2 image"):
+    with pytest.raises(InputError, match="15x12 is not a whole yuv422_yuy2 image"):
         images.decode_image(odd)
 
 

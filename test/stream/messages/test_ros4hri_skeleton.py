@@ -10,7 +10,7 @@ import pytest
 
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.stream.messages.ros4hri_skeleton import MOVING, Skeleton, link_frames
+from flowing_puppet_ros.stream.messages.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames
 
 LINKS = {"shoulder": "r_shoulder", "elbow": "elbow", "wrist": "wrist", "hip": "r_hip", "knee": "knee", "ankle": "ankle"}
 
@@ -26,7 +26,7 @@ def skeleton(model: StitchedPuppet) -> Skeleton:
 
 
 def angles(model: StitchedPuppet, skeleton: Skeleton, state: BodyState) -> dict[str, float]:
-    return skeleton.angles(model.joints(model.vertices(state)), state)
+    return skeleton.joint_angles(model.joints(model.vertices(state)), state)
 
 
 def turned(model: StitchedPuppet, state: BodyState, joint: str, parts: tuple[str, ...], axis: list[float]) -> BodyState:
@@ -56,7 +56,7 @@ def test_turned_parts_turn_the_joints_of_their_names(
     def change(joint: str, parts: tuple[str, ...], axis: list[float]) -> dict[str, float]:
         sided = tuple(f"{side}_{part}" for part in parts)
         after = angles(model, skeleton, turned(model, rest, f"{side}_{joint}", sided, axis))
-        return {name: after[name] - before[name] for name in MOVING}
+        return {name: after[name] - before[name] for name in MOVING_JOINTS}
 
     # The shank backward by half a radian more: a knee bends to negative angles; nothing else moves.
     knee = change("knee", ("lower_leg", "foot"), [0, 0.5, 0])
@@ -89,7 +89,7 @@ def test_links_lie_on_the_limbs_of_any_body_anywhere(model: StitchedPuppet, skel
         state = replace(state, center=state.center @ turn.T + step, rotation=turn @ state.rotation)
         joints = model.joints(model.vertices(state))
         origin, axes = skeleton.body_frame(joints, state)
-        placed = link_frames(skeleton.origins(state.shape), skeleton.angles(joints, state))
+        placed = link_frames(skeleton.joint_origins(state.shape), skeleton.joint_angles(joints, state))
         for side, short in (("left", "l"), ("right", "r")):
             for first, second in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle")):
                 bone = axes.T @ (joints[index[f"{side}_{second}"]] - joints[index[f"{side}_{first}"]])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Many puppets at once are the puppets one by one."""
+"""A batch of puppets equals the puppets one by one."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ MODEL = DeformableStructures.load()
 
 
 @pytest.mark.parametrize("view", ["front", "back"])
-def test_contours_and_energies_of_many_puppets_are_those_of_each(view: View) -> None:
+def test_contours_and_energies_of_a_batch_are_those_of_each_puppet(view: View) -> None:
     rng = np.random.default_rng(0)
     sign = np.array([1.0 if view == "front" else -1.0, 1.0])
     scale = rng.uniform(60, 300, 12)

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""When the detector runs: on a stream, in time with it, and on a clip that is known as a whole."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flowing_puppet_ros.settings import Settings, setting
+
+
+@dataclass(frozen=True)
+class LiveDetectionSettings(Settings):
+    """When the detector runs on the images of a stream."""
+
+    source: str = setting(
+        "auto",
+        "who finds people: auto: the detections topic where somebody publishes on it, else the package's own detector;"
+        " none: the detections topic alone",
+        choices=("auto", "none"),
+    )
+    min_probability: float = setting(0.3, "minimum probability of a detected person to be tracked", low=0.0, high=1.0)
+    full_frame_interval: float = setting(
+        2.0, "time between full-frame detections while people are tracked", unit="s", low=0.0, high=3600.0
+    )
+    empty_interval: float = setting(
+        0.7, "time between full-frame detections while nobody is tracked", unit="s", low=0.0, high=3600.0, advanced=True
+    )
+    full_frame_delay: float = setting(
+        0.4,
+        "age at which the result of a full-frame detection is used; three times that while people are tracked",
+        unit="s",
+        low=0.0,
+        high=10.0,
+        advanced=True,
+    )
+    roi_interval: float = setting(
+        0.2, "time between re-detections in the region (ROI) of each known person", unit="s", low=0.0, high=3600.0
+    )
+    roi_delay: float = setting(
+        0.13,
+        "age at which the result of an ROI re-detection is used, for each person in it",
+        unit="s",
+        low=0.0,
+        high=10.0,
+        advanced=True,
+    )
+
+
+EVERY_IMAGE = LiveDetectionSettings(
+    full_frame_interval=0.33, empty_interval=0.0, full_frame_delay=0.0, roi_interval=0.0, roi_delay=0.0
+)
+"""For recordings, where the detector takes the time it needs: people are re-detected in every image."""
+
+
+@dataclass(frozen=True)
+class ClipDetectionSettings(Settings):
+    """When the detector runs on the images of a clip."""
+
+    min_probability: float = setting(
+        0.3,
+        "minimum probability of a detected person to be tracked; the most probable one needs a third of it",
+        low=0.0,
+        high=1.0,
+    )
+    stride: int = setting(2, "images from one full-frame detection to the next", low=1, high=10000)

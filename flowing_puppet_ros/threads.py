@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Threads: independent work on several, and BLAS and OpenCV on one where the number of threads changes the result.
+
+`one_blas_thread` and `one_opencv_thread` limit the whole process, since neither library counts by caller. They nest,
+may be entered from several threads at once, and give the former count back when the last caller has left.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache, partial
+from threading import Lock
+
+import threadpoolctl
+from numba import config
+
+
+def usable_threads(threads: int) -> int:
+    """Return at most `threads`, the cores that this process may use, and NUMBA_NUM_THREADS, which limits workers."""
+    return max(1, min(threads, int(config.NUMBA_NUM_THREADS)))
+
+
+def parallel_map[Item, Result](work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> list[Result]:
+    """Apply `work` to each item and return the results in the items' order; `work` must not change shared state.
+
+    The results and their order do not depend on the number of threads.
+    """
+    if threads == 1:
+        return [work(item) for item in items]
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(work, items))
+
+
+type Restore = Callable[[], None]
+"""Gives a library its former number of threads back."""
+
+
+class _SharedLimit:
+    """A limit of one thread that holds while any caller is inside.
+
+    `limit` sets one thread and returns how to undo that, or None when there was one already. It runs at every entry:
+    someone may have raised the count since the first caller entered.
+    """
+
+    def __init__(self, limit: Callable[[], Restore | None]) -> None:
+        self._limit = limit
+        self._lock = Lock()
+        self._callers = 0
+        self._restore: Restore | None = None
+
+    @contextmanager
+    def hold(self) -> Iterator[None]:
+        """Limit the library until the last caller leaves."""
+        with self._lock:
+            self._restore = self._limit() or self._restore
+            self._callers += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._callers -= 1
+                if self._callers == 0 and self._restore is not None:
+                    self._restore()
+                    self._restore = None
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Let numpy and scipy multiply matrices with one thread inside the context."""
+    with _BLAS.hold():
+        yield
+
+
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """Let OpenCV work with one thread inside the context."""
+    with _OPENCV.hold():
+        yield
+
+
+def _limit_blas() -> Restore | None:
+    controller = _controller()
+    if all(library["num_threads"] == 1 for library in controller.info()):
+        return None
+    _disown_openblas()
+    limits = controller.limit(limits=1)
+    _disown_openblas()
+
+    def restore() -> None:
+        _disown_openblas()
+        limits.restore_original_limits()
+        _disown_openblas()
+
+    return restore
+
+
+def _disown_openblas() -> None:
+    """Let any thread limit OpenBLAS: threadpoolctl 3.8 silently ignores all but the first thread that does."""
+    clear = getattr(threadpoolctl.OpenBLASController, "clear_controlling_thread", None)
+    if clear is not None:
+        clear(force=True)
+
+
+def _limit_opencv() -> Restore | None:
+    # Loaded here: bodies need the other functions of this module, and no OpenCV.
+    import cv2
+
+    former = cv2.getNumThreads()
+    if former == 1:
+        return None
+    cv2.setNumThreads(1)
+    return partial(cv2.setNumThreads, former)
+
+
+@cache
+def _controller() -> threadpoolctl.ThreadpoolController:
+    # To look for the libraries takes milliseconds; those of both packages must be loaded when it is done.
+    import scipy.linalg  # noqa: F401
+
+    return threadpoolctl.ThreadpoolController()
+
+
+_BLAS, _OPENCV = _SharedLimit(_limit_blas), _SharedLimit(_limit_opencv)
