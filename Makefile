@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-# make venv   set everything up in .venv          make test   linter, type checker and tests
-# make demo   sample bag -> replay -> report      make lint   linter and type checker alone
-# make bench  speed as ratios, and live nodes     make docs   the documentation site, into out/site
+# make venv   set everything up in .venv          make check  linter, type checker and the fast tests
+# make demo   sample bag -> replay -> report      make test   linter, type checker and all tests
+# make bench  speed as ratios, and live nodes     make lint   linter and type checker alone
+# make docs   the documentation site, into out/site
 # make coverage, make release-check, make figures, make config, make lock: see CONTRIBUTING.md
 
 SHELL := /bin/bash
@@ -9,8 +10,12 @@ PYTHON := .venv/bin/python
 SAMPLE := bags/cache/sample
 # The two variables that the ROS wheels leave in their children would keep another environment's Python from starting.
 CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE
+# Tests in this many processes. They keep the order of the files, so that costly fixtures are seldom made twice, and
+# whoever is done takes over half of what another one still has to do.
+WORKERS := 2
+PYTEST = $(CLEAN_ENV) $(PYTHON) -m pytest --numprocesses $(WORKERS) --dist worksteal
 
-.PHONY: venv demo sample-bag test coverage lint bench docs figures config lock release-check clean
+.PHONY: venv demo sample-bag check test coverage lint bench docs figures config lock release-check clean
 
 venv:
 	@python=$$(sh scripts/find_python.sh) && $(CLEAN_ENV) "$$python" -I scripts/make_venv.py
@@ -27,13 +32,16 @@ lint: venv
 	@.venv/bin/ruff format --check .
 	@.venv/bin/mypy
 
+check: lint
+	@$(PYTEST) -m "not slow and not ros"
+
 test: lint
 	@$(PYTHON) scripts/ensure_browser.py
-	@$(CLEAN_ENV) $(PYTHON) -m pytest
+	@$(PYTEST)
 
 # Coverage sees no line of a compiled kernel run: those are covered where their tests are, not in the table.
 coverage: venv
-	@$(CLEAN_ENV) $(PYTHON) -m pytest --cov=flowing_puppet_ros --cov-report=term:skip-covered --cov-report=html:out/coverage
+	@$(PYTEST) --cov=flowing_puppet_ros --cov-report=term:skip-covered --cov-report=html:out/coverage
 
 docs: venv
 	@$(CLEAN_ENV) $(PYTHON) -m sphinx --quiet --fail-on-warning --keep-going --jobs auto -b html docs out/site

@@ -52,6 +52,7 @@ setup(
     install_requires=requirements("runtime"),
     extras_require={
         "learn": requirements("learn") + requirements("learn-assets"),
+        "annotate": requirements("annotate"),
         "cluster": requirements("cluster"),
         "rerun": requirements("rerun"),
     },

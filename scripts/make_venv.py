@@ -214,7 +214,7 @@ def check_imports(environment: dict[str, str]) -> None:
 
 def make_steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]:
     """Return the steps in order."""
-    names = ("runtime", "learn", "dev", "docs", "build", *(() if ros else ("ros",)))
+    names = ("runtime", "annotate", "learn", "dev", "docs", "build", *(() if ros else ("ros",)))
     lists = [ROOT / "requirements" / f"{name}.txt" for name in (*names, "learn-assets", "lock")]
     package = [ROOT / name for name in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "launch", "config")]
     libraries = ROOT / "scripts" / "interface_libraries.py"

@@ -20,8 +20,16 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
 FOUNDATION = {"arrays", "errors", "ids", "images", "reporting", "settings", "threads", "units"}
 """Modules beside the rooms, which everything may import."""
-OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "rerun"}
-OPTIONAL = {"learn": "learn", "cli.batch.cluster": "cluster", "report.rerun_file": "rerun"}
+OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug"}
+ONLY_WITH_EXTRA = "flowing_puppet_ros.annotate.server"
+"""Nothing but an extra's own module imports what the extra brings at its top."""
+OPTIONAL = {
+    "annotate.server": "annotate",
+    "cli.annotate": "annotate",
+    "learn": "learn",
+    "cli.batch.cluster": "cluster",
+    "report.rerun_file": "rerun",
+}
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10
 MAY_IMPORT: dict[str, set[str]] = {
@@ -266,6 +274,7 @@ def test_no_import_cycles() -> None:
 def test_all_but_node_imports_without_ros() -> None:
     """Every other module imports where rclpy, the message packages and what is optional are absent."""
     names = [module_name(path) for path in MODULES if room_of(module_name(path)) not in ("node", "__main__")]
+    names.remove(ONLY_WITH_EXTRA)
     code = f"""
 import importlib, sys
 class Absent:
@@ -307,7 +316,7 @@ def test_third_party_imports_are_required() -> None:
 def test_locked_versions_cover_the_requirements() -> None:
     folder = ROOT / "requirements"
     locked = {line.split("==")[0] for line in (folder / "lock.txt").read_text().splitlines()}
-    for name in ("runtime", "learn", "cluster", "dev", "docs", "build", "ros"):
+    for name in ("runtime", "annotate", "learn", "cluster", "dev", "docs", "build", "ros"):
         for line in (folder / f"{name}.txt").read_text().splitlines():
             if not line.startswith("#"):
                 assert re.split(r"[=<>\[]", line)[0].lower().replace("_", "-") in {

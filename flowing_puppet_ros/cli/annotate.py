@@ -11,10 +11,7 @@ import socket
 import sys
 from pathlib import Path
 
-import waitress
-
 from flowing_puppet_ros.annotate.folder import ImageFolder
-from flowing_puppet_ros.annotate.server import MAX_REQUEST_BYTES, make_app
 from flowing_puppet_ros.annotate.store import AnnotationStore
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
@@ -33,7 +30,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Serve the page until interrupted."""
+    """Serve the page until interrupted; InputError where the extra `annotate` is not installed."""
+    try:
+        import waitress
+
+        from flowing_puppet_ros.annotate.server import MAX_REQUEST_BYTES, make_app
+    except ModuleNotFoundError as error:
+        raise InputError(f"annotate needs {error.name}; pip install 'flowing_puppet_ros[annotate]'") from error
     if arguments.host in WILDCARDS:
         raise InputError(f"--host {arguments.host} does not name a machine; give the address that the browser will use")
     folder = ImageFolder(arguments.folder)

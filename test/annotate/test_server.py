@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The annotation server by its requests: who is answered, and with what."""
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from flask.testing import FlaskClient
 from flowing_puppet_ros.annotate.folder import ImageFolder
 from flowing_puppet_ros.annotate.server import MAX_REQUEST_BYTES, make_app
 from flowing_puppet_ros.annotate.store import AnnotationStore
+from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
@@ -170,3 +172,11 @@ def test_huge_and_broken_bodies_are_refused(client: FlaskClient) -> None:
 @pytest.mark.parametrize("path", ["/page/../server.py", "/page/..%2fserver.py", "/server.py", "/page/"])
 def test_only_the_page_is_served(client: FlaskClient, path: str) -> None:
     assert client.get(path).status_code == 404
+
+
+def test_without_its_extra_the_verb_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "waitress", None)
+    assert main(["annotate", str(tmp_path)]) == 2
+    assert "pip install 'flowing_puppet_ros[annotate]'" in capsys.readouterr().err

@@ -160,6 +160,26 @@ def test_without_keypoints_the_detector_looks(frames: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
+def test_the_loop_of_the_thesis_places_the_arms_near_the_keypoints(frames: Path, tmp_path: Path) -> None:
+    moved = [[[x + 2.0 * k, y, c] for x, y, c in start()] for k in range(6)]
+    init = write_keypoints(tmp_path / "k.json", {str(k): [person] for k, person in enumerate(moved)})
+    small = ["--thesis-loop-particles", "20", "--thesis-loop-rounds", "1", "--thesis-loop-iterations", "3"]
+    for out in ("one.json", "two.json"):
+        words = ["track", str(frames), "--init", str(init), "--out", str(tmp_path / out), "--method", "thesis", *small]
+        assert main(words) == 0
+    assert (tmp_path / "one.json").read_bytes() == (tmp_path / "two.json").read_bytes()
+    for k, frame in enumerate(json.loads((tmp_path / "one.json").read_text())["frames"]):
+        (puppet,) = frame["puppets"]
+        joints = np.array(puppet["joints"])[:, :2]
+        assert np.abs(joints - np.array(moved[k])[:, :2]).max() < 60
+
+
+def test_the_loop_of_the_thesis_is_not_live(frames: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["track", str(frames), "--out", str(tmp_path / "t.json"), "--method", "thesis", "--live"]
+    assert main(words) == 2
+    assert "exclude each other" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("flags", [[], ["--live"]])
 def test_where_nobody_is_nobody_is_tracked(flags: list[str], tmp_path: Path) -> None:
     rng, folder = np.random.default_rng(2), tmp_path / "frames"

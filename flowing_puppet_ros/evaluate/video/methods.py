@@ -166,7 +166,7 @@ def _track_by_thesis(run: ClipRun, flow: bool = True, hands: bool = True) -> Cli
     """Track by the loop of the thesis; without `flow` in propagation and likelihood, or without `hands`."""
     loop, energy = run.settings.thesis.loop, run.settings.thesis.energy
     if not flow:
-        loop, energy = replace(loop, carried=0), replace(energy, forward=False, backward=False)
+        loop, energy = replace(loop, max_propagated=0), replace(energy, forward_flow=False, backward_flow=False)
     if not hands:
         energy = replace(energy, hand_weight=0.0)
     thesis = replace(run.settings.thesis, loop=loop, energy=energy)

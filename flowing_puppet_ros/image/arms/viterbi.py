@@ -21,12 +21,14 @@ JOINT_WEIGHTS = np.array([0.4, 1.0])  # of elbow and wrist in a step's cost: the
 
 @dataclass(frozen=True)
 class ArmPathSettings(Settings):
-    """How the hypotheses of an arm are joined over time."""
+    """How the hypotheses of an arm are linked over time."""
 
-    modes: int = setting(8, "hypotheses of an arm that the detector gives", low=1, high=100)
+    modes: int = setting(8, "hypotheses of each arm taken from the detector", low=1, high=100)
     detector_weight: float = setting(8.0, "weight of the detector's score of elbow and wrist", low=0.0, high=100.0)
     evidence_weight: float = setting(0.5, "weight of contour and colour", low=0.0, high=100.0)
-    flow_strength: float = setting(60.0, "cost of a step that leaves the flow by a shoulder width", low=0.0, high=1e4)
+    flow_strength: float = setting(
+        60.0, "cost of a step that deviates from the flow by a shoulder width", low=0.0, high=1e4
+    )
     max_step: float = setting(1.0, "distance from the flow, in shoulder widths, beyond which a step costs no more",
                                   low=0.01, high=100.0)  # fmt: skip
 

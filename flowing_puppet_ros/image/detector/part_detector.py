@@ -46,16 +46,16 @@ MIN_SIDE_PX = 24  # nothing is found in a smaller image
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings(Settings):
-    """Whom to detect, and with how much effort."""
+    """Which people to detect, and with how much effort."""
 
     min_shoulder_width: float = setting(
-        0.0, "smallest shoulder width to look for; 0 is a twentieth of the longer side", unit="px", low=0.0, high=1e5
+        0.0, "minimum shoulder width; 0: a twentieth of the longer image side", unit="px", low=0.0, high=1e5
     )
-    max_side: int = setting(720, "images are shrunk to this longer side", unit="px", low=64, high=4096)
-    max_candidates: int = setting(12, "places where a pose is sought", low=1, high=80)
-    max_people: int = setting(8, "people to report", low=1, high=80)
-    mirrored: bool = setting(True, "look at the mirror image too: more is found, and it takes twice as long")
-    min_confidence: float = setting(0.03, "probability below which nobody is reported", low=0.0, high=1.0)
+    max_side: int = setting(720, "longest image side at which people are detected", unit="px", low=64, high=4096)
+    max_candidates: int = setting(12, "maximum number of candidates for which a pose is searched", low=1, high=80)
+    max_people: int = setting(8, "maximum number of people", low=1, high=80)
+    mirrored: bool = setting(True, "also detect in the mirror image: more accurate, twice as slow")
+    min_confidence: float = setting(0.03, "minimum probability of a person", low=0.0, high=1.0)
 
 
 DEFAULT_SETTINGS = DetectorSettings()

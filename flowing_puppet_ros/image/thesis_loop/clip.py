@@ -114,7 +114,11 @@ class ThesisClip:
             # The flow into the first image of a continued segment comes from outside of it, and still shows its hands.
             flows = [] if flow is None else [flow[1]]
             frame.hands = make_hand_maps(self.hands, evidence.window, flows, grid, puppet.scale)
-        if flow is not None and segment.frames and self.loop.carried + self.energy.forward + self.energy.backward > 0:
+        if (
+            flow is not None
+            and segment.frames
+            and self.loop.max_propagated + self.energy.forward_flow + self.energy.backward_flow > 0
+        ):
             low, high = _arm_reach_box(segment.puppets[-1], puppet)
             segment.frames[-1].after = FlowMoments.of(flow, grid, low, high)
             frame.before = FlowMoments.of((flow[1], flow[0]), grid, low, high)

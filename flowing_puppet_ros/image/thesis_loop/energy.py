@@ -37,9 +37,9 @@ class EnergySettings(Settings):
     colour_weight: float = setting(0.6, "weight of skin and torso colour", low=0.0, high=100.0)
     hand_weight: float = setting(1.0, "weight of the hand detectors", low=0.0, high=100.0)
     score_weight: float = setting(3.0, "weight of the detector's score of each arm joint", low=0.0, high=100.0)
-    forward: bool = setting(True, "use the evidence at the puppet that the flow carries forward")
-    backward: bool = setting(True, "use the evidence at the puppet that the flow carries backward")
-    steps: int = setting(1, "images that the flow carries a puppet for its evidence", low=1, high=10)
+    forward_flow: bool = setting(True, "use the evidence at the puppet propagated forward by the flow")
+    backward_flow: bool = setting(True, "use the evidence at the puppet propagated backward by the flow")
+    flow_steps: int = setting(1, "images by which the flow propagates a puppet for its evidence", low=1, high=10)
 
     @property
     def weights(self) -> F64:
@@ -116,14 +116,14 @@ class FlowingEnergy:
         contours, prior = self.body.model.puppets_from_joints(joints, scale, self.body.view, self.body.edges)
         own = self.frames[frame].terms(self.body, joints, scale, contours)
         elsewhere = np.zeros_like(own)
-        for step, wanted in ((1, self.settings.forward), (-1, self.settings.backward)):
+        for step, wanted in ((1, self.settings.forward_flow), (-1, self.settings.backward_flow)):
             if wanted:
                 elsewhere += self._propagated_terms(frame, step, joints, scale, contours)
         return prior, own, elsewhere
 
     def _propagated_terms(self, frame: int, step: int, joints: F64, scale: F64, contours: Sequence[F64]) -> F64:
         terms = np.zeros((len(joints), len(TERMS)))
-        for _ in range(self.settings.steps):
+        for _ in range(self.settings.flow_steps):
             flow = self.flow_to_neighbour(frame, step)
             if flow is None:
                 break

@@ -38,13 +38,17 @@ AGREEMENT_DISTANCE_M = 0.1  # within which particles agree on a joint
 class LoopSettings(Settings):
     """How long the particles are searched for; the thesis has P = 40, M = 5, R = 8 and three seeds."""
 
-    particles: int = setting(40, "particles an image, P", low=2, high=1000)
-    carried: int = setting(5, "best particles that are carried into the neighbouring images, M", low=0, high=100)
+    particles: int = setting(40, "particles per image, P", low=2, high=1000)
+    max_propagated: int = setting(5, "best particles propagated to the neighbouring images, M", low=0, high=100)
     rounds: int = setting(8, "rounds of search and propagation, R", low=1, high=100)
-    seeds: int = setting(3, "runs, of which that of least energy is taken", low=1, high=100)
+    restarts: int = setting(3, "independent runs, of which the one of minimum energy is taken", low=1, high=100)
     iterations: int = setting(3, "steps of the swarm in each stage of a round", low=1, high=1000)
-    jump: float = setting(0.5, "probability that a particle draws a wrist instead of moving", low=0.0, high=1.0)
-    temperature: float = setting(2.0, "energy difference at which a particle is drawn 1/e as often", low=0.01, high=1e3)
+    jump_probability: float = setting(
+        0.5, "probability that a particle draws a wrist instead of moving", low=0.0, high=1.0
+    )
+    temperature: float = setting(
+        2.0, "energy difference at which a particle is drawn 1/e times as often", low=0.01, high=1e3
+    )
     seed: int = setting(0, "seed of all random draws", low=0, high=1_000_000)
 
 
@@ -81,7 +85,7 @@ class ThesisLoop:
         """
         energy = FlowingEnergy(self.body, frames, self.energy_settings)
         best: tuple[float, list[_FrameParticles]] | None = None
-        for number in range(self.settings.seeds):
+        for number in range(self.settings.restarts):
             rng = np.random.default_rng([self.settings.seed, number])
             images = [self._initialise(t, start, energy, rng) for t, start in enumerate(starts)]
             self._propagate(images, energy)
@@ -134,7 +138,7 @@ class ThesisLoop:
         for parts in STAGES:
             search(
                 image.swarm, evaluate, bounds, self.settings.iterations, rng, self.body.select_values(parts),
-                image.proposal, self.settings.jump,
+                image.proposal, self.settings.jump_probability,
             )  # fmt: skip
         swarm = image.swarm
         best = int(swarm.best_energy.argmin())
@@ -146,7 +150,7 @@ class ThesisLoop:
     def _propagate(self, images: Sequence[_FrameParticles], energy: FlowingEnergy) -> None:
         """Propagate the best particles of each image forward through the clip, then backward; keep the best of all."""
         count = len(images)
-        if self.settings.carried == 0:
+        if self.settings.max_propagated == 0:
             return
         for step, order in ((1, range(count - 1)), (-1, range(count - 1, 0, -1))):
             for t in order:
@@ -159,7 +163,7 @@ class ThesisLoop:
         if flow is None:
             return
         here, there = images[t], images[t + step]
-        chosen = here.swarm.particles[np.argsort(here.swarm.energy, kind="stable")[: self.settings.carried]]
+        chosen = here.swarm.particles[np.argsort(here.swarm.energy, kind="stable")[: self.settings.max_propagated]]
         joints, scale = self.body.to_joints(chosen, here.legs)
         contours, _ = self.body.model.puppets_from_joints(joints, scale, self.body.view, [])
         moved = self.body.to_vectors(propagate_joints(self.body, flow, joints, contours), scale)

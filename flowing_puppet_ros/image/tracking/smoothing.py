@@ -32,10 +32,10 @@ _START_WEIGHT = 1e-6  # keeps joints with neither detection nor flow at their st
 class SmoothingSettings(Settings):
     """How joints are smoothed over time."""
 
-    flow_weight: float = setting(10.0, "weight of the flow against the detections", low=0.0, high=1000.0)
-    detection_width: float = setting(0.016, "distance at which a detection begins to count less", unit="m",
+    flow_weight: float = setting(10.0, "weight of the flow relative to the detections", low=0.0, high=1000.0)
+    detection_width: float = setting(0.016, "distance beyond which a detection counts less", unit="m",
                                      low=0.001, high=1.0)  # fmt: skip
-    flow_width: float = setting(0.005, "distance at which the flow begins to count less", unit="m",
+    flow_width: float = setting(0.005, "distance beyond which the flow counts less", unit="m",
                                 low=0.0005, high=1.0)  # fmt: skip
 
 

@@ -7,7 +7,7 @@ state of a person is the joints, a scale and a view; the puppet follows from the
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +38,10 @@ from flowing_puppet_ros.model.ds.shape import PuppetShape, View
 MIN_KNOWN_JOINTS = 3  # of a live track
 HIDDEN_CONFIDENCE = 0.3  # share of the confidence that a joint behind a nearer person keeps ...
 OUTSIDE_CONFIDENCE = 0.1  # ... and one outside of the image
+
+
+type DetectInTracks = Callable[[Sequence[Track]], tuple[Sequence[Keypoints] | None, Collection[str] | None]]
+"""From the tracks in an image to the people detected there (None: no detector ran), and the ids that were searched."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,11 +141,13 @@ class FlowingPuppetTracker:
         detections: Sequence[Keypoints] | None = None,
         flow: FlowPair | None = None,
         searched_ids: Collection[str] | None = None,
+        detect: DetectInTracks | None = None,
     ) -> TrackResult:
         """Track the people into the next `image` (H, W, 3) RGB or (H, W) grey, uint8.
 
         `detections` are the people a detector found in this image; None if none ran, empty if it found nobody. Tracks
         without a detection count as missed; if the detector searched for some people only, give their `searched_ids`.
+        `detect` runs a detector on this image once the tracks are propagated into it.
         `flow` is (forward from the previous image, backward to it), each (h, w, 2) in pixels of its own grid of any
         resolution, NaN unknown; computed here if not given. A stamp before the previous one, an image of another size
         or a cut between shots restarts the tracker with a warning. InputError if `image` is not an image.
@@ -160,6 +166,8 @@ class FlowingPuppetTracker:
             else:
                 propagation = propagate_tracks(self.model, self.tracks, pair, frame.grid, self.settings)
         self._count_image()
+        if detect is not None:
+            detections, searched_ids = detect(self.tracks)
         if detections is not None:
             found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
             appearances = self._measure_appearances(image, found)

@@ -84,9 +84,22 @@ class DetectionWorker:
                 if (puppet := owners.get(index)) is None:
                     people.append(DetectedPerson(detection, detection.keypoints))
                     continue
-                joints = arms[puppet.id].step_joints(self.evidence_model.extract(image, puppet, detection))
+                joints = self.step_arms(arms[puppet.id], image, puppet, detection)
                 people.append(DetectedPerson(detection, detection.keypoints, puppet.id, joints))
         return people
+
+    def detect_at(self, image: Image, candidates: Sequence[PersonCandidate]) -> list[DetectedPerson]:
+        """Detect people at some candidates only."""
+        with one_opencv_thread():
+            found = self.detector.detect_at(image, candidates)
+        return [DetectedPerson(detection, detection.keypoints) for detection in found]
+
+    def step_arms(
+        self, arms: ArmFilter, image: Image, puppet: TrackedPuppet, detection: PersonDetection | None
+    ) -> ArmJoints:
+        """Step the filter of a person's arms by what their image shows, and return the best joints."""
+        with one_opencv_thread():
+            return arms.step_joints(self.evidence_model.extract(image, puppet, detection))
 
 
 def match_to_tracks(

@@ -12,6 +12,8 @@ from flowing_puppet_ros.image.video.tracklets import TrackletLinker
 
 MAX_FULL_FRAMES = 20
 """Full-frame detections that are remembered."""
+CONFIRMING_FULL_FRAMES = 5
+"""Full-frame detections that must have found a person before full frames become rare."""
 
 
 @dataclass(slots=True, eq=False)
@@ -19,7 +21,7 @@ class KnownPeople:
     """Size and probability of the tracked people, and a `linker` that tells from several full frames who is there."""
 
     linker: TrackletLinker
-    _known: dict[str, tuple[float, float]] = field(default_factory=dict)
+    _known: dict[str, tuple[float, float, int]] = field(default_factory=dict)
 
     def locate(self, number: int, candidates: Sequence[PersonCandidate]) -> list[PersonCandidate]:
         """Record the candidates of full frame `number`; return where people are in it, by all full frames so far."""
@@ -32,22 +34,24 @@ class KnownPeople:
 
         The flow carries the forgotten on until a later full frame finds them or the tracker drops them.
         """
-        self._known = {identity: (place.scale, place.log_odds) for identity, place in found.items()}
+        counts = {identity: self._known[identity][2] + 1 if identity in self._known else 1 for identity in found}
+        self._known = {identity: (place.scale, place.log_odds, counts[identity]) for identity, place in found.items()}
 
     def add(self, found: Mapping[str, PersonCandidate]) -> None:
         """Take people who are new, by id, as if a full frame had found them."""
         for identity, place in found.items():
-            self._known.setdefault(identity, (place.scale, place.log_odds))
+            self._known.setdefault(identity, (place.scale, place.log_odds, 1))
 
-    def contains(self, people: Iterable[str]) -> bool:
-        """Return whether one of these people is known."""
-        return any(identity in self._known for identity in people)
+    def are_confirmed(self, people: Iterable[str]) -> bool:
+        """Return whether some of these people are known, and each of them from enough full frames."""
+        counts = [self._known[identity][2] for identity in people if identity in self._known]
+        return min(counts, default=0) >= CONFIRMING_FULL_FRAMES
 
     def candidates(self, joint_names: Sequence[str], people: Mapping[str, F64]) -> dict[str, PersonCandidate]:
         """Return where the known ones of these people are, whose joints (J, 2) px are given by id."""
         neck, face = (joint_names.index(name) for name in ("neck", "face"))
         return {
-            identity: PersonCandidate(joints[neck], joints[face], *self._known[identity])
+            identity: PersonCandidate(joints[neck], joints[face], *self._known[identity][:2])
             for identity, joints in people.items()
             if identity in self._known
         }

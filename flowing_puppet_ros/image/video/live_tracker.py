@@ -10,20 +10,22 @@ alone: a replay, where each run finishes at once, gives the same puppets as the 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import Flow, Image
+from flowing_puppet_ros.arrays import F64, Flow, Image
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arms.evidence import ArmEvidenceModel
 from flowing_puppet_ros.image.arms.hypotheses import ArmFilter
 from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
-from flowing_puppet_ros.image.detector.detection import PersonCandidate
+from flowing_puppet_ros.image.detector.detection import PersonCandidate, PersonDetection
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.tracking.track import Track
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.video.detection_worker import DetectedPerson, DetectionWorker, match_to_tracks
 from flowing_puppet_ros.image.video.flow_history import propagate_points, reduce_flow
@@ -185,6 +187,8 @@ class LiveTracker:
                 {p.id: people[p.detection].candidate for p in started.puppets if p.detection is not None}
             )
             if result is not None:
+                seen = {p.id: people[p.detection].detection for p in started.puppets if p.detection is not None}
+                started = self._refine_arms(started, image, seen)
                 return replace(started, warnings=warnings, restarted=restarted)
         if result is not None:
             return result
@@ -193,6 +197,8 @@ class LiveTracker:
 
     def _track(self, run: _PendingDetection | None, image: Image, stamp_ns: int, flow: FlowPair | None) -> TrackResult:
         """Track an image, with the result of an ROI re-detection where one is due."""
+        if run is None and self._settings.roi_delay == 0:
+            return self._track_and_detect(image, stamp_ns, flow)
         if run is None or not self._tracker.tracks or run.flows is None:
             if run is not None:
                 self._roi, self._arms = None, {}
@@ -217,6 +223,35 @@ class LiveTracker:
         self._known.add({identity: person.candidate for identity, person in matched.items()})
         arms_seen = {identity: person.arms for identity, person in matched.items() if person.identity == identity}
         return self._tracker.override_joints(result, arms_seen)
+
+    def _track_and_detect(self, image: Image, stamp_ns: int, flow: FlowPair | None) -> TrackResult:
+        """Track an image, with an ROI re-detection in it where the tracks lead."""
+        seen: list[DetectedPerson] = []
+
+        def detect(tracks: Sequence[Track]) -> tuple[list[Keypoints] | None, Collection[str] | None]:
+            rois = self._take_rois({track.id: track.mean for track in tracks}) if tracks else {}
+            if not rois:
+                return None, None
+            self._counters["ROI re-detections"] += 1
+            seen.extend(self._load_worker().detect_at(image, list(rois.values())))
+            return [person.keypoints for person in seen], rois
+
+        result = self._record_flow(self._tracker.step(image, stamp_ns, flow=flow, detect=detect))
+        matched = {puppet.id: seen[puppet.detection] for puppet in result.puppets if puppet.detection is not None}
+        self._known.add({identity: person.candidate for identity, person in matched.items()})
+        if not seen:
+            return result
+        return self._refine_arms(result, image, {identity: one.detection for identity, one in matched.items()})
+
+    def _refine_arms(self, result: TrackResult, image: Image, seen: Mapping[str, PersonDetection]) -> TrackResult:
+        """Return the result with elbows and wrists by the best hypotheses; `seen` are this image's detections by id."""
+        self._arms = {puppet.id: self._arms.get(puppet.id, ArmFilter(ArmPathSettings())) for puppet in result.puppets}
+        worker = self._load_worker()
+        joints = {
+            puppet.id: worker.step_arms(self._arms[puppet.id], image, puppet, seen.get(puppet.id))
+            for puppet in result.puppets
+        }
+        return self._tracker.override_joints(result, joints)
 
     def _record_flow(self, result: TrackResult) -> TrackResult:
         """Return the result; propagate what is pending, and the hypotheses of the arms, to its image."""
@@ -253,7 +288,7 @@ class LiveTracker:
     ) -> _PendingDetection | None:
         """Start a full-frame detection on the image that was just tracked, if it is time for one."""
         settings, people = self._settings, [puppet.id for puppet in result.puppets]
-        interval = settings.full_frame_interval if self._known.contains(people) else settings.empty_interval
+        interval = settings.full_frame_interval if self._known.are_confirmed(people) else settings.search_interval
         if self._full_frame_ns is not None and self._now_ns - self._full_frame_ns < _to_ns(interval):
             return None
         self._full_frame_ns = self._now_ns
@@ -266,17 +301,26 @@ class LiveTracker:
         self, image: Image, stamp_ns: int, result: TrackResult, executor: Executor | None
     ) -> _PendingDetection | None:
         """Start a re-detection of the known people in the image that was just tracked, if it is time for one."""
-        joints = {puppet.id: puppet.joints for puppet in result.puppets}
-        rois = self._known.candidates(self._tracker.model.joint_names, joints)
-        rois |= {f"new {number}": place for number, place in enumerate(self._new)}
-        since = None if self._roi_ns is None else self._now_ns - self._roi_ns
-        if not rois or (since is not None and since < _to_ns(self._settings.roi_interval * len(rois))):
+        if self._settings.roi_delay == 0:
             return None
-        self._new, self._roi_ns = [], self._now_ns
+        joints = {puppet.id: puppet.joints for puppet in result.puppets}
+        rois = self._take_rois(joints)
+        if not rois:
+            return None
         self._arms = {identity: self._arms.get(identity, ArmFilter(ArmPathSettings())) for identity in joints}
         run = partial(self._detect_in_rois, image, list(rois.values()), result.puppets, self._arms)
         due_ns = self._now_ns + _to_ns(self._settings.roi_delay * len(rois))
         return _PendingDetection(image, stamp_ns, due_ns, _submit(run, executor), rois)
+
+    def _take_rois(self, joints: Mapping[str, F64]) -> dict[str, PersonCandidate]:
+        """Return where to re-detect people whose joints (J, 2) px are given by id, if it is time for that."""
+        rois = self._known.candidates(self._tracker.model.joint_names, joints)
+        rois |= {f"new {number}": place for number, place in enumerate(self._new)}
+        since = None if self._roi_ns is None else self._now_ns - self._roi_ns
+        if not rois or (since is not None and since < _to_ns(self._settings.roi_interval * len(rois))):
+            return {}
+        self._new, self._roi_ns = [], self._now_ns
+        return rois
 
     # The detector is loaded where it runs: not in the thread that tracks.
     def _detect_full_frame(self, image: Image, known: KnownPeople, number: int) -> list[DetectedPerson]:

@@ -20,10 +20,15 @@ class LiveDetectionSettings(Settings):
     )
     min_probability: float = setting(0.3, "minimum probability of a detected person to be tracked", low=0.0, high=1.0)
     full_frame_interval: float = setting(
-        2.0, "time between full-frame detections while people are tracked", unit="s", low=0.0, high=3600.0
+        2.0, "time between full-frame detections while all tracked people are confirmed", unit="s", low=0.0, high=3600.0
     )
-    empty_interval: float = setting(
-        0.7, "time between full-frame detections while nobody is tracked", unit="s", low=0.0, high=3600.0, advanced=True
+    search_interval: float = setting(
+        0.7,
+        "time between full-frame detections while nobody is tracked, or somebody not yet confirmed",
+        unit="s",
+        low=0.0,
+        high=3600.0,
+        advanced=True,
     )
     full_frame_delay: float = setting(
         0.4,
@@ -38,7 +43,7 @@ class LiveDetectionSettings(Settings):
     )
     roi_delay: float = setting(
         0.13,
-        "age at which the result of an ROI re-detection is used, for each person in it",
+        "age at which the result of an ROI re-detection is used, for each person in it; 0: in its own image",
         unit="s",
         low=0.0,
         high=10.0,
@@ -47,7 +52,7 @@ class LiveDetectionSettings(Settings):
 
 
 EVERY_IMAGE = LiveDetectionSettings(
-    full_frame_interval=0.33, empty_interval=0.0, full_frame_delay=0.0, roi_interval=0.0, roi_delay=0.0
+    full_frame_interval=0.33, search_interval=0.0, full_frame_delay=0.0, roi_interval=0.0, roi_delay=0.0
 )
 """For recordings, where the detector takes the time it needs: people are re-detected in every image."""
 

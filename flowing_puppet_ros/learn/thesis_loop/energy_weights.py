@@ -143,7 +143,7 @@ def _sample_puppets(
         moves = WristProposals.of(body, box, legs, frames[1].hands, puppet.joints[0], puppet.scale)
         drawn[::3] = moves(drawn[::3], rng)
     joints, scale = body.to_joints(box.clip(drawn), legs)
-    prior, own, elsewhere = FlowingEnergy(body, frames, EnergySettings(forward=False)).terms(1, joints, scale)
+    prior, own, elsewhere = FlowingEnergy(body, frames, EnergySettings(forward_flow=False)).terms(1, joints, scale)
     return joints, np.column_stack([prior, own[:, :3], elsewhere[:, :3]])
 
 

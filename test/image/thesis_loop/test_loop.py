@@ -177,21 +177,20 @@ def test_the_energy_adds_the_evidence_at_the_carried_puppet() -> None:
     _, frames, truth = clip(lost=9)
     energies = {}
     for name, settings in (
-        ("none", EnergySettings(forward=False, backward=False)),
-        ("forward", EnergySettings(backward=False)),
-        ("two", EnergySettings(backward=False, steps=2)),
+        ("none", EnergySettings(forward_flow=False, backward_flow=False)),
+        ("forward", EnergySettings(backward_flow=False)),
+        ("two", EnergySettings(backward_flow=False, flow_steps=2)),
     ):
         energy = FlowingEnergy(FRONT, frames, settings)
         energies[name] = energy.terms(1, truth[1:2], np.array([SCALE]))
     assert not energies["none"][2].any()
     right, wrong = truth[1:2], truth[1:2] + 10.0
-    terms = FlowingEnergy(FRONT, frames, EnergySettings(backward=False)).terms(1, np.concatenate([right, wrong]),
+    terms = FlowingEnergy(FRONT, frames, EnergySettings(backward_flow=False)).terms(1, np.concatenate([right, wrong]),
                                                                               np.full(2, SCALE))[2]  # fmt: skip
     assert terms[0, 3] > terms[1, 3], "the true puppet is propagated onto the next image's detection"
     assert energies["two"][2][0, 3] <= energies["forward"][2][0, 3] <= 0.0
-    assert (
-        not FlowingEnergy(FRONT, frames, EnergySettings(backward=False)).terms(4, truth[4:], np.array([SCALE]))[2].any()
-    ), "after the last image there is nothing"
+    last = FlowingEnergy(FRONT, frames, EnergySettings(backward_flow=False)).terms(4, truth[4:], np.array([SCALE]))
+    assert not last[2].any(), "after the last image there is nothing"
 
 
 def test_wrists_go_where_hands_are_and_arms_follow() -> None:

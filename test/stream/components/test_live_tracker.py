@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The detector beside the tracker: searches, glances, how they are carried, the same live and replayed."""
+"""Detection beside tracking: full frames, ROIs, how results are propagated, the same live and replayed."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -75,6 +75,9 @@ class TrueWorker:
         near = [min(people, key=lambda person: person.candidate.neck_distance(place)) for place in places if people]
         return [self._with_arms(person, puppets) for person in near]
 
+    def step_arms(self, arms: ArmFilter, image: Any, puppet: TrackedPuppet, detection: Any) -> dict[int, Any]:
+        return {}
+
     def _with_arms(self, person: DetectedPerson, puppets: Sequence[TrackedPuppet]) -> DetectedPerson:
         neck = person.keypoints.xy[JOINTS.index("neck")]
         near = [puppet.id for puppet in puppets if np.hypot(*(puppet.joints[0] - neck)) < 30]
@@ -122,7 +125,7 @@ def test_tracks_start_in_the_image_of_the_full_frame_and_roi_detections_follow()
 
 
 def test_without_delay_tracks_start_in_the_first_image_and_after_a_cut_in_the_image_after_it() -> None:
-    live, worker = tracking(full_frame_delay=0.0, empty_interval=0.0, roi_interval=0.0, roi_delay=0.0)
+    live, worker = tracking(full_frame_delay=0.0, search_interval=0.0, roi_interval=0.0, roi_delay=0.05)
     results = [live.step(image(number), number * TENTH) for number in range(4)]
     assert [len(result.puppets) for result in results] == [1] * 4
     assert not live.step(image(4, "nobody"), 4 * TENTH).puppets
@@ -144,7 +147,7 @@ def test_an_roi_detection_moves_the_arms_to_where_they_are_in_the_image_it_is_us
 
 def test_who_comes_later_is_found_in_a_full_frame_and_re_detected_in_the_next_roi() -> None:
     live, worker = tracking(
-        full_frame_delay=0.1, empty_interval=0.5, full_frame_interval=0.5, roi_interval=0.0, roi_delay=0.05
+        full_frame_delay=0.1, search_interval=0.5, full_frame_interval=0.5, roi_interval=0.0, roi_delay=0.05
     )
     worker._people = lambda image, people=worker._people: people(image)[: 1 + (image[0, 0, 0] >= 4)]  # type: ignore
     results = [live.step(image(number, "two"), number * TENTH) for number in range(12)]
@@ -156,7 +159,7 @@ def test_who_comes_later_is_found_in_a_full_frame_and_re_detected_in_the_next_ro
 
 
 def test_who_is_found_no_more_is_not_re_detected() -> None:
-    live, worker = tracking(full_frame_delay=0.1, empty_interval=0.4, full_frame_interval=0.4, roi_delay=0.05)
+    live, worker = tracking(full_frame_delay=0.1, search_interval=0.4, full_frame_interval=0.4, roi_delay=0.05)
     worker.unseen = tuple(range(3, 30))
     for number in range(14):
         live.step(image(number), number * TENTH)
@@ -176,7 +179,7 @@ def test_after_a_cut_nobody_is_where_they_were_and_the_full_frame_is_detected_at
 
 @pytest.mark.parametrize("stamps", [[0] * 100, list(range(0, -100, -1))])
 def test_stamps_that_stand_still_or_go_back_do_not_stop_the_detector(stamps: list[int]) -> None:
-    live, worker = tracking(empty_interval=FRAME_NS * 10e-9, full_frame_delay=0.0)
+    live, worker = tracking(search_interval=FRAME_NS * 10e-9, full_frame_delay=0.0)
     worker.unseen = tuple(range(256))
     for number, stamp in enumerate(stamps):
         live.step(image(number % 30), stamp * SECOND)
@@ -220,7 +223,7 @@ def puppets(threads: Executor | None) -> tuple[list[bytes], list[Any]]:
         {"flow.preset": "fast"}
         | {
             f"detection.{name}": value
-            for name, value in (("full_frame_delay", 0.1), ("full_frame_interval", 0.4), ("empty_interval", 0.4))
+            for name, value in (("full_frame_delay", 0.1), ("full_frame_interval", 0.4), ("search_interval", 0.4))
         }
     )
     component = PuppetTrackerComponent(settings, FACTORY)
