@@ -3,7 +3,7 @@
 
 
 def letters_of_seed(seed: int) -> str:
-    """The seed as letters: 0 a, 1 b, ..., 25 z, 26 aa, ...: ids of runs with different seeds differ."""
+    """Return a seed as letters (0 a, 1 b, ..., 25 z, 26 aa), so that ids of runs with different seeds differ."""
     text = ""
     seed += 1
     while seed > 0:

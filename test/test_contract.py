@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import flowing_puppet_ros
+from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_settings
 
 PACKAGE = Path(flowing_puppet_ros.__file__).parent
 ROOT = PACKAGE.parent
@@ -344,3 +345,29 @@ def test_files_are_short_documented_and_licensed(path: Path) -> None:
 def test_versions_agree() -> None:
     for manifest in ("package.xml", "msg_defs/package.xml"):
         assert f"<version>{flowing_puppet_ros.__version__}</version>" in (ROOT / manifest).read_text()
+
+
+def test_no_class_name_stands_twice() -> None:
+    seen: dict[str, str] = {}
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef):
+                assert node.name not in seen, f"{node.name} is in {module_name(path)} and in {seen[node.name]}"
+                seen[node.name] = module_name(path)
+
+
+def test_limits_are_called_min_and_max() -> None:
+    other = re.compile(r"(?:^|_)(least|most|fewest|farthest|longest|shortest|largest|smallest)(?:_|$)", re.IGNORECASE)
+    for path in MODULES:
+        for node in ast.parse(path.read_text()).body:
+            targets = (
+                node.targets
+                if isinstance(node, ast.Assign)
+                else [node.target]
+                if isinstance(node, ast.AnnAssign)
+                else []
+            )
+            for target in (item for each in targets for item in ast.walk(each) if isinstance(item, ast.Name)):
+                assert not other.search(target.id), f"{module_name(path)}.{target.id}: say MIN_ or MAX_"
+    for settings in (kind for name in COMPONENTS for kind in (COMPONENTS[name].settings_type, node_settings(name))):
+        assert not [info.name for info in settings.describe() if other.search(info.name.replace(".", "_"))]

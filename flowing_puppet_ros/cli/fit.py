@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
         settings=settings.fitter,
         segmentation=settings.segmentation,
     )
-    sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in _scans(given)]
+    sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in _find_scans(given)]
     several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
     finished: list[dict[str, Any]] = []
     if arguments.rerun is not None:
@@ -131,8 +131,8 @@ def _fits(summaries: list[dict[str, Any]]) -> Iterator[tuple[str, np.ndarray, Pa
             yield output.stem, points, output
 
 
-def _scans(given: Path) -> list[Path]:
-    """An input, or the files of a folder that may be scans, by name."""
+def _find_scans(given: Path) -> list[Path]:
+    """Yield an input, or the files of a folder that may be scans, by name."""
     if not given.is_dir():
         return [given]
     found = sorted(path for path in given.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())

@@ -94,7 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         from flowing_puppet_ros.report.rerun_file import import_rerun
 
         import_rerun()
-    sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in bags_of(given)]
+    sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in find_bags(given)]
     if sources == arguments.inputs and len(sources) == 1 and arguments.scheduler is None:
         return _one(sources[0], arguments, options)
     if arguments.out.suffix == ".mcap":
@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
         recordings=arguments.rerun and runner.resolve_path(arguments.rerun, arguments),
         options=replace(options, progress=False),
     )
-    verb = runner.Verb("replay", replay_one, files_of, lambda summary: _tell(summary, arguments.json))
+    verb = runner.Verb("replay", replay_one, list_files, lambda summary: _tell(summary, arguments.json))
     return runner.run_batch(verb, sources, told, arguments.out, arguments)
 
 
@@ -134,8 +134,8 @@ def replay_one(source: Path, told: ReplayJob) -> dict[str, Any]:
     return summary
 
 
-def files_of(summary: dict[str, Any]) -> list[Path]:
-    """The files that a summary of `replay_one` names."""
+def list_files(summary: dict[str, Any]) -> list[Path]:
+    """Return the files that a summary of `replay_one` names."""
     return [Path(summary[name]) for name in ("output", "report", "rerun") if name in summary]
 
 
@@ -160,8 +160,8 @@ def _tell(summary: dict[str, Any], as_json: bool) -> None:
         print(json.dumps(summary) if as_json else _text(summary), flush=True)
 
 
-def bags_of(given: Path) -> list[Path]:
-    """An input as it is, or the bags in a folder that is none itself, by name."""
+def find_bags(given: Path) -> list[Path]:
+    """Return an input as it is, or the bags in a folder that is not a bag itself, by name."""
     if not given.is_dir() or is_bag(given):
         return [given]
     return sorted(path for path in given.iterdir() if is_bag(path)) or [given]

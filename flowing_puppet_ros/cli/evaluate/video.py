@@ -53,12 +53,12 @@ from flowing_puppet_ros.report.page import build_page, paragraph, table
 from flowing_puppet_ros.settings import make_out_folder
 from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
-MOST_FRAMES = 2000
+MAX_FRAMES = 2000
 BASES = {"": "detector", INIT: f"{INIT}detector"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Flags of `evaluate video`."""
+    """Add the flags of `evaluate video`."""
     names = ", ".join(METHODS)
     parser.add_argument("input", type=Path, help="folder of videos or of sub-folders of frames")
     parser.add_argument("--truth", type=Path, required=True, help="JSON of the clips' joints, or folder of keypoints")
@@ -109,7 +109,7 @@ class _Task:
     arguments: argparse.Namespace
 
     def file(self, method: str) -> Path:
-        """Where the tracks of a method are kept."""
+        """Return the file in which the tracks of a method are kept."""
         return Path(self.arguments.out) / method / f"{self.name}.json"
 
     def __call__(self) -> None:
@@ -126,8 +126,8 @@ class _Task:
     def _track(self, missing: Sequence[str]) -> None:
         source = open_frames(self.path)
         frames = list(source)
-        if len(frames) > MOST_FRAMES:
-            raise InputError(f"{self.path} has {len(frames)} frames; clips of up to {MOST_FRAMES} can be measured")
+        if len(frames) > MAX_FRAMES:
+            raise InputError(f"{self.path} has {len(frames)} frames; clips of up to {MAX_FRAMES} can be measured")
         made = ClipRun.load(frames, self.given, self.settings)
         size = [int(side) for side in frames[0].image.shape[1::-1]]
         for name in missing:

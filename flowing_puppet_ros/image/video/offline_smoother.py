@@ -54,7 +54,7 @@ class OfflineSmoother:
             count = len(puppet.joints)
             motion, trust = np.zeros((count, 2)), np.zeros(count)
             if result.flow is not None and track and track[-1].image == self.images - 1:
-                before, after = _place(track[-1].puppet), _place(puppet)
+                before, after = _sampled_joints(track[-1].puppet), _sampled_joints(puppet)
                 motion, trust = flow_at_joints(result.flow, result.grid, before, after)
             if sights is not None:
                 history = self._arms.setdefault(puppet.id, ArmSmoother(self.path))
@@ -65,7 +65,7 @@ class OfflineSmoother:
         self.images += 1
 
     def people(self) -> Iterator[list[TrackedPuppet]]:
-        """The people of each image, in the order of the images."""
+        """Yield the smoothed people of each image, in order."""
         people = {identity: self._smoothed(identity, track) for identity, track in self._tracks.items()}
         at = dict.fromkeys(self._tracks, 0)
         for image in range(self.images):
@@ -123,8 +123,8 @@ class OfflineSmoother:
         )
 
 
-def _place(puppet: TrackedPuppet) -> F64:
-    """Where the flow is asked: at the detected joints, else at the tracked ones."""
+def _sampled_joints(puppet: TrackedPuppet) -> F64:
+    """Return the joints at which the flow is sampled: the detected ones, else the tracked ones."""
     if puppet.detected is None:
         return puppet.joints
     return np.where(np.isfinite(puppet.detected[:, :2]), puppet.detected[:, :2], puppet.joints)

@@ -142,7 +142,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         while self._line.waiting:
             stamp, message = self._line.waiting[0]
             crowded = len(self._line.waiting) > self.settings.wait
-            if not (final or crowded or self._ready(stamp)):
+            if not (final or crowded or self._is_ready(stamp)):
                 break
             self._line.pop()
             try:
@@ -151,8 +151,8 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
                 self.report.count_unusable(error)
         return outputs
 
-    def _ready(self, stamp: int) -> bool:
-        """Whether everything that is expected for the image of `stamp` is there."""
+    def _is_ready(self, stamp: int) -> bool:
+        """Return whether everything that is expected for the image of `stamp` is there."""
         needs = [("detections", stamp)]
         if self._header is not None:
             needs += [("flow/backward", stamp), ("flow/forward", header_ns(self._header))]
@@ -160,7 +160,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
 
     def _step(self, stamp: int, message: Any) -> Output:
         image, flow = decode_image(message), self._flow(stamp)
-        people = self._detected(stamp)
+        people = self._decode_detections(stamp)
         if people is None and "detections" not in self._expected and self.settings.detection.source != "none":
             result = self._live.step(image, stamp, flow, self.background)
         else:
@@ -174,8 +174,8 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         self.counters["puppets"] += len(result.puppets)
         return self._publish(message.header, earlier, image, result)
 
-    def _detected(self, stamp: int) -> list[Keypoints] | None:
-        """The people that somebody else found in the image of this stamp, None when nobody told."""
+    def _decode_detections(self, stamp: int) -> list[Keypoints] | None:
+        """Return the people whom a published detection found in the image of this stamp, None without one."""
         detections = self._shelves["detections"].get(stamp)
         if detections is None:
             if "detections" in self._expected:
