@@ -6,6 +6,7 @@ import importlib.metadata
 import re
 import subprocess
 import sys
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -186,17 +187,24 @@ def module_name(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def imports(path: Path) -> set[str]:
+@cache
+def parsed(path: Path) -> ast.Module:
+    """Return the syntax tree of a module."""
+    return ast.parse(path.read_text())
+
+
+@cache
+def imports(path: Path) -> frozenset[str]:
     """Return the dotted names that a module imports, as written and with the names taken from them."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         if isinstance(node, ast.Import):
             found.update(alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: imports are absolute here"
             found.add(str(node.module))
             found.update(f"{node.module}.{alias.name}" for alias in node.names)
-    return found
+    return frozenset(found)
 
 
 def room_of(dotted: str) -> str:
@@ -350,7 +358,7 @@ def test_versions_agree() -> None:
 def test_no_class_name_stands_twice() -> None:
     seen: dict[str, str] = {}
     for path in MODULES:
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, ast.ClassDef):
                 assert node.name not in seen, f"{node.name} is in {module_name(path)} and in {seen[node.name]}"
                 seen[node.name] = module_name(path)
@@ -359,7 +367,7 @@ def test_no_class_name_stands_twice() -> None:
 def test_limits_are_called_min_and_max() -> None:
     other = re.compile(r"(?:^|_)(least|most|fewest|farthest|longest|shortest|largest|smallest)(?:_|$)", re.IGNORECASE)
     for path in MODULES:
-        for node in ast.parse(path.read_text()).body:
+        for node in parsed(path).body:
             targets = (
                 node.targets
                 if isinstance(node, ast.Assign)

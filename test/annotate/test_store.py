@@ -98,6 +98,7 @@ def test_people_that_cannot_be_are_refused(people: object) -> None:
         check_people(people, 15)
 
 
+@pytest.mark.slow
 @given(
     st.recursive(
         st.none() | st.booleans() | st.floats() | st.text(max_size=3) | st.sampled_from(["front", "male", "joints"]),

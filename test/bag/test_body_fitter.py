@@ -53,6 +53,7 @@ def places(body: Any) -> NDArray[np.float64]:
     return np.array([[joint.position.x, joint.position.y, joint.position.z] for joint in body.joints])
 
 
+@pytest.mark.slow
 def test_a_fit_does_not_depend_on_the_order_or_on_the_past(inputs: dict[str, list[Any]], second: Any) -> None:
     component = fitter()
     found = []

@@ -76,6 +76,7 @@ def test_a_salvaged_recording_gives_the_beginning_of_the_whole_one(golden: Any, 
     assert payload(tmp_path / "out.mcap", "/cam1/puppets") == payload(golden.replay, "/cam1/puppets")
 
 
+@pytest.mark.slow
 def test_images_that_cannot_be_decoded_are_warned_of_once_and_the_run_goes_on(golden: Any, tmp_path: Path) -> None:
     with open_bag(golden.source) as bag, BagWriter(tmp_path / "in.mcap") as writer:
         writer.add_topic("/a/image", IMAGE, "sensor")

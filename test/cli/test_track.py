@@ -81,6 +81,7 @@ def test_same_bits_twice_and_another_seed_another_id(frames: Path, tmp_path: Pat
     assert json.loads(texts[0])["frames"][0]["puppets"] == []
 
 
+@pytest.mark.slow
 def test_live_uses_no_later_frame_and_the_whole_clip_does(frames: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     shift = np.column_stack([rng.normal(0, 4, (6, 2)), np.zeros(6)])
@@ -180,6 +181,7 @@ def test_the_loop_of_the_thesis_is_not_live(frames: Path, tmp_path: Path, capsys
     assert "exclude each other" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flags", [[], ["--live"]])
 def test_where_nobody_is_nobody_is_tracked(flags: list[str], tmp_path: Path) -> None:
     rng, folder = np.random.default_rng(2), tmp_path / "frames"

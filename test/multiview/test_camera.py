@@ -56,6 +56,7 @@ small = st.floats(-0.15, 0.15)
 tangential = st.floats(-0.01, 0.01)
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(st.tuples(small, small, tangential, tangential, small), st.floats(-0.6, 0.6), st.floats(-0.6, 0.6))
 def test_undistort_inverts_the_lens(lens: tuple[float, ...], x: float, y: float) -> None:

@@ -109,6 +109,7 @@ def test_a_man_is_found_by_two_cameras_and_better_by_more(
     assert fit.two_way_distance < 0.02 and fit.energy < 0.02
 
 
+@pytest.mark.slow
 def test_the_same_input_gives_the_same_bits(fitter: SilhouetteFitter, ring: Ring) -> None:
     first, second = (fitter.fit(seen_by(ring(3)), start()) for _ in range(2))
     np.testing.assert_array_equal(first.vertices, second.vertices)

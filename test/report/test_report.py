@@ -60,6 +60,7 @@ def page_of(replay: Replay, **content: bool) -> tuple[str, Page]:
     return html, Page(html)
 
 
+@pytest.mark.slow
 def test_the_whole_page_stands_alone(replay: Replay) -> None:
     html, page = page_of(replay)
     assert page.open == [] and html.startswith("<!DOCTYPE html>")
@@ -75,6 +76,7 @@ def test_the_whole_page_stands_alone(replay: Replay) -> None:
     assert len(html) < 2_000_000
 
 
+@pytest.mark.slow
 def test_figures_are_those_of_the_bags(replay: Replay) -> None:
     data = gather_data(*replay(), summary={"frames_per_second": 12.5, "settings": {"tracker": {"seed": 3}}})
     assert data.shown_camera == "front"
@@ -103,6 +105,7 @@ def test_puppet_flow_follows_the_walk(replay: Replay) -> None:
         assert (red.min(axis=2) > 225).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_body_is_drawn_where_the_cameras_see_it(replay: Replay) -> None:
     given, made = replay()
     data = gather_data(given, made)

@@ -31,6 +31,7 @@ def reference(streams: list[list[int]], slop: int) -> list[tuple[int, ...]]:
     return sets
 
 
+@pytest.mark.slow
 @settings(max_examples=300, deadline=None)
 @given(st.lists(stamps, min_size=2, max_size=3), st.randoms(use_true_random=False))
 def test_sets_are_those_of_the_reference_in_every_interleaving(streams: Any, random: Any) -> None:

@@ -103,6 +103,7 @@ def test_hidden_vertices_are_not_seen(fitter: BodyFitter) -> None:
         SingleViewCloud.seen_from(vertices, normals, vertices.mean(axis=0))
 
 
+@pytest.mark.slow
 def test_bank_scores_bodies_by_all_or_by_some_of_their_parts(fitter: BodyFitter) -> None:
     model = fitter.model
     bank = PoseBank(model, build_part_points(model))

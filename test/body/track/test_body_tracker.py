@@ -142,6 +142,7 @@ def test_a_person_is_found_again_after_a_gap(fitter: _KnowingFitter, person: Bod
     assert tracker.counters["searched"] == 1
 
 
+@pytest.mark.slow
 def test_a_wrong_search_does_not_replace_a_better_track(fitter: _KnowingFitter, person: BodyState) -> None:
     tracker = BodyTracker(fitter, BodyTrackerSettings(max_points=1500, lost_ratio=1.0, lost_distance=0.0))
     fitter.truth = person

@@ -54,6 +54,7 @@ def test_distances_misses_and_unknown_joints(tmp_path: Path) -> None:
     np.testing.assert_allclose(accuracy["all"], [400 / 11, 700 / 11, 800 / 11])
 
 
+@pytest.mark.slow
 def test_the_command_writes_curves_of_several_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     person: list[list[float]] = [[10, 10, 1], [20, 20, 1], [30, 30, 1]]
     _files(tmp_path, {0: [person]}, {0: [[[10, 13, 1], [20, 20, 1], [30, 30, 1]]]})

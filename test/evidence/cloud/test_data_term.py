@@ -33,6 +33,7 @@ def test_closest_is_within_a_cell_of_brute_force(sphere: CloudGrid) -> None:
     assert np.mean(distance - exact.min(axis=1)) < 0.1 * sphere.cell
 
 
+@pytest.mark.slow
 def test_cells_hold_nearly_the_nearest_point(sphere: CloudGrid) -> None:
     rng = np.random.default_rng(4)
     cells = rng.integers(0, sphere.nearest.shape, (2000, 3))

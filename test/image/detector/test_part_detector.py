@@ -194,6 +194,7 @@ def test_two_joints_in_one_place_do_not_make_a_person_small(
     assert 0.85 * whole < changed < whole
 
 
+@pytest.mark.slow
 def test_ten_people_are_no_more_work_than_asked(detector: PartDetector) -> None:
     rng = np.random.default_rng(6)
     image = painted.ground(rng, (900, 300))
@@ -231,6 +232,7 @@ def test_what_is_no_image_is_one_sentence(detector: PartDetector, image: np.ndar
         detector.detect(image)
 
 
+@pytest.mark.slow
 def test_half_a_person_at_the_border_stays_finite(detector: PartDetector) -> None:
     image, joints, _ = painted.picture(np.random.default_rng(8), 45.0)
     cut = np.ascontiguousarray(image[:, int(joints[0, 0]) :])

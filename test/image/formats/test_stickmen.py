@@ -38,6 +38,7 @@ def test_unknown_joints_leave_their_sticks_unknown() -> None:
     assert [name for name, fine in zip(STICKS, known, strict=True) if not fine] == ["left_lower_arm"]
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.integers(0, 10**6), st.lists(arrays(np.int64, (6, 2, 2), elements=st.integers(-999, 9999)),
                                                         min_size=1, max_size=3), min_size=1, max_size=4))  # fmt: skip
 def test_what_is_written_is_read(tmp_path_factory: pytest.TempPathFactory, frames: dict[int, list[np.ndarray]]) -> None:

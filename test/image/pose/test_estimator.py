@@ -235,6 +235,7 @@ def test_likeliest_gender_is_told(joints: np.ndarray) -> None:
     assert person.model == f"{best}-10"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [(1, 1), (1, 1, 3), (3, 200), (240, 320)])
 def test_images_that_show_little_give_the_model_s_guess(joints: np.ndarray, shape: tuple[int, ...]) -> None:
     (person,) = estimator(joints).estimate(np.full(shape, 7, np.uint8))

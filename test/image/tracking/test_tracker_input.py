@@ -94,6 +94,7 @@ def test_bad_detections_neither_start_nor_disturb_anybody(bad: Keypoints) -> Non
     assert error(result, pose(0), "left_wrist") < 2
 
 
+@pytest.mark.slow
 def test_random_input_never_breaks_the_tracker() -> None:
     chance = np.random.default_rng(8)
     follower = tracker(max_people=3)

@@ -57,6 +57,7 @@ def test_live_arms_follow_the_guesses_that_move_with_the_person() -> None:
         assert np.linalg.norm(frame.puppets[0].joints[WRIST] - pose(t)[WRIST]) < 8, t
 
 
+@pytest.mark.slow
 def test_live_known_people_are_re_detected_in_every_image_between_full_frames() -> None:
     detector = GuessingDetector(range(18))
     track(detector, detector.images)

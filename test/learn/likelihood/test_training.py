@@ -124,6 +124,7 @@ def test_too_little_is_refused_in_a_sentence(model: DeformableStructures, album:
         command.run(flags(command, *words))
 
 
+@pytest.mark.slow
 def test_the_table_of_the_evaluation(album: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = (str(album / "annotations.json"), "--wrong", "2")
     assert likelihood.run(flags(likelihood, *words)) == 0

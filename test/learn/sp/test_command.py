@@ -9,6 +9,7 @@ from flowing_puppet_ros.learn.sp.command import describe_samples
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["neutral", "female", "male"])
 def test_samples_are_as_tall_and_as_large_as_adults_and_hold_together(name: str) -> None:
     report = describe_samples(StitchedPuppet.load(name), 12)

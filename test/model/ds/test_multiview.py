@@ -81,6 +81,7 @@ def test_limbs_are_the_same_in_every_view(sides: MultiViewStructures) -> None:
                 assert not np.array_equal(view.pairwise[part - 1].mean, sides.views[0].pairwise[part - 1].mean)
 
 
+@pytest.mark.slow
 def test_joints_of_another_model_determine_the_view(neutral: MultiViewStructures) -> None:
     """Puppets of the male model, evaluated by the neutral one: the view is right or the next one."""
     other, rng = MultiViewStructures.load("male"), np.random.default_rng(0)

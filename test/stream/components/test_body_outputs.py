@@ -47,6 +47,7 @@ def markers(made: list[tuple[str, Any]]) -> list[tuple[int, int]]:
     return [(marker.id, marker.action) for name, message in made if name == "body_meshes" for marker in message.markers]
 
 
+@pytest.mark.slow
 def test_everything_has_the_stamp_and_frame_of_the_cloud(model: StitchedPuppet) -> None:
     made = outputs(model).make(header(3), [("b1", body(model, (2, 0, 1)))], subscribed=ALL)
     found = dict(made)
@@ -60,6 +61,7 @@ def test_everything_has_the_stamp_and_frame_of_the_cloud(model: StitchedPuppet) 
     assert "body_topology" not in dict(again.make(header(1), [("b1", body(model, (2, 0, 1)))]))
 
 
+@pytest.mark.slow
 def test_meshes_come_at_their_rate_and_go_at_once(model: StitchedPuppet) -> None:
     shown, one, two = outputs(model, max_mesh_rate=5.0), ("b1", body(model, (2, 0, 1))), ("b2", body(model, (2, 1, 1)))
     assert markers(shown.make(header(0), [one, two], subscribed=ALL)) == [(1, 0), (2, 0)]

@@ -68,6 +68,7 @@ def test_a_tracked_person_is_searched_for_once(clouds: list[Any], found: list[in
         assert len(found) == 2 and found[1] != found[0], "the second person has another number"
 
 
+@pytest.mark.slow
 def test_without_tracking_every_cloud_is_searched(clouds: list[Any], found: list[int]) -> None:
     component = BodyFitterComponent(BodyFitterSettings.from_mapping({**SETTINGS, "track": False}), FACTORY)
     for cloud in clouds:

@@ -222,6 +222,7 @@ def hull_stream(recorded: dict[str, list[Any]], skip: tuple[str, ...] = ()) -> S
     return [item for item in stream if not item[0].endswith(skip)] if skip else stream
 
 
+@pytest.mark.slow
 def test_the_order_of_the_inputs_of_a_hull_does_not_matter(recorded: dict[str, list[Any]]) -> None:
     stream = hull_stream(recorded)
     settings = VisualHullSettings(cameras="cam1,cam2", hull_every=1)

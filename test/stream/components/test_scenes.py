@@ -152,6 +152,7 @@ def test_after_a_stall_a_person_is_neither_cut_in_two_nor_taken_for_another(
         assert stage.show((x, 0.0)) == {(x, 0.0): "b1"}
 
 
+@pytest.mark.slow
 def test_a_doubtful_body_is_searched_again_after_a_while(
     person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
