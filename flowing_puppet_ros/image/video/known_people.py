@@ -12,8 +12,6 @@ from flowing_puppet_ros.image.video.tracklets import TrackletLinker
 
 MAX_FULL_FRAMES = 20
 """Full-frame detections that are remembered."""
-CONFIRMING_FULL_FRAMES = 5
-"""Full-frame detections that must have found a person before full frames become rare."""
 
 
 @dataclass(slots=True, eq=False)
@@ -42,10 +40,10 @@ class KnownPeople:
         for identity, place in found.items():
             self._known.setdefault(identity, (place.scale, place.log_odds, 1))
 
-    def are_confirmed(self, people: Iterable[str]) -> bool:
-        """Return whether some of these people are known, and each of them from enough full frames."""
+    def are_confirmed(self, people: Iterable[str], full_frames: int) -> bool:
+        """Return whether some of these people are known, and each of them from so many full frames."""
         counts = [self._known[identity][2] for identity in people if identity in self._known]
-        return min(counts, default=0) >= CONFIRMING_FULL_FRAMES
+        return min(counts, default=0) >= full_frames
 
     def candidates(self, joint_names: Sequence[str], people: Mapping[str, F64]) -> dict[str, PersonCandidate]:
         """Return where the known ones of these people are, whose joints (J, 2) px are given by id."""

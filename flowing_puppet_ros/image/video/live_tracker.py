@@ -288,7 +288,8 @@ class LiveTracker:
     ) -> _PendingDetection | None:
         """Start a full-frame detection on the image that was just tracked, if it is time for one."""
         settings, people = self._settings, [puppet.id for puppet in result.puppets]
-        interval = settings.full_frame_interval if self._known.are_confirmed(people) else settings.search_interval
+        confirmed = self._known.are_confirmed(people, settings.confirming_full_frames)
+        interval = settings.full_frame_interval if confirmed else settings.search_interval
         if self._full_frame_ns is not None and self._now_ns - self._full_frame_ns < _to_ns(interval):
             return None
         self._full_frame_ns = self._now_ns

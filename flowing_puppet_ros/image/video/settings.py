@@ -30,6 +30,9 @@ class LiveDetectionSettings(Settings):
         high=3600.0,
         advanced=True,
     )
+    confirming_full_frames: int = setting(
+        1, "full-frame detections that confirm a person", low=1, high=1000, advanced=True
+    )
     full_frame_delay: float = setting(
         0.4,
         "age at which the result of a full-frame detection is used; three times that while people are tracked",
@@ -52,7 +55,12 @@ class LiveDetectionSettings(Settings):
 
 
 EVERY_IMAGE = LiveDetectionSettings(
-    full_frame_interval=0.33, search_interval=0.0, full_frame_delay=0.0, roi_interval=0.0, roi_delay=0.0
+    full_frame_interval=0.33,
+    search_interval=0.0,
+    confirming_full_frames=5,
+    full_frame_delay=0.0,
+    roi_interval=0.0,
+    roi_delay=0.0,
 )
 """For recordings, where the detector takes the time it needs: people are re-detected in every image."""
 
