@@ -48,22 +48,23 @@ class _SharedLimit:
         self._limit = limit
         self._lock = Lock()
         self._callers = 0
-        self._restore: Restore | None = None
+        self._restores: list[Restore] = []
 
     @contextmanager
     def hold(self) -> Iterator[None]:
         """Limit the library until the last caller leaves."""
         with self._lock:
-            self._restore = self._limit() or self._restore
+            if (restore := self._limit()) is not None:
+                self._restores.append(restore)
             self._callers += 1
         try:
             yield
         finally:
             with self._lock:
                 self._callers -= 1
-                if self._callers == 0 and self._restore is not None:
-                    self._restore()
-                    self._restore = None
+                # The first one knows the count from before all of them.
+                while self._callers == 0 and self._restores:
+                    self._restores.pop()()
 
 
 @contextmanager

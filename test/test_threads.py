@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
+from flowing_puppet_ros import threads
 from flowing_puppet_ros.evidence.image.features import ImageFeatures
 from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
@@ -24,6 +26,9 @@ IMAGE = np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8
 
 @pytest.fixture(autouse=True)
 def counts_of_the_user() -> Iterator[None]:
+    # An earlier test may have left work in the background that holds a limit for a moment longer.
+    while threads._BLAS._callers or threads._OPENCV._callers:
+        time.sleep(0.05)
     former = cv2.getNumThreads()
     cv2.setNumThreads(COUNT)
     with threadpool_limits(COUNT):

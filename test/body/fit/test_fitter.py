@@ -115,7 +115,9 @@ def crate() -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize("cloud", [two_people, ball, crate, dog])
 def test_what_is_no_single_person_is_not_reliable(cloud: Callable[[], tuple[np.ndarray, np.ndarray]]) -> None:
-    small = FitterSettings(particles=10, iterations=8, local_particles=6, local_iterations=3, max_limb_repairs=0)
+    small = FitterSettings(
+        particles=10, iterations=8, local_particles=6, local_iterations=3, max_limb_repairs=0, max_points=1500
+    )
     fit = BodyFitter(StitchedPuppet.load("neutral"), small).fit(*cloud())
     assert not fit.reliable
     assert np.isfinite(fit.vertices).all() and np.isfinite(fit.energy)

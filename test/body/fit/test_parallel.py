@@ -47,12 +47,19 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(monkeypatch:
         max_limb_repairs=1,
     )
     fits = []
-    for threads, seed in ((1, 5), (2, 5), (2, 6)):
+    for threads in (1, 2):
         monkeypatch.setattr(hypotheses, "usable_threads", lambda _, count=threads: count)
         with threadpool_limits(limits=threads):
-            fits.append(BodyFitter(StitchedPuppet.load("neutral"), small).fit(points, normals, seed=seed))
+            fits.append(BodyFitter(StitchedPuppet.load("neutral"), small).fit(points, normals, seed=5))
     for name in ("vertices", "joints", "part_confidence"):
         assert np.array_equal(getattr(fits[0], name), getattr(fits[1], name))
     for name in ("energy", "confidence", "reliable", "two_way_distance"):
         assert getattr(fits[0], name) == getattr(fits[1], name)
-    assert not np.array_equal(fits[0].vertices, fits[2].vertices)
+
+
+def test_another_seed_gives_another_fit() -> None:
+    points, normals = cloud_of(joints_of(), 2500)
+    small = FitterSettings(particles=4, iterations=2, local_iterations=0, restarts=0, max_limb_repairs=0)
+    fitter = BodyFitter(StitchedPuppet.load("neutral"), small)
+    one, other = (fitter.fit(points, normals, seed=seed).vertices for seed in (5, 6))
+    assert not np.array_equal(one, other)

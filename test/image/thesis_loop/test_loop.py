@@ -146,7 +146,7 @@ def clip(lost: int) -> tuple[list[InitialPose], list[FrameEvidence], np.ndarray]
     return starts, frames, truth
 
 
-QUICK = {"particles": 20, "carried": 4, "rounds": 2, "seeds": 1, "iterations": 3}
+QUICK = {"particles": 20, "max_propagated": 4, "rounds": 2, "restarts": 1, "iterations": 3}
 
 
 @pytest.mark.slow
@@ -160,7 +160,7 @@ def test_the_loop_finds_the_arms_and_repeats_itself() -> None:
     off = np.linalg.norm(joints - truth, axis=2)[:, ARMS]
     assert np.median(off) < 12.0, "the start is 25 px off"
     assert ((agreed >= 0) & (agreed <= 1)).all()
-    more = ThesisLoop(MODEL, "front", LoopSettings(**QUICK | {"seeds": 2}), energy).run(starts, frames)
+    more = ThesisLoop(MODEL, "front", LoopSettings(**QUICK | {"restarts": 2}), energy).run(starts, frames)
     assert more[2].sum() <= runs[0][2].sum() + 1e-9, "of several seeds the best is taken"
 
 
@@ -168,7 +168,7 @@ def test_the_loop_finds_the_arms_and_repeats_itself() -> None:
 def test_an_image_that_tells_nothing_learns_from_its_neighbours() -> None:
     starts, frames, truth = clip(lost=2)
     loop = ThesisLoop(MODEL, "front", LoopSettings(**QUICK), EnergySettings(prior_weight=0.01))
-    alone = ThesisLoop(MODEL, "front", LoopSettings(**QUICK | {"carried": 0}), EnergySettings(prior_weight=0.01))
+    alone = ThesisLoop(MODEL, "front", LoopSettings(**QUICK | {"max_propagated": 0}), EnergySettings(prior_weight=0.01))
     off = [np.linalg.norm(one.run(starts, frames)[0][2] - truth[2], axis=1)[ARMS].mean() for one in (loop, alone)]
     assert off[0] < off[1]
 

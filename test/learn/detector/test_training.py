@@ -36,7 +36,7 @@ def examples(count: int, seed: int) -> list[Example]:
 
 @pytest.fixture(scope="module")
 def small() -> PartDetector:
-    return learn_detector(examples(60, 0), LearnDetectorSettings(steps=40, trees=40), lambda _: None).detector
+    return learn_detector(examples(40, 0), LearnDetectorSettings(steps=40, trees=40), lambda _: None).detector
 
 
 @pytest.mark.slow
@@ -45,16 +45,16 @@ def test_finds_other_painted_people(small: PartDetector) -> None:
     found, errors = 0, []
     for _ in range(20):
         image, joints, scale = painted.picture(rng)
-        (best,) = small.detect(image, DetectorSettings(min_confidence=0.0, max_people=1))
+        (best,) = small.detect(image, DetectorSettings(min_confidence=0.0, max_people=1, mirrored=False))
         near = np.linalg.norm(best.neck - joints[painted.NAMES.index("neck")]) < 0.4 * scale
         if near and 0.75 < best.scale / scale < 1.3:
             found += 1
             order = [best.keypoints.names.index(name) for name in painted.NAMES]
             errors.append(np.linalg.norm(best.keypoints.xy[order] - joints, axis=1) / scale)
-    assert found >= 16
+    assert found >= 18
     median = dict(zip(painted.NAMES, np.median(errors, axis=0), strict=True))
-    assert median["right_shoulder"] < 0.2 and median["left_shoulder"] < 0.2
-    assert median["right_elbow"] < 0.35 and median["left_elbow"] < 0.35
+    assert median["right_shoulder"] < 0.1 and median["left_shoulder"] < 0.1
+    assert median["right_elbow"] < 0.2 and median["left_elbow"] < 0.2
 
 
 @pytest.mark.slow
