@@ -62,9 +62,8 @@ class _SharedLimit:
         finally:
             with self._lock:
                 self._callers -= 1
-                # The first one knows the count from before all of them.
                 while self._callers == 0 and self._restores:
-                    self._restores.pop()()
+                    self._restores.pop(0)()
 
 
 @contextmanager
@@ -82,19 +81,19 @@ def one_opencv_thread() -> Iterator[None]:
 
 
 def _limit_blas() -> Restore | None:
-    controller = _controller()
-    if all(library["num_threads"] == 1 for library in controller.info()):
+    # Only what is changed is given back: what another caller limited for the whole process is theirs to give back.
+    former = [(library, count) for library in _find_libraries() if (count := library.get_num_threads()) > 1]
+    if not former:
         return None
-    _disown_openblas()
-    limits = controller.limit(limits=1)
-    _disown_openblas()
 
-    def restore() -> None:
+    def set_counts(counts: Iterable[tuple[threadpoolctl.LibController, int]]) -> None:
         _disown_openblas()
-        limits.restore_original_limits()
+        for library, count in counts:
+            library.set_num_threads(count)
         _disown_openblas()
 
-    return restore
+    set_counts((library, 1) for library, _ in former)
+    return partial(set_counts, former)
 
 
 def _disown_openblas() -> None:
@@ -116,11 +115,11 @@ def _limit_opencv() -> Restore | None:
 
 
 @cache
-def _controller() -> threadpoolctl.ThreadpoolController:
+def _find_libraries() -> tuple[threadpoolctl.LibController, ...]:
     # To look for the libraries takes milliseconds; those of both packages must be loaded when it is done.
     import scipy.linalg  # noqa: F401
 
-    return threadpoolctl.ThreadpoolController()
+    return tuple(threadpoolctl.ThreadpoolController().lib_controllers)
 
 
 _BLAS, _OPENCV = _SharedLimit(_limit_blas), _SharedLimit(_limit_opencv)
