@@ -11,7 +11,7 @@ from rclpy.parameter import Parameter
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.parameters import apply_changes, convert_to_floats, declare
-from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.settings import Settings, nested, setting
 
 pytestmark = pytest.mark.ros
 
@@ -24,6 +24,21 @@ class Sample(Settings):
     ratio: float = setting(0.5, "share", low=0.0)
     mode: str = setting("a", "way", choices=("a", "b"))
     loud: bool = setting(False, "speak")
+
+
+@dataclass(frozen=True)
+class Part(Settings):
+    """A setting that is offered, and one that is not."""
+
+    gate: float = setting(3.0, "how far", low=1.0)
+    patience: int = setting(2, "how often", low=1, advanced=True)
+
+
+@dataclass(frozen=True)
+class Whole(Settings):
+    """Settings with a part."""
+
+    part: Part = nested(Part, gate=4.0)
 
 
 @pytest.fixture(autouse=True)
@@ -78,3 +93,13 @@ def test_whole_numbers_are_taken_for_floating_point_settings() -> None:
     assert {name: (type(value), value) for name, value in taken.items()} == {
         "ratio": (float, 2.0), "count": (int, 2), "mode": (str, "b"),
     }  # fmt: skip
+
+
+def test_parts_have_dotted_names_and_advanced_settings_are_declared_only_when_given() -> None:
+    plain, expert = node(), node(**{"part.patience": 5, "part.gate": 2.0})
+    assert declare(plain, Whole) == Whole()
+    assert plain.has_parameter("part.gate") and not plain.has_parameter("part.patience")
+    assert declare(expert, Whole) == Whole(Part(2.0, 5))
+    assert apply_changes(Whole(), [Parameter("part.gate", value=9.0)]) == Whole(Part(9.0, 2))
+    with pytest.raises(InputError, match=r"parameter part\.patience"):
+        declare(node(**{"part.patience": 0}), Whole)
