@@ -25,7 +25,8 @@ def lock_ros_domain() -> int:
     for number in range(os.getpid(), os.getpid() + 100):
         domain = 1 + number % 100
         try:
-            lock = os.open(f"{tempfile.gettempdir()}/flowing_puppet_ros_domain_{domain}.lock", os.O_CREAT | os.O_RDWR)
+            path = f"{tempfile.gettempdir()}/flowing_puppet_ros_domain_{domain}.lock"
+            lock = os.open(path, os.O_CREAT | os.O_RDWR, 0o666)
         except PermissionError:
             continue
         try:
