@@ -57,6 +57,7 @@ def test_the_same_seed_gives_the_same_bits_on_any_number_of_threads(monkeypatch:
         assert getattr(fits[0], name) == getattr(fits[1], name)
 
 
+@pytest.mark.slow
 def test_another_seed_gives_another_fit() -> None:
     points, normals = cloud_of(joints_of(), 2500)
     small = FitterSettings(particles=4, iterations=2, local_iterations=0, restarts=0, max_limb_repairs=0)

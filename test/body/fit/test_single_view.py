@@ -121,6 +121,7 @@ def test_bank_scores_bodies_by_all_or_by_some_of_their_parts(fitter: BodyFitter)
     np.testing.assert_allclose(bank.coverage_cost(groups, coarse, legs, rest.distance).distance, whole.distance)
 
 
+@pytest.mark.slow
 def test_a_body_promises_more_upright_than_lying(fitter: BodyFitter) -> None:
     points, _ = cloud_of(joints_of(raise_left=0.3), 3000)
     upright = fitter.coarse_cost(points)

@@ -18,6 +18,8 @@ from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, make_
 from flowing_puppet_ros.evaluate.tables import format_table, write_csv
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
+pytestmark = pytest.mark.slow
+
 LEARN = pytest.mark.skipif(not (find_spec("anny") and find_spec("body_models")), reason="needs the extra learn")
 
 
@@ -113,7 +115,6 @@ def test_tables_line_up(tmp_path: Path) -> None:
         assert [row["cm"] for row in csv.DictReader(file)] == ["1.23456", "12.0"]
 
 
-@pytest.mark.slow
 @LEARN
 def test_the_command_writes_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     quick = ["--particles", "4", "--iterations", "1", "--restarts", "0", "--gauss-newton-steps", "1"]

@@ -23,6 +23,8 @@ from flowing_puppet_ros.evaluate.body.synthetic_scans import (
 )
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
+pytestmark = pytest.mark.slow
+
 LEARN = pytest.mark.skipif(not (find_spec("anny") and find_spec("body_models")), reason="needs the extra learn")
 SIZE = np.array([0.4, 0.6, 1.8])
 
@@ -140,7 +142,6 @@ def test_motion_is_smooth_and_goes_through_the_captured_frames(source: BodySourc
     assert np.abs(np.diff(steps, axis=0)).max() < 0.02
 
 
-@pytest.mark.slow
 @LEARN
 def test_poses_of_people_need_motion_capture() -> None:
     source = BodySource()

@@ -17,7 +17,10 @@ from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
 from flowing_puppet_ros.model.weights import load
 
 # Only looked for: importing anny itself would need torch.
-pytestmark = pytest.mark.skipif(not (find_spec("anny") and find_spec("body_models")), reason="needs the extra learn")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not (find_spec("anny") and find_spec("body_models")), reason="needs the extra learn"),
+]
 MIRROR = np.array([1.0, -1.0, 1.0])
 
 
@@ -57,7 +60,6 @@ def test_a_chosen_subset_is_the_same_as_all(body: AnnyBody, poses: PoseSampler) 
     np.testing.assert_allclose(body.pose(rest, pose, ids)[0], body.pose(rest, pose)[0][:, ids], atol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("gender", ["neutral", "female", "male"])
 def test_people_are_adults(gender: str) -> None:
     body, rng = AnnyBody(gender), np.random.default_rng(3)

@@ -10,7 +10,10 @@ from flowing_puppet_ros.learn.anny.body import AnnyBody, RestBody
 from flowing_puppet_ros.learn.sp.fingers import CLOSED_DEG, FINGERS, THUMB_CLOSED_DEG, Fingers
 
 # Only looked for: importing anny itself would need torch.
-pytestmark = pytest.mark.skipif(not (find_spec("anny") and find_spec("body_models")), reason="needs the extra learn")
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(not (find_spec("anny") and find_spec("body_models")), reason="needs the extra learn"),
+]
 MIRROR = np.array([1.0, -1.0, 1.0])
 
 
