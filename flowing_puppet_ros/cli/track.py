@@ -34,6 +34,7 @@ from flowing_puppet_ros.image.video.clip import (
     track_live,
 )
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.threads import one_opencv_thread
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -57,6 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ClipSettings.add_arguments(parser, main="tracker")
 
 
+# Held for the whole run: OpenCV makes its threads anew each time that their number changes, here at every frame.
+@one_opencv_thread()
 def run(arguments: argparse.Namespace) -> int:
     """Track through the whole input and write the tracks."""
     if arguments.live and arguments.method != "smoothed":

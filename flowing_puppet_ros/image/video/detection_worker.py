@@ -65,8 +65,7 @@ class DetectionWorker:
         """Detect people anywhere in an image (H, W, 3); `known` records it as its full frame `number`."""
         # Results may depend on the number of threads otherwise.
         with one_opencv_thread():
-            found = self.detector.detect_at(image, known.locate(number, self.detector.propose(image)))
-        return [DetectedPerson(detection, detection.keypoints) for detection in found]
+            return self.detect_at(image, known.locate(number, self.detector.propose(image)))
 
     def detect_in_rois(
         self,
@@ -77,15 +76,11 @@ class DetectionWorker:
     ) -> list[DetectedPerson]:
         """Detect people at some candidates only; the `arms` (by id) of the tracked `puppets` take what is seen."""
         with one_opencv_thread():
-            found = self.detector.detect_at(image, candidates)
-            owners = match_to_tracks([detection.candidate for detection in found], puppets, self.evidence_model.model)
-            people = []
-            for index, detection in enumerate(found):
-                if (puppet := owners.get(index)) is None:
-                    people.append(DetectedPerson(detection, detection.keypoints))
-                    continue
-                joints = self.step_arms(arms[puppet.id], image, puppet, detection)
-                people.append(DetectedPerson(detection, detection.keypoints, puppet.id, joints))
+            people = self.detect_at(image, candidates)
+            places = [person.detection.candidate for person in people]
+            for index, puppet in match_to_tracks(places, puppets, self.evidence_model.model).items():
+                joints = self.step_arms(arms[puppet.id], image, puppet, people[index].detection)
+                people[index] = replace(people[index], identity=puppet.id, arms=joints)
         return people
 
     def detect_at(self, image: Image, candidates: Sequence[PersonCandidate]) -> list[DetectedPerson]:

@@ -245,13 +245,17 @@ class LiveTracker:
 
     def _refine_arms(self, result: TrackResult, image: Image, seen: Mapping[str, PersonDetection]) -> TrackResult:
         """Return the result with elbows and wrists by the best hypotheses; `seen` are this image's detections by id."""
-        self._arms = {puppet.id: self._arms.get(puppet.id, ArmFilter(ArmPathSettings())) for puppet in result.puppets}
+        self._keep_arms(result.puppets)
         worker = self._load_worker()
         joints = {
             puppet.id: worker.step_arms(self._arms[puppet.id], image, puppet, seen.get(puppet.id))
             for puppet in result.puppets
         }
         return self._tracker.override_joints(result, joints)
+
+    def _keep_arms(self, puppets: Sequence[TrackedPuppet]) -> None:
+        """Keep the filters of these people's arms, and begin those of the new ones."""
+        self._arms = {puppet.id: self._arms.get(puppet.id) or ArmFilter(ArmPathSettings()) for puppet in puppets}
 
     def _record_flow(self, result: TrackResult) -> TrackResult:
         """Return the result; propagate what is pending, and the hypotheses of the arms, to its image."""
@@ -308,7 +312,7 @@ class LiveTracker:
         rois = self._take_rois(joints)
         if not rois:
             return None
-        self._arms = {identity: self._arms.get(identity, ArmFilter(ArmPathSettings())) for identity in joints}
+        self._keep_arms(result.puppets)
         run = partial(self._detect_in_rois, image, list(rois.values()), result.puppets, self._arms)
         due_ns = self._now_ns + _to_ns(self._settings.roi_delay * len(rois))
         return _PendingDetection(image, stamp_ns, due_ns, _submit(run, executor), rois)
