@@ -88,10 +88,8 @@ class PeopleTally:
             else:
                 self.astray += 1
 
-    def summarise(self, unmatched: Unmatched) -> dict[str, float]:
-        """Return counts and percentages by name; puppets on nobody lower the precision unless they are unknown."""
-        reported = self.found + self.twice + self.astray + (self.elsewhere if unmatched == "wrong" else 0)
-        arms = np.array(self.arms)
+    def list_counts(self) -> dict[str, float]:
+        """Return the counts by name."""
         return {
             "people": float(self.people),
             "people found": float(self.found),
@@ -99,12 +97,17 @@ class PeopleTally:
             "puppets twice on a person": float(self.twice),
             "puppets badly on a person": float(self.astray),
             "puppets on nobody annotated": float(self.elsewhere),
+        }
+
+    def summarise(self, unmatched: Unmatched) -> dict[str, float]:
+        """Return counts and percentages by name; puppets on nobody lower the precision unless they are unknown."""
+        reported = self.found + self.twice + self.astray + (self.elsewhere if unmatched == "wrong" else 0)
+        near = np.array(self.arms) < MAX_SHARE
+        arms = f"arm joints of those found within {100 * MAX_SHARE:g} % of extent, %"
+        return self.list_counts() | {
             "precision of people, %": 100 * self.found / reported if reported else float("nan"),
             "error of those found, median, % of extent": 100 * float(np.median(self.shares or [np.nan])),
-            f"arm joints of those found within {100 * MAX_SHARE:g} % of extent, %": 100
-            * float((arms < MAX_SHARE).mean())
-            if len(arms)
-            else float("nan"),
+            arms: 100 * float(near.mean()) if len(near) else float("nan"),
         }
 
 

@@ -16,7 +16,13 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.output import Chart, EvaluationReport, Line, name_runs
 from flowing_puppet_ros.evaluate.output import add_arguments as add_output
 from flowing_puppet_ros.evaluate.people import add_unmatched_argument
-from flowing_puppet_ros.evaluate.video.tracks import JointMisses, measure_misses, measure_people, read_tracks
+from flowing_puppet_ros.evaluate.video.tracks import (
+    JointMisses,
+    count_by_image,
+    measure_misses,
+    measure_people,
+    read_tracks,
+)
 from flowing_puppet_ros.evaluate.video.truth import read_named_people
 
 DRAWN_GROUPS = ("wrists", "elbows", "all joints")
@@ -45,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     named = read_named_people(arguments.truth)
     thresholds = np.arange(1, arguments.most + 1)
     shown = sorted({max(arguments.most * share // 8, 1) for share in (1, 2, 4, 8)})
-    figures, curves, lines = {}, {}, []
+    figures, curves, images, lines = {}, {}, {}, []
     for name, path in zip(names, arguments.tracks, strict=True):
         tracks = read_tracks(path)
         truth = tracks.number(named)
@@ -53,6 +59,7 @@ def run(arguments: argparse.Namespace) -> int:
         figures[name] = _summarise(misses, shown) | {"jitter, px": tracks.jitter()} | misses.pck()
         figures[name] |= measure_people(tracks, truth, arguments.unmatched)
         curves[name] = {joint: curve.tolist() for joint, curve in misses.accuracy(thresholds).items()}
+        images[name] = count_by_image(tracks, named)
         lines += [
             Line(group, thresholds, 100 * (values[:, None] <= thresholds).mean(axis=0), name if len(names) > 1 else "")
             for group, values in misses.group().items()
@@ -60,7 +67,7 @@ def run(arguments: argparse.Namespace) -> int:
         ]
     title = "Accuracy of joints; people nobody found are misses"
     chart = Chart("accuracy", title, "threshold, px", "joints within, %", lines, y_limits=(0, 100))
-    details = {"thresholds_px": thresholds.tolist(), "percent_within": curves}
+    details = {"thresholds_px": thresholds.tolist(), "percent_within": curves, "images": images}
     EvaluationReport("joints", figures, details, [chart]).emit(arguments)
     return 0
 

@@ -177,6 +177,16 @@ def measure_people(tracks: Tracks, truth: Mapping[int, Sequence[Keypoints]], unm
     return measure_precision(images) | tally.summarise(unmatched)
 
 
+def count_by_image(tracks: Tracks, named: Mapping[int | str, Sequence[Keypoints]]) -> dict[str, dict[str, float]]:
+    """Return the counts of people in each image of the truth, by its key."""
+    counts = {}
+    for key, (index, persons) in zip(named, tracks.number(named).items(), strict=True):
+        tally = PeopleTally()
+        tally.add(tracks.frames.get(index, []), [known_joints(person) for person in persons], tracks.names)
+        counts[str(key)] = tally.list_counts()
+    return counts
+
+
 def torso_length(joints: Joints) -> float:
     """Return the distance from a shoulder to the other side's hip, the mean of both if both are known; NaN without."""
     ends = (("left_shoulder", "right_hip"), ("right_shoulder", "left_hip"))

@@ -62,6 +62,14 @@ def test_people_in_images_by_name(files: list[str], capsys: pytest.CaptureFixtur
     assert figures["OKS AR, %"] == pytest.approx(100 / 3)
 
 
+@pytest.mark.slow
+def test_the_file_says_in_which_image(files: list[str], tmp_path: Path) -> None:
+    assert main([*files, "--out", str(tmp_path / "out")]) == 0
+    images = json.loads((tmp_path / "out" / "joints.json").read_text())["images"]["poses"]
+    assert images["a.jpg"]["people found"] == images["a.jpg"]["puppets twice on a person"] == 1
+    assert images["b.jpg"]["people missed"] == images["c.jpg"]["puppets on nobody annotated"] == 1
+
+
 def test_unmatched_people_may_be_unknown(files: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     figures = measure([*files, "--unmatched", "unknown"], capsys)
     assert figures["precision of people, %"] == 50 and figures["puppets on nobody annotated"] == 2
