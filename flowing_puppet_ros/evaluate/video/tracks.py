@@ -92,6 +92,8 @@ class Tracks:
         numbered: dict[int, Sequence[Keypoints]] = {}
         for place, (key, people) in enumerate(truth.items()):
             index = self._find(key) if isinstance(key, str) else key
+            if index in numbered:
+                raise InputError(f"the truth names the image {key} twice; give all people of an image together")
             numbered[-1 - place if index is None else index] = people
         if truth and all(index < 0 for index in numbered):
             raise InputError(f"tracks and truth have no image in common; the truth has {next(iter(truth))}")
