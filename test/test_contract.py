@@ -88,6 +88,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "evaluate.bag": {"bag", "body.scans", "evaluate", "image.formats", "multiview", "stream", "stream.messages"},
     "evaluate.body": {"body.fit", "body.scans", "learn.anny", "model"},
     "evaluate.image": {
+        "evaluate",
         "evidence.image",
         "flow",
         "image.formats",

@@ -11,6 +11,8 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.annotations import Annotations
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
@@ -68,6 +70,25 @@ def read_people(path: Path, clips: Clips) -> dict[str, PeopleByFrame]:
     if not found:
         raise InputError(f"{path} has no person in any of the clips {', '.join(list(clips)[:3])} ...")
     return found
+
+
+def read_named_people(path: Path) -> dict[int | str, list[Keypoints]]:
+    """Read a keypoints.json whose frames are indices or names of images; InputError for any other file."""
+    data = _read_object(path)
+    names, frames = data.get("joint_names"), data.get("frames")
+    if not isinstance(names, list) or not isinstance(frames, dict) or all(key.isdecimal() for key in frames):
+        return dict(read_keypoints(path).items())
+    try:
+        # null, the JSON for an unknown number, becomes NaN.
+        rows = {file: [np.array(person, np.float64) for person in people] for file, people in frames.items()}
+        return {
+            file: [Keypoints(tuple(names), person[:, :2], np.nan_to_num(person[:, 2])) for person in people]
+            for file, people in rows.items()
+        }
+    except (TypeError, ValueError, IndexError) as error:
+        raise InputError(
+            f"{path}: a person needs {len(names)} entries [x, y, confidence], one per joint name"
+        ) from error
 
 
 def _read_object(path: Path) -> Mapping[str, object]:

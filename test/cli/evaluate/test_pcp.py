@@ -46,6 +46,10 @@ def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.Captur
     assert figures["people"] == 2 and figures["found"] == 100
     assert figures["strict lower arms"] == 50 and figures["strict torso"] == 100
     assert figures["wrists within 10 px"] == 50 and figures["wrists of the best solution"] == 100
+    # 14 px are more than a fifth of a torso of 35 px and than half a head of 18 px.
+    assert figures["PCK@0.2, %"] == figures["PCKh@0.5, %"] == 50
+    # The first of two is right at every threshold, up to a recall of 1/2: at 51 of 101 places.
+    assert figures["OKS AP75, %"] == pytest.approx(100 * 51 / 101, abs=0.01)
 
 
 @pytest.mark.slow

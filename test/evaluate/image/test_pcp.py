@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.image.pcp import PosedSticks, Tally, check_parts, match_people
 from flowing_puppet_ros.evaluate.image.pcp_truth import open_true_images, read_stick_truth
+from flowing_puppet_ros.evaluate.people import Unmatched
 from flowing_puppet_ros.image.formats.stickmen import STICKS, sticks_from_joints, write_sticks
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
@@ -66,6 +67,34 @@ def test_unknown_estimates_are_wrong_and_unknown_truth_is_left_out() -> None:
     figures = tally.summarise()
     assert figures["strict lower arms"] == 100 and tally.known.sum() == 5
     assert figures["wrists within 20 px"] == 100 and tally.ends.tolist() == [2, 1]
+
+
+def test_pck_and_oks_of_arms_moved_by_a_known_distance() -> None:
+    torso, head = LENGTH[STICKS.index("torso")], LENGTH[STICKS.index("head")]
+    for share, length, name in ((0.2, torso, "PCK@0.2, %"), (0.5, head, "PCKh@0.5, %")):
+        for factor, expected in ((0.99, 100.0), (1.01, 0.0)):
+            tally = Tally()
+            tally.add([answer(TRUTH + np.array([factor * share * length, 0.0]))], [TRUTH])
+            assert tally.summarise()[name] == expected
+    arms = TRUTH[1:5].reshape(-1, 2)
+    # COCO's deviations of shoulders, elbows and wrists; the person's area is estimated from all ends of sticks.
+    sides = np.ptp(TRUTH.reshape(-1, 2), axis=0)
+    area = 0.53 * np.prod(sides + 0.1 * sides.max())
+    assert len(arms) == 8
+    for distance in (5.0, 30.0, 45.0):
+        oks = np.mean([np.exp(-(distance**2) / (2 * area * (2 * sigma) ** 2)) for sigma in (0.079, 0.072, 0.062)])
+        tally = Tally()
+        tally.add([answer(TRUTH + np.array([distance, 0.0]))], [TRUTH])
+        assert tally.summarise()["OKS AP, %"] == 10 * sum(oks >= least for least in np.linspace(0.5, 0.95, 10))
+
+
+@pytest.mark.parametrize(("unmatched", "expected"), [("wrong", 50.0), ("unknown", 100.0)])
+def test_a_score_ranks_people_and_strangers_may_be_unknown(unmatched: Unmatched, expected: float) -> None:
+    ghost = PosedSticks(TRUTH + 900, (TRUTH + 900)[None], 0.9)
+    right = PosedSticks(TRUTH, TRUTH[None], 0.5)
+    tally = Tally(unmatched=unmatched)
+    tally.add([ghost, right], [TRUTH])
+    assert tally.summarise()["OKS AP, %"] == expected
 
 
 def test_people_are_matched_by_place_and_strangers_are_not_found() -> None:
