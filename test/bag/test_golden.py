@@ -13,10 +13,10 @@ from flowing_puppet_ros.bag.reader import Record, open_bag
 from flowing_puppet_ros.bag.replay import replay
 from flowing_puppet_ros.model.tree import mirrored_name
 from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_silhouettes
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image, decode_labels
-from flowing_puppet_ros.stream.messages.silhouettes import decode_silhouettes
 
 CAMERAS = ("cam1", "cam2", "cam3", "cam4")
 LIMBS = ("elbow", "wrist", "knee", "ankle", "shoulder", "hip")
