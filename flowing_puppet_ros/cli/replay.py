@@ -26,7 +26,7 @@ from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.errors import InputError
 
-_OF_NODES_ONLY = ("queue", "autostart", "use_sim_time")
+_OF_NODES_ONLY = ("queue", "image_transport", "autostart", "use_sim_time")
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
@@ -19,10 +20,12 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_policy_name_from_kind, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.diagnostics import Diagnostics
-from flowing_puppet_ros.node.factory import message_type
+from flowing_puppet_ros.node.factory import is_installed, message_type
+from flowing_puppet_ros.node.image_transport import AUTO, CHECK_INTERVAL_S, COMPRESSED, TransportChoice
 from flowing_puppet_ros.node.worker import Worker
 from flowing_puppet_ros.stream.component import Component, Output, Port
 from flowing_puppet_ros.stream.messages.geometry import header_ns
@@ -56,24 +59,29 @@ class Session[C: Component[Any]]:
     closed is not published.
     """
 
-    def __init__(self, node: Node, component: C, queue: int, diagnostics: Diagnostics) -> None:
+    def __init__(
+        self, node: Node, component: C, queue: int, diagnostics: Diagnostics, image_transport: str = AUTO
+    ) -> None:
         """Open the outputs and start the worker; the inputs are opened by `activate`."""
         self.component = component
+        self.image_transport = image_transport
         self.active = False
         self._node = node
         self._diagnostics = diagnostics
         self._publishing = threading.Lock()
         self._last_stamp: int | None = None
         self._warned: set[str] = set()
-        self._subscriptions: list[Subscription] = []
-        topics = {port.name: _resolve_topic(node, port.name) for port in component.inputs}
-        self._optional = {port.name: topics[port.name] for port in component.inputs if port.optional}
-        self.topics = [topic for name, topic in topics.items() if name not in self._optional]
+        self._subscriptions: dict[str, Subscription] = {}
+        self._transports: dict[str, TransportChoice] = {}
+        self._watch: Timer | None = None
+        self._topics = {port.name: _resolve_topic(node, port.name) for port in component.inputs}
+        self._optional = {port.name: self._topics[port.name] for port in component.inputs if port.optional}
         self._lazy = [port for port in component.outputs if port.lazy]
         self._outputs: dict[str, list[tuple[Publisher, Callable[[Any], Any]]]] = {}
+        self._unavailable = [port for port in component.outputs if port.optional and not is_installed(port.type)]
         try:
             for port in component.outputs:
-                if not port.per_person:
+                if not port.per_person and port not in self._unavailable:
                     self._outputs[port.name] = self._open_output(port)
         except Exception:
             self._close_outputs()
@@ -86,17 +94,23 @@ class Session[C: Component[Any]]:
         self._diagnostics.reset_silence()
         self.active = True
         for port in self.component.inputs:
-            self._subscribe(port, message_type(port.type), port.name)
             if port.transport:
-                self._subscribe(port, message_type(COMPRESSED_IMAGE), self._compressed_topic(port))
+                self._transports[port.name] = TransportChoice(self.image_transport)
+            self._subscribe(port)
+        # On the clock of the machine, since simulated time may stand still.
+        self._watch = self._node.create_timer(
+            CHECK_INTERVAL_S, self._follow_others, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def deactivate(self) -> None:
         """Close the inputs and drop what waits; the outputs stay open but silent."""
         with self._publishing:
             self.active = False
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions.clear()
+        if self._watch is not None:
+            self._node.destroy_timer(self._watch)
+            self._watch = None
+        for name in list(self._subscriptions):
+            self._node.destroy_subscription(self._subscriptions.pop(name))
         self.reset()
 
     def close(self) -> None:
@@ -136,10 +150,37 @@ class Session[C: Component[Any]]:
         last = self._last_stamp
         return last is not None and last > now_ns + BACKWARD_JUMP_NS
 
-    def _subscribe(self, port: Port, kind: Any, topic: str) -> None:
-        name = self._node.resolve_topic_name(topic)
-        made = self._node.create_subscription(
-            kind,
+    @property
+    def topics(self) -> list[str]:
+        """The full names of the topics that the component cannot do without."""
+        return [topic for name, topic in self._topics.items() if name not in self._optional]
+
+    def _follow_others(self) -> None:
+        """Subscribe to the transport of each image that is published now, and say what somebody asks for in vain."""
+        for port in self.component.inputs:
+            if port.transport:
+                choice = self._transports[port.name]
+                choice.setting, before = self.image_transport, choice.chosen
+                names = [self._node.resolve_topic_name(topic) for topic in (port.name, self._compressed_topic(port))]
+                if choice.update(*map(self._node.count_publishers, names)) != before:
+                    self._node.destroy_subscription(self._subscriptions.pop(port.name))
+                    self._subscribe(port)
+        for port in self._unavailable:
+            topic, package = self._node.resolve_topic_name(port.name), port.type.partition("/")[0]
+            if self._node.count_subscribers(topic):
+                self._warn_once(
+                    f"{topic} is not published, since {package} is not installed: install ros-jazzy-"
+                    + package.replace("_", "-")
+                )
+
+    def _subscribe(self, port: Port) -> None:
+        """Open an input, for an image that with the transport that is chosen for it."""
+        choice = self._transports.get(port.name)
+        compressed = choice is not None and choice.chosen == COMPRESSED
+        topic = self._compressed_topic(port) if compressed else port.name
+        name = self._topics[port.name] = self._node.resolve_topic_name(topic)
+        self._subscriptions[port.name] = self._node.create_subscription(
+            message_type(COMPRESSED_IMAGE if compressed else port.type),
             topic,
             partial(self._on_message, port.name, name),
             copy(_SUBSCRIPTION_QOS[port.qos]),  # an override changes the profile itself
@@ -150,7 +191,6 @@ class Session[C: Component[Any]]:
                 message_lost=partial(self._on_message_lost, port.name, name),
             ),
         )
-        self._subscriptions.append(made)
 
     def _open_output(self, port: Port, person: bool = False) -> list[tuple[Publisher, Callable[[Any], Any]]]:
         """Return the publishers of a port, each with the conversion from the component's message to its own."""

@@ -46,7 +46,7 @@ class Port:
     `lazy`: an output that is made only while it has subscribers.
     `transport`: the image also travels as CompressedImage on `<name>/<transport>`; COMPRESSED or, for an input,
     COMPRESSED_DEPTH; empty when it does not.
-    `optional`: an input that the component works without.
+    `optional`: an input that the component works without, or an output whose message package a machine may lack.
     `recorded`: a replay writes this output into its bag; False for what is too large.
 
     An output with `{id}` in its name is one topic per person. The component puts `port.person_topic(id)` beside each

@@ -25,8 +25,9 @@ from flowing_puppet_ros.stream.components import warm_up
 from flowing_puppet_ros.stream.components.optical_flow import make_flow_preview
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, make_image_messages
 from flowing_puppet_ros.stream.messages.geometry import header_ns, stamp_ns
+from flowing_puppet_ros.stream.messages.image_annotations import make_annotations, make_detections_2d
 from flowing_puppet_ros.stream.messages.images import decode_flow, decode_image, make_image
-from flowing_puppet_ros.stream.messages.message_types import IMAGE, PUPPETS, MessageFactory
+from flowing_puppet_ros.stream.messages.message_types import ANNOTATIONS, DETECTIONS_2D, IMAGE, PUPPETS, MessageFactory
 from flowing_puppet_ros.stream.messages.puppets import decode_keypoints, make_puppets
 from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
@@ -72,6 +73,8 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         Port("overlay", IMAGE, lazy=True, transport=COMPRESSED),
         Port("flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
         Port("puppet_flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
+        Port("detections_2d", DETECTIONS_2D, lazy=True, optional=True),
+        Port("annotations", ANNOTATIONS, lazy=True, optional=True),
     )
 
     def __init__(self, settings: PuppetTrackerSettings, factory: MessageFactory) -> None:
@@ -91,7 +94,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         other = type(self)(self.settings, self.factory)
         other.set_expected("detections", True)
         for port in other.outputs:
-            if port.lazy:
+            if port.lazy and not port.optional:
                 other.set_subscribed(port.name, True)
         messages = warm_up.make_tracker_input(self.factory, self._model)
         for port_name, message in messages:
@@ -214,6 +217,9 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         if self._humans.enabled:
             made = make_image_messages(self.factory, header, image, puppets.puppets)
             outputs += self._humans.make(header, list(made), made)
+        for name, make in (("detections_2d", make_detections_2d), ("annotations", make_annotations)):
+            if name in self._subscribed:
+                outputs.append((name, make(self.factory, header, puppets.puppets, image.shape[1::-1])))
         if "part_labels" in self._subscribed:
             labels = result.render_part_labels(image.shape[:2])
             outputs.append(("part_labels", make_image(self.factory, header, labels, "mono8")))

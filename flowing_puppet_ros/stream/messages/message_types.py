@@ -18,6 +18,8 @@ TRANSFORMS = "tf2_msgs/msg/TFMessage"
 PUPPETS = "flowing_puppet_msgs/msg/PuppetArray"
 BODIES = "flowing_puppet_msgs/msg/BodyArray"
 SILHOUETTES = "flowing_puppet_msgs/msg/SilhouetteSet"
+DETECTIONS_2D = "vision_msgs/msg/Detection2DArray"
+ANNOTATIONS = "foxglove_msgs/msg/ImageAnnotations"
 
 
 class MessageFactory(Protocol):

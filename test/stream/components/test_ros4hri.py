@@ -23,9 +23,9 @@ from flowing_puppet_ros.stream.components.ros4hri import (
     make_skeleton2d,
     to_name_component,
 )
+from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import JOINTS, MOVING_JOINTS, Skeleton, make_urdf
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image
-from flowing_puppet_ros.stream.messages.ros4hri_skeleton import JOINTS, MOVING_JOINTS, Skeleton, make_urdf
 
 FACTORY = BagMessageFactory()
 HEADER = make_header(FACTORY, 1_500_000_000, "camera_optical_frame")
