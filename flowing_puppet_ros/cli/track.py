@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Track people in a video, a folder of frames or a bag: joints, part outlines and depth order in every frame.
 
-People come from the keypoints of --init or of a bag, else from the package's detector; optical flow propagates them.
+People come from the keypoints of --init or of a bag, else from keypoint networks where these are installed, else from
+the package's own detector; optical flow propagates them.
 At the end the best hypotheses of the arms are chosen and all joints smoothed along the flow, over the whole input. With
 --live no frame is used before its turn; with --method thesis the loop of the thesis places the joints instead.
 """
@@ -25,6 +26,8 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.tracks_json import puppet_to_json, read_keypoints, write_tracks
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame, open_frames
+from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED, SOURCE_HELP, SOURCES, load_networks
+from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.video.clip import (
     Clip,
     ClipSettings,
@@ -42,6 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", help="video file, folder of images, or bag (.mcap, .db3 or a rosbag2 folder)")
     parser.add_argument("--out", required=True, help="tracks.json to write")
     parser.add_argument("--init", help="keypoints.json or sticks.txt, people of one or more frames, for the detector")
+    parser.add_argument("--source", default="auto", choices=SOURCES, help=SOURCE_HELP)
     parser.add_argument("--topic", default="", help="image topic of a bag [the first camera with detections]")
     parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated or damaged .mcap")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
@@ -68,9 +72,12 @@ def run(arguments: argparse.Namespace) -> int:
     settings = ClipSettings.from_arguments(arguments)
     if arguments.overlay:
         check_overlay(Path(arguments.overlay))
+    networks = load_networks(arguments.source)
     source = _open(arguments, _Warnings())
+    if networks is None and not source.clip.has_keypoints and arguments.source == "auto":
+        source.warnings(NOT_INSTALLED)
     began = time.monotonic()
-    people = _track(arguments, source, model, settings)
+    people = _track(arguments, source, model, settings, networks)
     tally = _Tally()
     write_tracks(arguments.out, model.joint_names, source.fps, tally.counted(_entries(people, model)))
     if not tally.frames:
@@ -83,14 +90,26 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _track(
-    arguments: argparse.Namespace, source: _Source, model: DeformableStructures, settings: ClipSettings
+    arguments: argparse.Namespace,
+    source: _Source,
+    model: DeformableStructures,
+    settings: ClipSettings,
+    networks: KeypointSource | None,
 ) -> Iterator[TrackedFrame]:
     def progress(frames: Iterable[DetectedFrame], title: str) -> Iterable[DetectedFrame]:
         return tqdm(frames, title, total=source.count or None, unit="frame", disable=None)
 
     if arguments.live:
-        return track_live(source.clip, model, settings, warn=source.warnings, progress=progress)
-    return track_clip(source.clip, model, settings, method=arguments.method, warn=source.warnings, progress=progress)
+        return track_live(source.clip, model, settings, networks=networks, warn=source.warnings, progress=progress)
+    return track_clip(
+        source.clip,
+        model,
+        settings,
+        method=arguments.method,
+        networks=networks,
+        warn=source.warnings,
+        progress=progress,
+    )
 
 
 def _draw(arguments: argparse.Namespace, fps: float) -> None:

@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import importlib.util
 from functools import cache
-from typing import Literal
 
 from flowing_puppet_ros.image.networks.files import FILES, REMEDY, find_file
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointNetworks, KeypointSource
 
-type Source = Literal["auto", "neural", "own"]
-
-SOURCES: tuple[Source, ...] = ("auto", "neural", "own")
+SOURCES = ("auto", "neural", "own")
+SOURCE_HELP = (
+    "who finds people: neural, keypoint networks; own, the package's detector; auto, the networks if installed [auto]"
+)
 NOT_INSTALLED = (
     "keypoint networks are not installed, people are found by the package's own detector, which knows upper bodies"
     f" from the front only: {REMEDY}"
@@ -24,7 +24,7 @@ def are_installed() -> bool:
     return importlib.util.find_spec("ai_edge_litert") is not None and all(find_file(file) for file in FILES)
 
 
-def load_networks(source: Source = "auto", side: int = 256, thorough: bool = True) -> KeypointSource | None:
+def load_networks(source: str = "auto", side: int = 256, thorough: bool = True) -> KeypointSource | None:
     """Load the networks that a source names; None where the own detector is to be used.
 
     Raises:

@@ -25,10 +25,12 @@ from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
 from flowing_puppet_ros.image.detector.detection import PersonCandidate, PersonDetection
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.networks.choice import load_networks
 from flowing_puppet_ros.image.tracking.track import Track
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.video.detection_worker import DetectedPerson, DetectionWorker, match_to_tracks
 from flowing_puppet_ros.image.video.known_people import KnownPeople
+from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
 from flowing_puppet_ros.image.video.pending_detection import (
     PendingDetection,
     StreamClock,
@@ -51,6 +53,20 @@ class _RoiDetection(PendingDetection[DetectedPerson]):
     """A re-detection; `rois` are the candidates by the ids of the people, and of new ones."""
 
     rois: dict[str, PersonCandidate] = field(default_factory=dict)
+
+
+def make_live_tracker(
+    tracker: FlowingPuppetTracker, settings: LiveDetectionSettings, counters: Counter[str] | None = None
+) -> LiveTracker | NetworkTracker:
+    """Return what tracks a live stream with the source of people that the settings name.
+
+    Raises:
+        InputError: when the source is `neural` and the networks are not installed.
+    """
+    networks = None if settings.source == "none" else load_networks(settings.source, thorough=False)
+    if networks is not None:
+        return NetworkTracker(tracker, settings, networks, counters)
+    return LiveTracker(tracker, settings, counters)
 
 
 class LiveTracker:
