@@ -83,7 +83,5 @@ def _print(network: NetworkFile, as_json: bool) -> None:
             )
         )
         return
-    state = (
-        str(path) if installed else f"{path or 'not installed'}{'' if path is None else ' is another file'}: {REMEDY}"
-    )
+    state = str(path) if installed else f"{'not installed' if path is None else f'{path} is another file'}: {REMEDY}"
     print(f"{network.title} ({network.licence}; in {network.requirement})\n    {state}")

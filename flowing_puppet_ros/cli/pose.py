@@ -80,7 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     # The search models upper bodies without separate hands; hands are drawn at the ends of the lower arms.
     drawn = [MultiViewStructures.load(gender, arguments.parts) for gender in genders] if arguments.parts > 10 else []
     settings = PoseVerbSettings.from_arguments(arguments)
-    networks = load_networks(arguments.source, IMAGE_SIDE_PX) if init is None else None
+    networks = load_networks(arguments.source, IMAGE_SIDE_PX, thorough=True) if init is None else None
     if init is None and networks is None and arguments.source == "auto":
         print(f"flowing-puppet pose: {NOT_INSTALLED}", file=sys.stderr)
     own = init is None and networks is None

@@ -11,16 +11,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, I64
-from flowing_puppet_ros.image.networks.poses import COCO, NetworkPose
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.image.networks.poses import COCO, OTHER_SIDE, NetworkPose
 
 DISTANCES = (0.0, 0.1, 0.2, 0.4, 0.7, 1.0)  # between networks, in shoulder widths ...
 PROBABILITIES = (1.0, 0.9, 0.7, 0.35, 0.12, 0.05)  # ... and how probably the mean is right
 SURE_SCORE = 0.65  # mean score from which the agreement alone counts
 MAX_CROSSED = 0.7  # of the distance of two poses: if that with left and right exchanged is below, one is the wrong way
 
-OTHER_SIDE: I64 = np.array([0, *(row + (1 if row % 2 else -1) for row in range(1, len(COCO)))])
-"""For each joint the one of the other side."""
 MIN_WEIGHT = 1e-3
 
 
@@ -53,7 +51,7 @@ def turn_sides(poses: Sequence[NetworkPose], known: F64 | None) -> list[NetworkP
     judge = poses[-1].joints if known is None or not np.isfinite(known).any() else known
     if not any(_is_crossed(pose.joints, poses[-1].joints) for pose in poses[:-1]):
         return list(poses)
-    return [_exchange(pose) if _is_crossed(pose.joints, judge) else pose for pose in poses]
+    return [pose.exchange_sides() if _is_crossed(pose.joints, judge) else pose for pose in poses]
 
 
 def _is_crossed(one: F64, other: F64) -> bool:
@@ -64,7 +62,3 @@ def _is_crossed(one: F64, other: F64) -> bool:
     if not known.any():
         return False
     return float(np.hypot(*crossed[known].T).sum()) < MAX_CROSSED * float(np.hypot(*straight[known].T).sum())
-
-
-def _exchange(pose: NetworkPose) -> NetworkPose:
-    return NetworkPose(pose.joints[OTHER_SIDE], pose.scores[OTHER_SIDE], pose.score)

@@ -32,6 +32,12 @@ class Landmarks:
     visibility: F64
     presence: float
 
+    @property
+    def pose(self) -> NetworkPose:
+        """The landmarks that are joints of COCO; their scores are the visibilities."""
+        rows = list(COCO_ROWS)
+        return NetworkPose(self.points[rows], self.visibility[rows], self.presence)
+
 
 class BlazePose:
     """The network, and how its input and output are read."""

@@ -24,7 +24,7 @@ def are_installed() -> bool:
     return importlib.util.find_spec("ai_edge_litert") is not None and all(find_file(file) for file in FILES)
 
 
-def load_networks(source: str = "auto", side: int = 256, thorough: bool = True) -> KeypointSource | None:
+def load_networks(source: str = "auto", side: int = 256, thorough: bool = False) -> KeypointSource | None:
     """Load the networks that a source names; None where the own detector is to be used.
 
     Raises:

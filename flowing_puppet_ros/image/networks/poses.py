@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, Image
+from flowing_puppet_ros.arrays import F64, I64, Image
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 
 COCO = (
@@ -19,6 +19,8 @@ COCO = (
 )  # fmt: skip
 """Joints of COCO people, which most networks find."""
 
+OTHER_SIDE: I64 = np.array([0, *(row + (1 if row % 2 else -1) for row in range(1, len(COCO)))])
+"""For each joint the one of the other side."""
 SHOULDERS, HIPS = (5, 6), (11, 12)
 STRIDE = 32  # the sides of a network's input are multiples of it
 MAX_SAME_DISTANCE = 0.5  # median distance of joints, in shoulder widths, within which two poses are one person's
@@ -45,6 +47,14 @@ class NetworkPose:
         """Shoulder width px, from the side what it would be from the front."""
         shoulders = float(np.hypot(*(self.joints[SHOULDERS[0]] - self.joints[SHOULDERS[1]])))
         return max(shoulders, MIN_SHOULDER_SHARE * self.trunk, 1e-3)
+
+    def mirror(self, width: int) -> NetworkPose:
+        """Return the pose in the mirror image of an image of this width px: left is right there."""
+        return NetworkPose((width - 1, 0) + self.joints[OTHER_SIDE] * (-1, 1), self.scores[OTHER_SIDE], self.score)
+
+    def exchange_sides(self) -> NetworkPose:
+        """Return the pose with left called right."""
+        return NetworkPose(self.joints[OTHER_SIDE], self.scores[OTHER_SIDE], self.score)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
