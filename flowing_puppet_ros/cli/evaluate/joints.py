@@ -12,7 +12,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.output import Chart, EvaluationReport, Line, name_runs
 from flowing_puppet_ros.evaluate.output import add_arguments as add_output
 from flowing_puppet_ros.evaluate.video.tracks import JointMisses, measure_misses, read_tracks
-from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
+from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
 
 DRAWN_GROUPS = ("wrists", "elbows", "all joints")
 
