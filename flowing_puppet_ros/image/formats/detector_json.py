@@ -30,7 +30,7 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.annotations import HIDDEN_CONFIDENCE
-from flowing_puppet_ros.image.formats.frame_names import Label, Size
+from flowing_puppet_ros.image.formats.frame_names import MAX_INDEX_DIGITS, Label, Size
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, normalise_name
 from flowing_puppet_ros.image.formats.skeletons import (
     COCO_17,
@@ -53,6 +53,7 @@ ORDERS: Mapping[int, tuple[str, ...]] = {
 
 MIN_SCORE = 0.1  # of a person in results
 MAX_NORMALISED = 2.0  # half of the coordinates of people in pixels are beyond; normalised ones reach 1
+MAX_DEPTH = 6  # of landmarks in lists and objects
 MAX_NEGATIVE = 1 / 3  # share of normalised coordinates under 0; more are metres or reach from -1 to 1
 
 type Row = tuple[tuple[str, ...], F64]
@@ -123,7 +124,25 @@ def read_detector_json(data: Any, label: Label, place: str, into: DetectorFrames
         _read_results(data, place, into)
         return True
     alone = isinstance(data, dict) or (isinstance(data, list) and data and _is_point(data[0]))
-    return (alone and _read_frame(data, label, {}, place, into)) or _read_frames(data, place, into)
+    return (alone and read_detector_frame(data, label, {}, place, into)) or _read_frames(data, place, into)
+
+
+def read_detector_frame(frame: Any, label: Label, about: Mapping[str, Any], place: str, into: DetectorFrames) -> bool:
+    """Add the people of one frame, in OpenPose's form or as landmarks; return False if it is no frame.
+
+    `about` or the frame itself may have its size. InputError as of `read_detector_json`.
+    """
+    people = None
+    if isinstance(frame, dict):
+        about = {**about, **frame}
+        people = next((frame[key] for key in _PEOPLE if isinstance(frame.get(key), list)), None)
+    if people is not None:
+        into.open_frame(label, about).extend(_read_openpose(people, place))
+        return True
+    landmarks = _split_people(frame)
+    if landmarks is not None:
+        into.open_frame(label, about).extend(_read_landmarks(person, place) for person in landmarks)
+    return landmarks is not None
 
 
 def _read_coco(data: Mapping[str, Any], place: str, into: DetectorFrames) -> None:
@@ -159,34 +178,20 @@ def _read_results(data: Sequence[Any], place: str, into: DetectorFrames) -> None
 def _read_frames(data: Any, place: str, into: DetectorFrames) -> bool:
     """Read frames in a list, or by index or name; return False if the first is none."""
     frames = data["frames"] if isinstance(data, dict) and "frames" in data else data
-    if not isinstance(frames, dict | list) or not frames:
+    if not isinstance(frames, dict | list) or not frames or (isinstance(data, dict) and not any(data.values())):
         return False
     everywhere = data if isinstance(data, dict) else {}
     for number, (key, frame) in enumerate(frames.items() if isinstance(frames, dict) else enumerate(frames)):
         about = frame if isinstance(frame, dict) else {}
-        label: Label = int(key) if isinstance(key, str) and key.isdecimal() else key
+        label: Label = int(key) if isinstance(key, str) and key.isdecimal() and len(key) <= MAX_INDEX_DIGITS else key
         if isinstance(frames, list):
             label = next((about[name] for name in _FRAME if isinstance(about.get(name), int | str)), number)
-        if not _read_frame(frame, label, {**everywhere, **about}, f"{place}, frame {key}", into):
+        # null or {} where nobody was found
+        if not read_detector_frame(frame or [], label, {**everywhere, **about}, f"{place}, frame {key}", into):
             if number == 0:
                 return False
             raise InputError(f"{place}, frame {key} is of another form than those before; each needs {FRAME_FORM}")
     return True
-
-
-def _read_frame(frame: Any, label: Label, about: Mapping[str, Any], place: str, into: DetectorFrames) -> bool:
-    """Read the people of one frame, in OpenPose's form or as landmarks; return False if it is no frame."""
-    people = None
-    if isinstance(frame, dict):
-        about = {**about, **frame}
-        people = next((frame[key] for key in _PEOPLE if isinstance(frame.get(key), list)), None)
-    if people is not None:
-        into.open_frame(label, about).extend(_read_openpose(people, place))
-        return True
-    landmarks = _split_people(frame or [])
-    if landmarks is not None:
-        into.open_frame(label, about).extend(_read_landmarks(person, place) for person in landmarks)
-    return landmarks is not None
 
 
 def _read_openpose(people: Sequence[Any], place: str) -> Iterator[Row]:
@@ -198,20 +203,23 @@ def _read_openpose(people: Sequence[Any], place: str) -> Iterator[Row]:
             yield _read_triples(points, (), f"{place}, person {number}")
 
 
-def _split_people(value: Any) -> list[Any] | None:
+def _split_people(value: Any, depth: int = MAX_DEPTH) -> list[Any] | None:
     """Return the landmarks of each person in a frame, however they are nested; None for anything else."""
+    if depth == 0:
+        return None
     if isinstance(value, dict):
         for key in _LANDMARKS:
             if key in value:
-                return _split_people(value[key] or [])
+                return _split_people(value[key] or [], depth - 1)
         return [value] if value and all(map(_is_point, value.values())) else None
     if not isinstance(value, list):
         return None
     if value and _is_point(value[0]):
-        return [value]
+        # Boxes too are lists of four numbers.
+        return [value] if isinstance(value[0], dict) or len(value) == len(MEDIAPIPE_33) else None
     people: list[Any] = []
     for one in value:
-        found = _split_people(one)
+        found = _split_people(one, depth - 1)
         if found is None:
             return None
         people += found
@@ -243,14 +251,20 @@ def _read_landmarks(person: Mapping[str, Any] | Sequence[Any], place: str) -> Ro
         names = MEDIAPIPE_33
     if len(names) != len(rows):
         raise InputError(f"{place}: a person has {len(rows)} landmarks without names; MediaPipe's have {len(names)}")
-    return names, _as_numbers(rows, place)
+    numbers = _as_numbers(rows, place)
+    if numbers.ndim != 2:
+        raise InputError(f"{place} has a landmark whose x, y or visibility is a list; each must be one number")
+    return names, numbers
 
 
 def _read_triples(values: Any, names: Sequence[str], place: str) -> tuple[tuple[str, ...], F64]:
     """Return the names of the points that have one, and their rows (K, 3)."""
     numbers = _as_numbers(values, place).ravel()
     count = len(numbers) / 3
-    order = tuple(names) if len(names) == count and any(map(normalise_name, names)) else ORDERS.get(int(count), ())
+    order = ORDERS.get(int(count), ())
+    # Halpe's own names call the top of the head "head".
+    if order != HALPE_26 and len(names) == count and any(map(normalise_name, names)):
+        order = tuple(names)
     if not order or count != int(count):
         counts = ", ".join(map(str, ORDERS))
         raise InputError(

@@ -17,6 +17,8 @@ type Label = int | str
 type Size = tuple[float, float]
 """Width and height, px."""
 
+MAX_INDEX_DIGITS = 18  # of a frame's index; longer numbers are none
+_INDEX = rf"\d{{1,{MAX_INDEX_DIGITS}}}"
 _OPENPOSE_INDEX = re.compile(r".+_(\d{12})")  # OpenPose numbers the frames of a video so
 
 
@@ -50,7 +52,7 @@ class FrameNames:
         """Return the frames that each label means; labels of other images are absent.
 
         An index means itself. Names mean the images with that name, or with that name but for suffix and leading zeros
-        of numbers; of two such images in different folders the one in the folder that the label names. Names that are
+        of numbers; of such images in several folders, the one whose folders agree most with the label's. Names that are
         bare numbers (AlphaPose on a video, COCO's ids) mean the number in the images' names if every one is there, or
         else the index. Where frames have no names, and for what OpenPose calls `NAME_000000000012`, the number at the
         end is the index.
@@ -58,7 +60,7 @@ class FrameNames:
         InputError, which begins with `place`, when no label fits, or when one fits images in several folders.
         """
         names = [label for label in labels if isinstance(label, str)]
-        found: dict[Label, list[int]] = {label: [label] for label in labels if isinstance(label, int)}
+        found: dict[Label, list[int]] = {label: [label] for label in labels if isinstance(label, int) and label >= 0}
         if not names:
             return found
         by_name = self._match_images(names, place) if self.files else self._match_indices(names, place)
@@ -71,7 +73,7 @@ class FrameNames:
 
     def _match_images(self, names: Sequence[str], place: str | Path) -> dict[Label, list[int]]:
         exact = _look_up(names, self.files, lambda path: path.name, place)
-        if not exact and all(_stem(_as_path(name)).isdecimal() for name in names):
+        if not exact and all(re.fullmatch(_INDEX, _stem(_as_path(name))) for name in names):
             return self._match_numbers(names)
         found = exact
         for key in (_stem, lambda path: _strip_zeros(_stem(path))):
@@ -93,9 +95,11 @@ class FrameNames:
         index_of = {number: index for index, number in enumerate(numbers) if number is not None}
         numbered = len(index_of) == len(self.files)
         among = numbered and set(wanted.values()) <= set(index_of)
-        if not among and (not numbered or all(number < len(self.files) for number in wanted.values())):
+        # Indices have no leading zeros, unlike the names of images.
+        plain = all(_stem(_as_path(name)) == str(number) for name, number in wanted.items())
+        if plain and not among and (not numbered or all(number < len(self.files) for number in wanted.values())):
             return {name: [number] for name, number in wanted.items()}
-        return {name: [index_of[number]] for name, number in wanted.items() if number in index_of}
+        return {name: [index_of[number]] for name, number in wanted.items() if numbered and number in index_of}
 
     def _match_indices(self, names: Sequence[str], place: str | Path) -> dict[Label, list[int]]:
         """Match names with frames that have none, by the number at the end."""
@@ -121,7 +125,7 @@ class FrameNames:
 def _look_up(
     names: Sequence[str], files: Sequence[Path], key: Callable[[PurePosixPath], str], place: str | Path
 ) -> dict[Label, list[int]]:
-    """Return the images with the same key as each name; of several, those in the folder that the name gives."""
+    """Return the images with the same key as each name; of several, those whose folders agree most with the name's."""
     indices: dict[str, list[int]] = {}
     for index, file in enumerate(files):
         indices.setdefault(key(_as_path(file)), []).append(index)
@@ -130,16 +134,26 @@ def _look_up(
         path = _as_path(name)
         same = indices.get(key(path), [])
         if len({files[index].parent for index in same}) > 1:
-            folder = path.parent.parts
-            same = [i for i in same if folder and files[i].absolute().parent.parts[-len(folder) :] == folder]
-            if len({files[index].parent for index in same}) != 1:
+            shared = [_count_shared(path.parent, _as_path(files[index].absolute()).parent) for index in same]
+            same = [index for index, count in zip(same, shared, strict=True) if count == max(shared)]
+            if len({files[index].parent for index in same}) > 1:
                 raise InputError(
-                    f"{place} names the image {name!r}, which is in several folders or in none of these; give its "
-                    "folder with the name, or pose the folders one by one"
+                    f"{place} names the image {name!r}, which several folders have; give its folder with the name, or "
+                    "one folder of images at a time"
                 )
         if same:
             found[name] = same
     return found
+
+
+def _count_shared(one: PurePosixPath, other: PurePosixPath) -> int:
+    """Return how many folders at the end of two paths are the same."""
+    count = 0
+    for a, b in zip(reversed(one.parts), reversed(other.parts), strict=False):
+        if a != b:
+            break
+        count += 1
+    return count
 
 
 def _as_path(name: Label | Path) -> PurePosixPath:
@@ -159,7 +173,7 @@ def _strip_zeros(stem: str) -> str:
 def _number_at_end(stem: str) -> int | None:
     """Return the last number in a name; None without one."""
     digits = re.findall(r"\d+", stem)
-    return int(digits[-1]) if digits else None
+    return int(digits[-1]) if digits and len(digits[-1]) <= MAX_INDEX_DIGITS else None
 
 
 def _strip_number(stem: str) -> str:

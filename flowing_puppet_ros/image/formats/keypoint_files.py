@@ -23,16 +23,16 @@ from flowing_puppet_ros.image.formats.detector_json import (
     FRAME_FORM,
     DetectorFrames,
     LabelledPeople,
+    read_detector_frame,
     read_detector_json,
 )
-from flowing_puppet_ros.image.formats.frame_names import FrameNames, Label, Size
+from flowing_puppet_ros.image.formats.frame_names import MAX_INDEX_DIGITS, FrameNames, Label, Size
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, normalise_name
 from flowing_puppet_ros.image.formats.stick_regression import StickRegression
 from flowing_puppet_ros.image.formats.stickmen import read_sticks
 from flowing_puppet_ros.image.formats.video_reader import natural_sort_key
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
-MAX_INDEX_DIGITS = 18  # of a frame's index; longer ones are refused
 FRAME_FILE_ENDING = "_keypoints"  # of OpenPose's files, before .json
 FORMS = (
     '{"joint_names": [...], "frames": {"0": [[[x, y, confidence], ...], ...]}}; '
@@ -103,7 +103,8 @@ def read_labelled(path: str | Path) -> LabelledPeople:
     into = DetectorFrames()
     # OpenPose names a frame's file after the image; any other file with one frame has that of index 0.
     label: Label = path.stem.removesuffix(FRAME_FILE_ENDING) if path.stem.endswith(FRAME_FILE_ENDING) else 0
-    _read_detected(data, label, path, into, f"one of {FORMS}")
+    if not read_detector_json(data, label, str(path), into):
+        raise InputError(f"{path} has none of the forms of keypoints that are read; expected is one of {FORMS}")
     return into.finish(str(path))
 
 
@@ -128,17 +129,9 @@ def _read_folder(folder: Path) -> LabelledPeople:
         )
     into = DetectorFrames()
     for file in files:
-        _read_detected(load_json(file), file.stem.removesuffix(FRAME_FILE_ENDING), file, into, FRAME_FORM)
+        if not read_detector_frame(load_json(file), file.stem.removesuffix(FRAME_FILE_ENDING), {}, str(file), into):
+            raise InputError(f"{file} is no frame of keypoints; expected is {FRAME_FORM}")
     return into.finish(str(folder))
-
-
-def _read_detected(data: Any, label: Label, path: Path, into: DetectorFrames, expected: str) -> None:
-    try:
-        known = read_detector_json(data, label, str(path), into)
-    except RecursionError:
-        known = False
-    if not known:
-        raise InputError(f"{path} has none of the forms of keypoints that are read; expected is {expected}")
 
 
 def _read_own(data: Mapping[str, Any], path: Path) -> dict[Label, list[Keypoints]]:
