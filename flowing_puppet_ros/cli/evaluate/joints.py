@@ -20,7 +20,13 @@ DRAWN_GROUPS = ("wrists", "elbows", "all joints")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flowing-puppet evaluate joints`."""
     parser.add_argument("tracks", nargs="+", type=Path, metavar="TRACKS", help="tracks.json or poses.json of a run")
-    parser.add_argument("--truth", type=Path, required=True, metavar="FILE", help="keypoints.json with the true joints")
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        required=True,
+        metavar="FILE",
+        help="the true joints: keypoints.json, or keypoints in pixels of COCO, OpenPose, AlphaPose or MediaPipe",
+    )
     parser.add_argument("--most", type=int, default=40, metavar="PX", help="largest threshold, pixels [%(default)s]")
     add_output(parser, "joints")
 

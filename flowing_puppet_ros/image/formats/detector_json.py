@@ -67,7 +67,7 @@ _SIZES = (("width", "height"), ("image_width", "image_height"))
 _CONFIDENCES = ("visibility", "score", "confidence", "presence")
 _COCO_FORM = 'COCO needs "images": [{"id", "file_name"}], "annotations": [{"image_id", "keypoints": [x, y, v, ...]}]'
 _RESULT_FORM = 'results need "image_id", an image\'s name or number, and "keypoints": [x, y, score, ...]'
-FRAME_FORM = '"people": [{"pose_keypoints_2d": [x, y, c, ...]}] or "landmarks": [{"x", "y", "visibility"}, ...]'
+FRAME_FORM = '{"people": [{"pose_keypoints_2d": [x, y, c, ...]}]} or {"landmarks": [{"x", "y", "visibility"}, ...]}'
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,7 +198,7 @@ def _read_openpose(people: Sequence[Any], place: str) -> Iterator[Row]:
     for number, person in enumerate(people):
         points = next((person[key] for key in _POINTS if key in person), None) if isinstance(person, dict) else None
         if points is None:
-            raise InputError(f"{place}: person {number} has no points; OpenPose's frames need {FRAME_FORM}")
+            raise InputError(f"{place}: person {number} has no points; a frame needs {FRAME_FORM}")
         if points:
             yield _read_triples(points, (), f"{place}, person {number}")
 
@@ -236,7 +236,7 @@ def _is_point(value: Any) -> bool:
 def _read_landmarks(person: Mapping[str, Any] | Sequence[Any], place: str) -> Row:
     points = list(person.values()) if isinstance(person, Mapping) else person
     if not all(map(_is_point, points)):
-        raise InputError(f"{place} has a landmark without place; frames of landmarks need {FRAME_FORM}")
+        raise InputError(f"{place} has a landmark without place; a frame needs {FRAME_FORM}")
     rows = [
         (one["x"], one["y"], next((one[key] for key in _CONFIDENCES if key in one), 1.0))
         if isinstance(one, dict)

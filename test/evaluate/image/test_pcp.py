@@ -117,6 +117,18 @@ def test_keypoints_count_images_and_leave_out_what_they_lack(tmp_path: Path) -> 
     assert np.isnan(sticks).any(axis=(1, 2)).tolist() == [stick == "left_lower_arm" for stick in STICKS]
 
 
+def test_other_detectors_count_images_from_0_or_name_them(tmp_path: Path) -> None:
+    for number in (7, 12):
+        picture(tmp_path / f"frame{number:04d}.png", number)
+    shown = {"left_shoulder": {"x": 100.0, "y": 40.0}, "left_elbow": {"x": 110.0, "y": 80.0}}
+    path = tmp_path / "landmarks.json"
+    for frames in ([None, shown], [{"image": "frame12.jpg", "landmarks": shown}]):
+        path.write_text(json.dumps(frames))
+        ((frame, (sticks,)),) = open_true_images(tmp_path, read_stick_truth(path, tmp_path))
+        assert int(frame.image[0, 0, 0]) == 12
+        np.testing.assert_array_equal(sticks[STICKS.index("left_upper_arm")], [[100, 40], [110, 80]])
+
+
 def test_annotations_name_images_and_frames_of_clips(tmp_path: Path) -> None:
     picture(tmp_path / "one.png", 50)
     writer = cv2.VideoWriter(str(tmp_path / "clip.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 10, (32, 32))

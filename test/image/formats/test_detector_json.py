@@ -166,7 +166,7 @@ WRONG: dict[str, tuple[Any, str]] = {
     "text": ([{"image_id": 0, "keypoints": ["a"] * 51}], "must be numbers"),
     "long number": ('[{"image_id": 0, "keypoints": [' + "9" * 400 + "]}]", "must be numbers"),
     "no image": ([*FORMS["AlphaPose"], {"keypoints": []}], 'entry 1 is incomplete; results need "image_id"'),
-    "no keypoints": ({"people": [{"box": []}]}, 'need "people": [{"pose_keypoints_2d": [x, y, c, ...]}]'),
+    "no keypoints": ({"people": [{"box": []}]}, 'needs {"people": [{"pose_keypoints_2d": [x, y, c, ...]}]'),
     "images of nothing": ({"images": [{"file": 1}], "annotations": []}, 'COCO needs "images": [{"id", "file_name"}]'),
     "annotations of nothing": ({"annotations": 3}, "COCO needs"),
     "few landmarks": ([landmarks()[:20]], "20 landmarks without names; MediaPipe's have 33"),

@@ -80,7 +80,7 @@ def test_a_folder_for_a_folder_of_images_goes_by_name(tmp_path: Path) -> None:
     [
         ("", "", "has no JSON file; expected is one a frame as OpenPose writes them, NAME_000000000012_keypoints.json"),
         ("a_keypoints.json", '{"people": [{"pose_key', "a_keypoints.json is not a JSON file"),
-        ("a_keypoints.json", '{"boxes": []}', 'expected is "people": [{"pose_keypoints_2d": [x, y, c, ...]}]'),
+        ("a_keypoints.json", '{"boxes": []}', 'expected is {"people": [{"pose_keypoints_2d": [x, y, c, ...]}]'),
         ("a_keypoints.json", '{"people": []}', "has no person in any frame"),
     ],
     ids=["empty", "truncated", "other", "nobody"],
