@@ -18,8 +18,8 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.formats.frame_names import FrameNames
-from flowing_puppet_ros.image.formats.keypoint_files import load_json, read_keypoints
+from flowing_puppet_ros.image.formats.frame_names import FrameNames, Label
+from flowing_puppet_ros.image.formats.keypoint_files import load_json, read_keypoints, read_labelled
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.stickmen import read_sticks, sticks_from_joints
 from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, FrameSource, VideoFrame, open_frames
@@ -43,10 +43,12 @@ def read_stick_truth(path: Path, source: Path) -> StickTruth:
         return _read_named(path, source)
     if "images" in data:
         return _read_annotations(data, path)
-    return dict(_convert(read_keypoints(path)).items())
+    people = read_labelled(path).people
+    # In our own file a number is that in an image's name, see `open_true_images`.
+    return _convert(people) if all(isinstance(label, int) for label in people) else _read_named(path, source)
 
 
-def _convert(people: Mapping[int, Sequence[Keypoints]]) -> dict[int, list[Array]]:
+def _convert(people: Mapping[Label, Sequence[Keypoints]]) -> StickTruth:
     return {number: [_sticks_from_keypoints(one) for one in found] for number, found in people.items()}
 
 
@@ -54,10 +56,10 @@ def _read_named(path: Path, source: Path) -> StickTruth:
     """Read the keypoints of another detector; its images are named, or are counted from 0 where it has no names."""
     files = open_frames(source).files if source.is_dir() else _list_posed(source)
     frames = FrameNames(source.stem, files, len(files), FrameSource(source, FOLDER_FPS, len(files), files).read_size)
-    people = _convert(read_keypoints(path, frames))
+    people = read_keypoints(path, frames)
     # An image is known by its name in its folder, and by its whole path in a poses.json.
     keys = [file.name if source.is_dir() else file.as_posix() for file in files]
-    return {keys[index] if index < len(keys) else index: found for index, found in people.items()}
+    return _convert({keys[index] if index < len(keys) else index: found for index, found in people.items()})
 
 
 def _list_posed(source: Path) -> tuple[Path, ...]:

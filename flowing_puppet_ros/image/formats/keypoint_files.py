@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read the people that any detector found from its file: ours, or one of those in `detector_json`, told by content.
 
-    keypoints.json  {"joint_names": [...], "frames": {"0": [[[x, y, confidence], ...], ...]}}   people by frame index
+    keypoints.json  {"joint_names": [...], "frames": {"0": [[[x, y, confidence], ...], ...]}}, people by a frame's index
+                    or an image's name
     tracks.json     and poses.json, as `track` and `pose` write them
     sticks.txt      frame number and 6 x (x1 y1 x2 y2) per person, see `stickmen`
     a folder        of OpenPose's files or of landmarks, one a frame
@@ -151,9 +152,13 @@ def _read_own(data: Mapping[str, Any], path: Path) -> dict[Label, list[Keypoints
             found[label] = [_parse_person(tuple(names), rows, f"{path}, frame {number}") for rows in people]
         return found
     for key, people in frames.items():
-        if not key.isdecimal() or len(key) > MAX_INDEX_DIGITS or not isinstance(people, list):
-            raise InputError(f"{path}: frame {key[:MAX_INDEX_DIGITS]!r} must be an index with a list of people")
-        found[int(key)] = [_parse_person(tuple(names), rows, f"{path}, frame {key}") for rows in people]
+        if not isinstance(people, list) or (key.isdecimal() and len(key) > MAX_INDEX_DIGITS):
+            raise InputError(
+                f"{path}: frame {key[:MAX_INDEX_DIGITS]!r} must be an index or an image's name, with a list of people"
+            )
+        found[int(key) if key.isdecimal() else key] = [
+            _parse_person(tuple(names), rows, f"{path}, frame {key}") for rows in people
+        ]
     return found
 
 

@@ -44,7 +44,9 @@ def number_points(count: int, pairs_from: int | None = None) -> list[float]:
     return values
 
 
-@pytest.mark.parametrize("form", ["sticks.txt", "keypoints.json", "annotations.json", "results.json", "openpose"])
+@pytest.mark.parametrize(
+    "form", ["sticks.txt", "keypoints.json", "names.json", "annotations.json", "results.json", "openpose"]
+)
 def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
     poses, truth = poses_file(tmp_path / "poses.json", 14.0), tmp_path / form
     people = [np.column_stack([JOINTS, np.ones(len(JOINTS))]).tolist()]
@@ -52,6 +54,10 @@ def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.Captur
         write_sticks(truth, {k: [sticks_from_joints(MODEL.joint_names, JOINTS)] for k in (0, 1)})
     elif form == "keypoints.json":
         truth.write_text(json.dumps({"joint_names": MODEL.joint_names, "frames": {"0": people, "1": people}}))
+    elif form == "names.json":
+        truth.write_text(
+            json.dumps({"joint_names": MODEL.joint_names, "frames": {"im0.png": people, "im1.png": people}})
+        )
     elif form == "results.json":
         truth.write_text(json.dumps([{"image_id": f"im{k}.jpg", "keypoints": number_points(17, 5)} for k in (0, 1)]))
     elif form == "openpose":

@@ -39,6 +39,12 @@ def test_our_own_keypoints_and_their_unknown_points(tmp_path: Path) -> None:
     assert people[2][0].select_usable() == {"left_wrist": (10.0, 20.0, 0.9)}
 
 
+def test_our_own_keypoints_may_name_images(tmp_path: Path) -> None:
+    path = write(tmp_path / "k.json", {"joint_names": NAMES, "frames": {"b.png": [PERSON], "z.png": [PERSON]}})
+    frames = FrameNames(files=(Path("a.png"), Path("b.png")), count=2)
+    assert wrists(read_keypoints(path, frames)) == {1: [10.0]}
+
+
 def test_tracks_and_poses_are_read_as_they_are_written(tmp_path: Path) -> None:
     puppets = [{"id": "a1", "joints": PERSON}]
     tracks = {
@@ -101,7 +107,11 @@ def test_a_wrong_folder_gets_one_sentence(tmp_path: Path, name: str, text: str, 
     [
         ({"joint_names": NAMES, "frames": {"0": [PERSON[:1]]}}, "frame 0: a person needs 2 entries"),
         ({"joint_names": NAMES, "frames": {"0": [[[10**400, 1, 1], [1, 1, 1]]]}}, "frame 0: a person needs 2 entries"),
-        ({"joint_names": NAMES, "frames": {"a.png": [PERSON]}}, "must be an index"),
+        ({"joint_names": NAMES, "frames": {"a.png": [PERSON]}}, "names the image 'a.png', but the frames here have no"),
+        (
+            {"joint_names": NAMES, "frames": {"a.png": 3}},
+            "frame 'a.png' must be an index or an image's name, with a list",
+        ),
         ({"joint_names": NAMES, "frames": [{"index": None, "puppets": []}]}, 'frame 0 needs "index" and "puppets"'),
         ({"joint_names": NAMES, "frames": [{"index": 1, "puppets": [[]]}]}, 'frame 0 needs "index" and "puppets"'),
         ({"joint_names": NAMES, "frames": []}, "no person in any frame"),
