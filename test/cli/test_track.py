@@ -104,6 +104,23 @@ def test_a_folder_of_openpose_starts_the_same_people(frames: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
+def test_landmarks_in_shares_of_the_image_start_people_in_a_bag(tmp_path: Path) -> None:
+    shares = {"shoulder": (0.1, 0.3), "elbow": (0.15, 0.45), "wrist": (0.16, 0.55), "hip": (0.06, 0.6)}
+    texts = []
+    for width, height in ((1, 1), (192, 240)):  # 192x240 are the images of the bag
+        places = {
+            f"{side}_{part}": {"x": (0.5 + sign * dx) * width, "y": y * height}
+            for part, (dx, y) in shares.items()
+            for side, sign in (("left", 1), ("right", -1))
+        }
+        init = tmp_path / "landmarks.json"
+        init.write_text(json.dumps([places]))
+        assert main(["track", str(GOLDEN), "--init", str(init), "--out", str(tmp_path / "t.json")]) == 0
+        texts.append((tmp_path / "t.json").read_text())
+    assert texts[0] == texts[1] and len(json.loads(texts[0])["frames"][0]["puppets"]) == 1
+
+
+@pytest.mark.slow
 def test_live_uses_no_later_frame_and_the_whole_clip_does(frames: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     shift = np.column_stack([rng.normal(0, 4, (6, 2)), np.zeros(6)])

@@ -53,9 +53,9 @@ class FrameNames:
 
         An index means itself. Names mean the images with that name, or with that name but for suffix and leading zeros
         of numbers; of such images in several folders, the one whose folders agree most with the label's. Names that are
-        bare numbers (AlphaPose on a video, COCO's ids) mean the number in the images' names if every one is there, or
-        else the index. Where frames have no names, and for what OpenPose calls `NAME_000000000012`, the number at the
-        end is the index.
+        bare numbers (AlphaPose on a video, COCO's ids) mean the numbers in the images' names, or indices if some are
+        not there and all of them can be indices. Where frames have no names, and for what OpenPose calls
+        `NAME_000000000012`, the number at the end is the index.
 
         InputError, which begins with `place`, when no label fits, or when one fits images in several folders.
         """
