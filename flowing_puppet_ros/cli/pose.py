@@ -2,8 +2,7 @@
 """Find the pose of the people in single images: joints, part outlines, depth order, and other hypotheses of the arms.
 
 Keypoint networks where these are installed, else the package's own detector, say where people are, or the keypoints of
---init. Frames of --init are counted from 0 in the
-order of the images.
+--init. The images of --init are found by name where it has names, or else counted from 0 in the order of the images.
 """
 
 from __future__ import annotations
@@ -24,8 +23,10 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.image.detector.detection import PersonDetection
 from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
-from flowing_puppet_ros.image.formats.tracks_json import DECIMALS, puppet_to_json, read_keypoints, write_tracks
-from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, IMAGE_SUFFIXES, open_frames
+from flowing_puppet_ros.image.formats.frame_names import FrameNames
+from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
+from flowing_puppet_ros.image.formats.tracks_json import DECIMALS, puppet_to_json, write_tracks
+from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, IMAGE_SUFFIXES, FrameSource, open_frames
 from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED, SOURCE_HELP, SOURCES, load_networks
 from flowing_puppet_ros.image.pose.estimator import PoseEstimator
 from flowing_puppet_ros.image.pose.result import PosedPuppet
@@ -54,7 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", nargs="+", type=Path, help="image files, or folders of images")
     parser.add_argument("--out", required=True, type=Path, help="poses.json to write")
     parser.add_argument(
-        "--init", type=Path, help="keypoints.json or sticks.txt: people of each image, for the detector"
+        "--init",
+        type=Path,
+        help="people of each image, for the detector: keypoints.json, or a file or folder of COCO, OpenPose, AlphaPose "
+        "or MediaPipe keypoints",
     )
     parser.add_argument("--source", default="auto", choices=SOURCES, help=SOURCE_HELP)
     parser.add_argument(
@@ -69,7 +73,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Pose the people of every image; return 1 if an image could not be read, after all others are done."""
     files = list(_find_images(arguments.images))
-    init = None if arguments.init is None else read_keypoints(arguments.init)
+    source = FrameSource(Path(), FOLDER_FPS, len(files), tuple(files))
+    init = None if arguments.init is None else read_keypoints(arguments.init, FrameNames.of(source))
     if arguments.out.resolve() in {file.resolve() for file in files} | {Path(arguments.init or "").resolve()}:
         raise InputError(f"{arguments.out} is an input itself: name another output")
     if init is not None and min(index for index, people in init.items() if people) >= len(files):

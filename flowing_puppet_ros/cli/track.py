@@ -23,8 +23,10 @@ from tqdm import tqdm
 from flowing_puppet_ros.bag.paths import is_bag
 from flowing_puppet_ros.draw.overlay_video import check_overlay, read_drawn_tracks, write_overlay
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.formats.frame_names import FrameNames, Size
+from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.formats.tracks_json import puppet_to_json, read_keypoints, write_tracks
+from flowing_puppet_ros.image.formats.tracks_json import puppet_to_json, write_tracks
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame, open_frames
 from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED, SOURCE_HELP, SOURCES, load_networks
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
@@ -44,8 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this verb."""
     parser.add_argument("input", help="video file, folder of images, or bag (.mcap, .db3 or a rosbag2 folder)")
     parser.add_argument("--out", required=True, help="tracks.json to write")
-    parser.add_argument("--init", help="keypoints.json or sticks.txt, people of one or more frames, for the detector")
     parser.add_argument("--source", default="auto", choices=SOURCES, help=SOURCE_HELP)
+    parser.add_argument(
+        "--init",
+        help="people of one or more frames, for the detector: keypoints.json, or a file or folder of COCO, OpenPose, "
+        "AlphaPose or MediaPipe keypoints",
+    )
     parser.add_argument("--topic", default="", help="image topic of a bag [the first camera with detections]")
     parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated or damaged .mcap")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
@@ -169,17 +175,19 @@ def _open(arguments: argparse.Namespace, warnings: _Warnings) -> _Source:
     path, init, out = Path(arguments.input), arguments.init, Path(arguments.out)
     if out.resolve() in {Path(name).resolve() for name in (path, init) if name}:
         raise InputError(f"{out} is an input itself: name another output")
-    keypoints = None if init is None else read_keypoints(init)
     if is_bag(path):
         # Only bags need the bag stack, which takes a while to import.
         from flowing_puppet_ros.bag.frames import open_bag_frames
 
         bag = open_bag_frames(path, arguments.topic, arguments.salvage, warnings)
-        if keypoints is None:
+        if init is None:
             return _Source(Clip(bag, bool(bag.detections)), bag.fps, bag.count, warnings)
-        _check_reach(keypoints, bag.count, arguments)
-        return _Source(Clip.of(_Images(bag), keypoints), bag.fps, bag.count, warnings)
+        images = _Images(bag)
+        given = read_keypoints(init, FrameNames(path.stem, count=bag.count, read_size=images.read_size))
+        _check_reach(given, bag.count, arguments)
+        return _Source(Clip.of(images, given), bag.fps, bag.count, warnings)
     source = open_frames(path, warnings)
+    keypoints = None if init is None else read_keypoints(init, FrameNames.of(source))
     if keypoints is not None:
         _check_reach(keypoints, source.count, arguments)
     return _Source(Clip.of(source, keypoints), source.fps, source.count, warnings)
@@ -193,6 +201,10 @@ class _Images:
 
     def __iter__(self) -> Iterator[VideoFrame]:
         return (frame for frame, _ in self.frames)
+
+    def read_size(self, _: int) -> Size | None:
+        """Return width and height of the images, px."""
+        return next(((frame.image.shape[1], frame.image.shape[0]) for frame in self), None)
 
 
 def _check_reach(keypoints: dict[int, list[Keypoints]], count: int, arguments: argparse.Namespace) -> None:

@@ -23,7 +23,7 @@ from flowing_puppet_ros.evaluate.video.tracks import (
     measure_people,
     read_tracks,
 )
-from flowing_puppet_ros.evaluate.video.truth import read_named_people
+from flowing_puppet_ros.image.formats.keypoint_files import read_labelled
 
 DRAWN_GROUPS = ("wrists", "elbows", "all joints")
 
@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         required=True,
         metavar="FILE",
-        help="keypoints.json with the true joints, by index or name of the image",
+        help="the true joints: keypoints.json, or keypoints in pixels of COCO, OpenPose, AlphaPose or MediaPipe",
     )
     parser.add_argument("--most", type=int, default=40, metavar="PX", help="largest threshold, pixels [%(default)s]")
     add_unmatched_argument(parser)
@@ -48,7 +48,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.most < 4:
         raise InputError(f"--most is {arguments.most}; give at least 4 pixels")
     names = name_runs(arguments.tracks)
-    named = read_named_people(arguments.truth)
+    labelled = read_labelled(arguments.truth)
+    if labelled.normalised:
+        raise InputError(f"{arguments.truth} has shares of the image, not pixels; the images' size is not known here")
+    named = labelled.people
     thresholds = np.arange(1, arguments.most + 1)
     shown = sorted({max(arguments.most * share // 8, 1) for share in (1, 2, 4, 8)})
     figures, curves, images, lines = {}, {}, {}, []

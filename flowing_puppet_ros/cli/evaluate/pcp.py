@@ -38,7 +38,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `evaluate pcp`."""
     parser.add_argument("inputs", nargs="+", type=Path, metavar="INPUT", help="folder of images, or poses.json")
     parser.add_argument(
-        "--truth", type=Path, help="annotations.json, keypoints.json or sticks.txt [annotations.json in INPUT]"
+        "--truth",
+        type=Path,
+        help="annotations.json, keypoints.json, sticks.txt, or keypoints of COCO, OpenPose, AlphaPose or MediaPipe "
+        "[annotations.json in INPUT]",
     )
     add_unmatched_argument(parser)
     add_output(parser, "pcp")
@@ -71,7 +74,7 @@ def _read_truth(source: Path, given: Path | None) -> StickTruth:
     path = given or (source / "annotations.json" if source.is_dir() else None)
     if path is None:
         raise InputError(f"{source} needs the truth: name it with --truth")
-    truth = read_stick_truth(path)
+    truth = read_stick_truth(path, source)
     if not any(truth.values()):
         raise InputError(f"{path} has no person in any image")
     return truth

@@ -64,7 +64,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `evaluate video`."""
     names = ", ".join(METHODS)
     parser.add_argument("input", type=Path, help="folder of videos or of sub-folders of frames")
-    parser.add_argument("--truth", type=Path, required=True, help="JSON of the clips' joints, or folder of keypoints")
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        required=True,
+        help="JSON of the clips' joints, or a file or folder of keypoints, ours or of COCO, OpenPose, AlphaPose or "
+        "MediaPipe",
+    )
     parser.add_argument("--init", type=Path, help="keypoints that rows with init- start from, in a form of the truth's")
     parser.add_argument("--out", type=Path, required=True, help="folder for the tracks, video.json, .csv and .html")
     parser.add_argument("--clips", default="", help="names of clips, with commas between [all that the truth has]")

@@ -102,7 +102,7 @@ def test_a_run_that_finds_nobody_misses_everybody(files: list[str], capsys: pyte
     [
         ({"x.jpg": [rows(0.0)]}, "no image in common; the truth has x.jpg"),
         ({"a.jpg": [[[1.0, 2.0]]]}, "a person needs 6 entries"),
-        ({"a.jpg": 3}, "a person needs 6 entries"),
+        ({"a.jpg": 3}, "must be an index or an image's name"),
         ({"a.jpg": [rows(0.0)], "data/a.jpg": []}, "the image data/a.jpg twice"),
     ],
 )

@@ -126,12 +126,12 @@ def test_numbers_are_those_in_the_names_of_images(tmp_path: Path) -> None:
     for number in (7, 12, 100):
         picture(tmp_path / f"frame{number:04d}.png", number)
     write_sticks(tmp_path / "sticks.txt", {12: [TRUTH], 100: [TRUTH, TRUTH + 5]})
-    seen = list(open_true_images(tmp_path, read_stick_truth(tmp_path / "sticks.txt")))
+    seen = list(open_true_images(tmp_path, read_stick_truth(tmp_path / "sticks.txt", tmp_path)))
     assert [(int(frame.image[0, 0, 0]), len(people)) for frame, people in seen] == [(12, 1), (100, 2)]
     np.testing.assert_allclose(seen[0][1][0], TRUTH, atol=0.01)
     write_sticks(tmp_path / "sticks.txt", {3: [TRUTH]})
     with pytest.raises(InputError, match="no image number 3"):
-        list(open_true_images(tmp_path, read_stick_truth(tmp_path / "sticks.txt")))
+        list(open_true_images(tmp_path, read_stick_truth(tmp_path / "sticks.txt", tmp_path)))
 
 
 def test_keypoints_count_images_and_leave_out_what_they_lack(tmp_path: Path) -> None:
@@ -141,9 +141,21 @@ def test_keypoints_count_images_and_leave_out_what_they_lack(tmp_path: Path) -> 
     joints = [[*MODEL.likely_puppet().joints[MODEL.joint_names.index(name)], 1.0] for name in names]
     path = tmp_path / "keypoints.json"
     path.write_text(json.dumps({"joint_names": names, "frames": {"1": [joints], "0": []}}))
-    ((frame, (sticks,)),) = open_true_images(tmp_path, read_stick_truth(path))
+    ((frame, (sticks,)),) = open_true_images(tmp_path, read_stick_truth(path, tmp_path))
     assert int(frame.image[0, 0, 0]) == ord("b")
     assert np.isnan(sticks).any(axis=(1, 2)).tolist() == [stick == "left_lower_arm" for stick in STICKS]
+
+
+def test_other_detectors_count_images_from_0_or_name_them(tmp_path: Path) -> None:
+    for number in (7, 12):
+        picture(tmp_path / f"frame{number:04d}.png", number)
+    shown = {"left_shoulder": {"x": 100.0, "y": 40.0}, "left_elbow": {"x": 110.0, "y": 80.0}}
+    path = tmp_path / "landmarks.json"
+    for frames in ([None, shown], [{"image": "frame12.jpg", "landmarks": shown}]):
+        path.write_text(json.dumps(frames))
+        ((frame, (sticks,)),) = open_true_images(tmp_path, read_stick_truth(path, tmp_path))
+        assert int(frame.image[0, 0, 0]) == 12
+        np.testing.assert_array_equal(sticks[STICKS.index("left_upper_arm")], [[100, 40], [110, 80]])
 
 
 def test_annotations_name_images_and_frames_of_clips(tmp_path: Path) -> None:
@@ -158,7 +170,7 @@ def test_annotations_name_images_and_frames_of_clips(tmp_path: Path) -> None:
     images = {"one.png": [person], "clip.avi#1": [person], "clip.avi#3": [person, person], "clip.avi#4": []}
     path = tmp_path / "annotations.json"
     path.write_text(json.dumps({"joint_names": MODEL.joint_names, "images": images}))
-    seen = list(open_true_images(tmp_path, read_stick_truth(path)))
+    seen = list(open_true_images(tmp_path, read_stick_truth(path, tmp_path)))
     assert [len(people) for _, people in seen] == [1, 1, 2]
     assert [
         abs(int(frame.image[8, 8, 0]) - value) < 8 for (frame, _), value in zip(seen, (50, 50, 150), strict=True)
@@ -174,6 +186,6 @@ def test_broken_truth_is_one_sentence(tmp_path: Path, text: str) -> None:
     path = tmp_path / "truth.json"
     path.write_text(text)
     with pytest.raises(InputError):
-        read_stick_truth(path)
+        read_stick_truth(path, tmp_path)
     with pytest.raises(InputError):
-        read_stick_truth(tmp_path / "missing.json")
+        read_stick_truth(tmp_path / "missing.json", tmp_path)
