@@ -29,7 +29,6 @@ from flowing_puppet_ros.image.networks.poses import (
     drop_duplicates,
     pose_distance,
 )
-from flowing_puppet_ros.threads import one_opencv_thread
 
 SQUARE_SIDE_PX = 192  # of MoveNet's input for one person: larger ones are no better
 TRUNK_REACH, JOINT_REACH = 1.9, 1.2  # half side of a person's square: trunks, distances of the farthest joint
@@ -112,7 +111,6 @@ class KeypointNetworks:
         """Load the installed networks; InputError where they are not installed."""
         return cls(MoveNet.load(), BlazePose.load(), side, thorough)
 
-    @one_opencv_thread()
     def find(
         self, image: Image, known: Sequence[Keypoints] = (), everybody: bool = True, max_people: int = MAX_PEOPLE
     ) -> list[FoundPerson]:

@@ -19,6 +19,7 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64, Image
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.networks.agreement import calibrate
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.tracking.track import Track
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
@@ -104,7 +105,11 @@ class NetworkTracker:
         else:
             result = self._track(due, image, stamp_ns, flow)
         self._previous = image, self._clock.now_ns
-        return result
+        # The tracker weighs joints by their raw confidence; what is told is a probability.
+        told = [
+            replace(one, confidence=calibrate(one.confidence / one.visible) * one.visible) for one in result.puppets
+        ]
+        return replace(result, puppets=told)
 
     def _track_here(self, image: Image, stamp_ns: int, flow: FlowPair | None) -> TrackResult:
         """Track an image with what the run on itself finds."""
