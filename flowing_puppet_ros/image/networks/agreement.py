@@ -21,8 +21,8 @@ CALIBRATION = (
     (0.0, 0.05, 0.15, 0.35, 0.5, 0.65, 0.75, 0.85, 1.0),
     (0.0, 0.15, 0.58, 0.78, 0.83, 0.91, 0.95, 0.98, 0.99),
 )
-"""Confidence of an elbow or wrist, and the probability that it is within a quarter of the shoulder width: measured on 118
-clips of JHMDB, against the joints of MediaPipe's tracker there."""
+"""Confidence of an elbow or wrist, and the probability that it is within a quarter of the shoulder width: measured on
+118 clips of JHMDB, against the joints of MediaPipe's tracker there."""
 MAX_CROSSED = 0.7  # of the distance of two poses: if that with left and right exchanged is below, one is the wrong way
 
 MIN_WEIGHT = 1e-3
@@ -44,6 +44,11 @@ def combine(poses: Sequence[NetworkPose], trusts: Sequence[F64], size: float) ->
     pairs = [joints[i] - joints[k] for i in range(len(poses)) for k in range(i)]
     apart = np.mean([np.hypot(*pair.T) for pair in pairs], axis=0) / size
     return mean, np.interp(apart, DISTANCES, PROBABILITIES) * sure
+
+
+def calibrate(confidence: F64) -> F64:
+    """Return how probably joints are right by their confidence, which `combine` gives and a tracker has fused."""
+    return np.asarray(np.interp(confidence, *CALIBRATION), np.float64)
 
 
 def turn_sides(poses: Sequence[NetworkPose], known: F64 | None) -> list[NetworkPose]:
