@@ -27,7 +27,7 @@ from flowing_puppet_ros.image.formats.frame_names import FrameNames
 from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
 from flowing_puppet_ros.image.formats.tracks_json import DECIMALS, puppet_to_json, write_tracks
 from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, IMAGE_SUFFIXES, FrameSource, open_frames
-from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED, SOURCE_HELP, SOURCES, load_networks
+from flowing_puppet_ros.image.networks.choice import NETWORK_HELP, NOT_INSTALLED, SOURCE_HELP, SOURCES, load_networks
 from flowing_puppet_ros.image.pose.estimator import PoseEstimator
 from flowing_puppet_ros.image.pose.result import PosedPuppet
 from flowing_puppet_ros.image.pose.settings import PoseSettings
@@ -61,6 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "or MediaPipe keypoints",
     )
     parser.add_argument("--source", default="auto", choices=SOURCES, help=SOURCE_HELP)
+    parser.add_argument("--network", default="", metavar="FILE", help=NETWORK_HELP)
     parser.add_argument(
         "--model", default="neutral", choices=(*GENDERS, "auto"), help="body; auto: the likeliest [neutral]"
     )
@@ -85,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
     # The search models upper bodies without separate hands; hands are drawn at the ends of the lower arms.
     drawn = [MultiViewStructures.load(gender, arguments.parts) for gender in genders] if arguments.parts > 10 else []
     settings = PoseVerbSettings.from_arguments(arguments)
-    networks = load_networks(arguments.source, IMAGE_SIDE_PX, thorough=True) if init is None else None
+    networks = load_networks(arguments.source, IMAGE_SIDE_PX, True, arguments.network) if init is None else None
     if init is None and networks is None and arguments.source == "auto":
         print(f"flowing-puppet pose: {NOT_INSTALLED}", file=sys.stderr)
     own = init is None and networks is None

@@ -28,7 +28,7 @@ from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.tracks_json import puppet_to_json, write_tracks
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame, open_frames
-from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED, SOURCE_HELP, SOURCES, load_networks
+from flowing_puppet_ros.image.networks.choice import NETWORK_HELP, NOT_INSTALLED, SOURCE_HELP, SOURCES, load_networks
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.video.clip import (
     Clip,
@@ -47,6 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("input", help="video file, folder of images, or bag (.mcap, .db3 or a rosbag2 folder)")
     parser.add_argument("--out", required=True, help="tracks.json to write")
     parser.add_argument("--source", default="auto", choices=SOURCES, help=SOURCE_HELP)
+    parser.add_argument("--network", default="", metavar="FILE", help=NETWORK_HELP)
     parser.add_argument(
         "--init",
         help="people of one or more frames, for the detector: keypoints.json, or a file or folder of COCO, OpenPose, "
@@ -78,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     settings = ClipSettings.from_arguments(arguments)
     if arguments.overlay:
         check_overlay(Path(arguments.overlay))
-    networks = load_networks(arguments.source)
+    networks = load_networks(arguments.source, description=arguments.network)
     source = _open(arguments, _Warnings())
     if networks is None and not source.clip.has_keypoints and arguments.source == "auto":
         source.warnings(NOT_INSTALLED)

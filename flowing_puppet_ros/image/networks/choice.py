@@ -5,14 +5,17 @@ from __future__ import annotations
 
 import importlib.util
 from functools import cache
+from pathlib import Path
 
 from flowing_puppet_ros.image.networks.files import FILES, REMEDY, find_file
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointNetworks, KeypointSource
+from flowing_puppet_ros.image.networks.user_network import UserNetwork
 
 SOURCES = ("auto", "neural", "own")
 SOURCE_HELP = (
     "who finds people: neural, keypoint networks; own, the package's detector; auto, the networks if installed [auto]"
 )
+NETWORK_HELP = "description file (YAML) of a keypoint network of your own, ONNX or TFLite, in place of the package's"
 NOT_INSTALLED = (
     "keypoint networks are not installed, people are found by the package's own detector, which knows upper bodies"
     f" from the front only: {REMEDY}"
@@ -24,12 +27,23 @@ def are_installed() -> bool:
     return importlib.util.find_spec("ai_edge_litert") is not None and all(find_file(file) for file in FILES)
 
 
-def load_networks(source: str = "auto", side: int = 256, thorough: bool = False) -> KeypointSource | None:
+def load_networks(
+    source: str = "auto", side: int = 256, thorough: bool = False, description: str = ""
+) -> KeypointSource | None:
     """Load the networks that a source names; None where the own detector is to be used.
 
+    Args:
+        source: one of SOURCES.
+        side: longer side px to which the whole image is reduced.
+        thorough: see `KeypointNetworks`.
+        description: path of the description file of the user's own network, which then takes the place of ours.
+
     Raises:
-        InputError: when the source is `neural` and they are not installed.
+        InputError: when the source is `neural` and they are not installed, or the user's network cannot be used.
     """
+    if description and source != "own":
+        finder = _load(side, thorough) if are_installed() else None
+        return UserNetwork.load(Path(description), finder)
     if source == "own" or (source == "auto" and not are_installed()):
         return None
     return _load(side, thorough)

@@ -18,8 +18,7 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64, Image
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.networks.agreement import combine, turn_sides
-from flowing_puppet_ros.image.networks.blazepose import EXTRA, BlazePose, Landmarks
-from flowing_puppet_ros.image.networks.movenet import MoveNet
+from flowing_puppet_ros.image.networks.pose_networks import EXTRA, BlazePose, Landmarks, MoveNet
 from flowing_puppet_ros.image.networks.poses import (
     COCO,
     HIPS,

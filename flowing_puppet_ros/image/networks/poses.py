@@ -112,6 +112,22 @@ def cut_square(image: Image, center: F64, half: float, side: int, angle: float =
     return np.asarray(square), Warp(matrix)
 
 
+def fit_to_rectangle(image: Image, size: tuple[int, int]) -> tuple[Image, Warp]:
+    """Return an image (H, W, 3) reduced into a rectangle of `size` (width, height), with black bars beside it."""
+    height, width = image.shape[:2]
+    return cut_rectangle(image, np.array([(width - 1) / 2, (height - 1) / 2]), np.array([width, height]), size)
+
+
+def cut_rectangle(image: Image, center: F64, box: F64, size: tuple[int, int]) -> tuple[Image, Warp]:
+    """Return a `box` (width, height) px of an image about `center` (2,), widened to the shape of `size`."""
+    step = float(max(box[0] / size[0], box[1] / size[1], 1e-3))
+    side = max(size)
+    square, warp = cut_square(image, center, step * side / 2, side)
+    left, top = (side - size[0]) // 2, (side - size[1]) // 2
+    moved = Warp(np.column_stack([warp.matrix[:, :2], warp.to_image(np.array([left, top], float))]))
+    return np.ascontiguousarray(square[top : top + size[1], left : left + size[0]]), moved
+
+
 def pose_distance(one: NetworkPose, other: NetworkPose) -> float:
     """Return the median distance of the joints known to both poses, in units of the larger shoulder width."""
     away = np.hypot(*(one.joints - other.joints).T)

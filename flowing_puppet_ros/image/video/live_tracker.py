@@ -63,7 +63,7 @@ def make_live_tracker(
     Raises:
         InputError: when the source is `neural` and the networks are not installed.
     """
-    networks = None if settings.source == "none" else load_networks(settings.source)
+    networks = None if settings.source == "none" else load_networks(settings.source, description=settings.network)
     if networks is not None:
         return NetworkTracker(tracker, settings, networks, counters)
     return LiveTracker(tracker, settings, counters)

@@ -43,6 +43,11 @@ class LiveDetectionSettings(Settings):
         " detections topic alone",
         choices=("auto", "neural", "own", "none"),
     )
+    network: str = setting(
+        "",
+        "description file (YAML) of a keypoint network of your own, ONNX or TFLite, in place of the package's",
+        advanced=True,
+    )
     networks: NetworkTimingSettings = nested(NetworkTimingSettings)
     min_probability: float = setting(0.3, "minimum probability of a detected person to be tracked", low=0.0, high=1.0)
     full_frame_interval: float = setting(

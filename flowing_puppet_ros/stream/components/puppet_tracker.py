@@ -115,7 +115,8 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         """Go on tracking the same people with other settings."""
         if settings.flow.preset != self.settings.flow.preset:
             self._tracker.optical_flow = OpticalFlow(settings.flow)
-        if settings.detection.source != self.settings.detection.source:
+        before = self.settings.detection
+        if (settings.detection.source, settings.detection.network) != (before.source, before.network):
             self._live = make_live_tracker(self._tracker, settings.detection, self.counters)
         self.settings, self._tracker.settings = settings, settings.tracker
         self._live.reconfigure(settings.detection)

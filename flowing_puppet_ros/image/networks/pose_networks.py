@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""BlazePose: 33 landmarks of one person, in a square turned along the trunk."""
+"""MoveNet MultiPose and BlazePose: how their inputs are made and their outputs read.
+
+MoveNet finds up to six people in an image, or the people in a square of it; BlazePose the 33 landmarks of one person, in a
+square turned along the trunk.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Image
-from flowing_puppet_ros.image.networks.files import BLAZEPOSE, read_file
-from flowing_puppet_ros.image.networks.poses import HIPS, SHOULDERS, NetworkPose, cut_square
+from flowing_puppet_ros.image.networks.decoders import decode_movenet
+from flowing_puppet_ros.image.networks.files import BLAZEPOSE, MOVENET, read_file
+from flowing_puppet_ros.image.networks.poses import (
+    COCO,
+    HIPS,
+    SHOULDERS,
+    NetworkPose,
+    Warp,
+    cut_square,
+    fit_to_canvas,
+)
 from flowing_puppet_ros.image.networks.runtime import LiteRtNetwork, Network
 
 SIDE_PX = 256
@@ -22,6 +35,30 @@ EXTRA = {"left_hand": 19, "right_hand": 20, "left_heel": 29, "right_heel": 30, "
 MARGIN = 1.5  # of the square around the person
 TRUNK_REACH, JOINT_REACH = 1.2, 1.1  # of the square's half side: trunks, and distances of the farthest joint
 MIN_REACH_SCORE = 0.2  # of a joint that the square has to contain
+
+
+class MoveNet:
+    """The network, and how its input and output are read."""
+
+    def __init__(self, network: Network) -> None:
+        self._network = network
+
+    @classmethod
+    def load(cls) -> MoveNet:
+        """Load the installed weights; InputError where there are none."""
+        return cls(LiteRtNetwork(read_file(MOVENET)))
+
+    def detect(self, image: Image, side: int) -> list[NetworkPose]:
+        """Return the people in an image (H, W, 3) RGB, seen with its longer side reduced to `side` px."""
+        return self._run(*fit_to_canvas(image, side))
+
+    def detect_in_square(self, image: Image, center: F64, half: float, side: int) -> list[NetworkPose]:
+        """Return the people in a square of an image, see `cut_square`."""
+        return self._run(*cut_square(image, center, half, side))
+
+    def _run(self, canvas: Image, warp: Warp) -> list[NetworkPose]:
+        people = decode_movenet(self._network.run(canvas[None]), (canvas.shape[1], canvas.shape[0]), len(COCO))
+        return [NetworkPose(warp.to_image(joints), scores, score) for joints, scores, score in people]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
