@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
@@ -24,13 +24,14 @@ from rclpy.timer import Timer
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.diagnostics import Diagnostics
-from flowing_puppet_ros.node.factory import is_installed, message_type
+from flowing_puppet_ros.node.factory import choose_type, is_installed, message_type
 from flowing_puppet_ros.node.image_transport import AUTO, CHECK_INTERVAL_S, COMPRESSED, TransportChoice
 from flowing_puppet_ros.node.worker import Worker
 from flowing_puppet_ros.stream.component import Component, Output, Port
+from flowing_puppet_ros.stream.messages.detections import BodySkeleton, skeleton_topic
 from flowing_puppet_ros.stream.messages.geometry import header_ns
 from flowing_puppet_ros.stream.messages.images import compress_image
-from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, SKELETON_2D
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 from flowing_puppet_ros.units import NANOSECONDS
 
@@ -38,6 +39,8 @@ LOG_INTERVAL_S = 5.0
 """Minimum seconds between two log lines about failed messages."""
 MAX_STAMP_LEAD_NS = NANOSECONDS
 """Maximum nanoseconds that a stamp may be ahead of the node's clock; a later one is from another clock."""
+MAX_BODIES = 100
+"""Maximum bodies in a list whose skeletons are subscribed to."""
 _SUBSCRIPTION_QOS = {
     "sensor": qos_profile_sensor_data,
     "reliable": QoSProfile(depth=10),
@@ -73,9 +76,13 @@ class Session[C: Component[Any]]:
         self._warned: set[str] = set()
         self._subscriptions: dict[str, Subscription] = {}
         self._transports: dict[str, TransportChoice] = {}
+        self._types = {port.name: port.type for port in component.inputs}
+        self._unusable: set[str] = set()
+        self._bodies: dict[str, Subscription] = {}
         self._watch: Timer | None = None
         self._topics = {port.name: _resolve_topic(node, port.name) for port in component.inputs}
         self._optional = {port.name: self._topics[port.name] for port in component.inputs if port.optional}
+        self._check_no_loop()
         self._lazy = [port for port in component.outputs if port.lazy]
         self._outputs: dict[str, list[tuple[Publisher, Callable[[Any], Any]]]] = {}
         self._unavailable = [port for port in component.outputs if port.optional and not is_installed(port.type)]
@@ -111,6 +118,7 @@ class Session[C: Component[Any]]:
             self._watch = None
         for name in list(self._subscriptions):
             self._node.destroy_subscription(self._subscriptions.pop(name))
+        self._close_bodies()
         self.reset()
 
     def close(self) -> None:
@@ -156,8 +164,10 @@ class Session[C: Component[Any]]:
         return [topic for name, topic in self._topics.items() if name not in self._optional]
 
     def _follow_others(self) -> None:
-        """Subscribe to the transport of each image that is published now, and say what somebody asks for in vain."""
+        """Subscribe to the transport and type of each input that is published now; say what is asked for in vain."""
         for port in self.component.inputs:
+            if port.alternatives:
+                self._follow_type(port)
             if port.transport:
                 choice = self._transports[port.name]
                 choice.setting, before = self.image_transport, choice.chosen
@@ -173,6 +183,51 @@ class Session[C: Component[Any]]:
                     + package.replace("_", "-")
                 )
 
+    def _check_no_loop(self) -> None:
+        """Raise an InputError if an input for others' results is an output of this node."""
+        outputs = {_resolve_topic(self._node, port.name) for port in self.component.outputs if not port.per_person}
+        for port in self.component.inputs:
+            if port.alternatives and self._topics[port.name] in outputs:
+                topic = self._topics[port.name]
+                raise InputError(f"{port.name} is {topic}, which this node itself publishes: name another topic there")
+
+    def _follow_type(self, port: Port) -> None:
+        """Subscribe to an input as the type that is published there."""
+        topic, present = self._topics[port.name], self._types[port.name]
+        published = {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)}
+        try:
+            chosen = choose_type(published, port, present)
+        except InputError as error:
+            self._unusable.add(port.name)
+            self._warn_once(f"{topic}: {error}")
+            return
+        self._unusable.discard(port.name)
+        if chosen != present:
+            # First, since the middleware knows one type for a topic in a node.
+            self._node.destroy_subscription(self._subscriptions.pop(port.name))
+            self._close_bodies()
+            self._types[port.name] = chosen
+            self._subscribe(port)
+
+    def _follow_bodies(self, port: Port, ids: Sequence[str]) -> None:
+        """Subscribe to the skeletons of the bodies in a list, and no longer to those that nobody publishes."""
+        wanted = {skeleton_topic(self._topics[port.name], identity): identity for identity in ids}
+        for topic in self._bodies.keys() - wanted.keys():
+            if not self._node.count_publishers(topic):
+                self._node.destroy_subscription(self._bodies.pop(topic))
+        for topic in sorted(wanted.keys() - self._bodies.keys())[: MAX_BODIES - len(self._bodies)]:
+            receive = partial(self._on_skeleton, port.name, topic, wanted[topic])
+            try:
+                self._bodies[topic] = self._node.create_subscription(
+                    message_type(SKELETON_2D), topic, receive, copy(_SUBSCRIPTION_QOS[port.qos])
+                )
+            except (RuntimeError, ValueError, NameValidationException):
+                self._warn_once(f"{self._topics[port.name]}: a topic cannot be named after the id {wanted[topic]!r}")
+
+    def _close_bodies(self) -> None:
+        while self._bodies:
+            self._node.destroy_subscription(self._bodies.popitem()[1])
+
     def _subscribe(self, port: Port) -> None:
         """Open an input, for an image that with the transport that is chosen for it."""
         choice = self._transports.get(port.name)
@@ -180,14 +235,14 @@ class Session[C: Component[Any]]:
         topic = self._compressed_topic(port) if compressed else port.name
         name = self._topics[port.name] = self._node.resolve_topic_name(topic)
         self._subscriptions[port.name] = self._node.create_subscription(
-            message_type(COMPRESSED_IMAGE if compressed else port.type),
+            message_type(COMPRESSED_IMAGE if compressed else self._types[port.name]),
             topic,
-            partial(self._on_message, port.name, name),
+            partial(self._on_message, port, name),
             copy(_SUBSCRIPTION_QOS[port.qos]),  # an override changes the profile itself
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=partial(self._on_incompatible_qos, name, "subscription"),
-                incompatible_type=partial(self._on_incompatible_type, name),
+                incompatible_type=partial(self._on_incompatible_type, port, name),
                 message_lost=partial(self._on_message_lost, port.name, name),
             ),
         )
@@ -222,8 +277,9 @@ class Session[C: Component[Any]]:
         cure = f"set qos_overrides.{topic}.{side}.{policy} of this node, or the {policy} of the other, to fit"
         self._warn(f"{topic}: a {other} another {policy}, so they do not connect; {cure}")
 
-    def _on_incompatible_type(self, topic: str, _: Any) -> None:
-        self._warn(f"{topic}: another node uses another message type; remap its topic or this node's")
+    def _on_incompatible_type(self, port: Port, topic: str, _: Any) -> None:
+        if not port.alternatives:  # otherwise `_follow_type` sees to it
+            self._warn(f"{topic}: another node uses another message type; remap its topic or this node's")
 
     def _on_message_lost(self, port: str, topic: str, event: Any) -> None:
         """Count the messages that the middleware lost; warn once, with the remedy."""
@@ -242,16 +298,22 @@ class Session[C: Component[Any]]:
             self._warned.add(sentence)
             self._warn(sentence)
 
-    def _on_message(self, port: str, topic: str, message: Any) -> None:
-        self._diagnostics.count_received(port)
-        self.worker.put(port, partial(self._handle, port, topic, message))
+    def _on_message(self, port: Port, topic: str, message: Any) -> None:
+        self._diagnostics.count_received(port.name)
+        if port.alternatives and hasattr(message, "ids"):
+            self._follow_bodies(port, message.ids)
+        self.worker.put(port.name, partial(self._handle, port.name, topic, message))
+
+    def _on_skeleton(self, port: str, topic: str, identity: str, message: Any) -> None:
+        self.worker.put(port, partial(self._handle, port, topic, BodySkeleton(identity, message)), identity)
 
     def _handle(self, port: str, topic: str, message: Any) -> None:
         """Pass one message to the component and publish the results (on the worker thread)."""
         if not self.active:
             return
         for name, optional in self._optional.items():
-            self.component.set_expected(name, self._node.count_publishers(optional) > 0)
+            usable = name not in self._unusable
+            self.component.set_expected(name, usable and self._node.count_publishers(optional) > 0)
         for lazy in self._lazy:
             subscribed = any(publisher.get_subscription_count() for publisher, _ in self._outputs.get(lazy.name, []))
             self.component.set_subscribed(lazy.name, subscribed)
