@@ -103,7 +103,10 @@ class Session[C: Component[Any]]:
         for port in self.component.inputs:
             if port.transport:
                 self._transports[port.name] = TransportChoice(self.image_transport)
-            self._subscribe(port)
+            if port.alternatives:
+                self._follow_type(port)
+            else:
+                self._subscribe(port)
         # On the clock of the machine, since simulated time may stand still.
         self._watch = self._node.create_timer(
             CHECK_INTERVAL_S, self._follow_others, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -197,17 +200,21 @@ class Session[C: Component[Any]]:
         published = {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)}
         try:
             chosen = choose_type(published, port, present)
+            self._unusable.discard(port.name)
         except InputError as error:
+            chosen = present
             self._unusable.add(port.name)
             self._warn_once(f"{topic}: {error}")
+        if chosen == present and port.name in self._subscriptions:
             return
-        self._unusable.discard(port.name)
-        if chosen != present:
-            # First, since the middleware knows one type for a topic in a node.
+        if port.name in self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.pop(port.name))
             self._close_bodies()
-            self._types[port.name] = chosen
+        self._types[port.name] = chosen
+        try:
             self._subscribe(port)
+        except RuntimeError as error:  # the middleware knows one type for a topic in a process; tried again soon
+            self._warn_once(f"{topic} cannot be subscribed to as {chosen}: {' '.join(str(error).split())}")
 
     def _follow_bodies(self, port: Port, ids: Sequence[str]) -> None:
         """Subscribe to the skeletons of the bodies in a list, and no longer to those that nobody publishes."""
