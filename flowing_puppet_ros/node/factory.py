@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import array
-from collections.abc import Collection
 from functools import cache
 from importlib import import_module
 from typing import Any
@@ -12,8 +11,6 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import Array
-from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.component import Port
 
 # Element type of a sequence field -> type code of the array.array that rclpy keeps it in.
 _TYPE_CODES = {
@@ -36,28 +33,6 @@ def message_type(type_name: str) -> Any:
     """Return the class of `package/msg/Name`."""
     package, kind, name = type_name.split("/")
     return getattr(import_module(f"{package}.{kind}"), name)
-
-
-def choose_type(published: Collection[str], port: Port, present: str) -> str:
-    """Return the type to subscribe to on an input that understands several, given those `published` on its topic.
-
-    It stays the `present` one while somebody publishes that, or nobody publishes anything. InputError if none of the
-    published types is understood, or installed here.
-    """
-    if present in published or not published:
-        return present
-    understood = [kind for kind in sorted(published) if port.accepts(kind)]
-    if not understood:
-        known = ", ".join((port.type, *port.alternatives))
-        raise InputError(
-            f"{', '.join(sorted(published))} is published, which is not understood; understood are {known}"
-        )
-    if not is_installed(understood[0]):
-        package = understood[0].partition("/")[0]
-        raise InputError(
-            f"{understood[0]} is published, but {package} is not installed: source a workspace that has it"
-        )
-    return understood[0]
 
 
 def is_installed(type_name: str) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
 from dataclasses import replace
@@ -24,14 +24,22 @@ from rclpy.timer import Timer
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.diagnostics import Diagnostics
-from flowing_puppet_ros.node.factory import choose_type, is_installed, message_type
-from flowing_puppet_ros.node.image_transport import AUTO, CHECK_INTERVAL_S, COMPRESSED, TransportChoice
+from flowing_puppet_ros.node.factory import is_installed, message_type
+from flowing_puppet_ros.node.inputs import (
+    AUTO,
+    CHECK_INTERVAL_S,
+    COMPRESSED,
+    BodyTopics,
+    TransportChoice,
+    check_no_loop,
+    choose_type,
+)
 from flowing_puppet_ros.node.worker import Worker
 from flowing_puppet_ros.stream.component import Component, Output, Port
-from flowing_puppet_ros.stream.messages.detections import BodySkeleton, skeleton_topic
+from flowing_puppet_ros.stream.messages.detections import BodySkeleton
 from flowing_puppet_ros.stream.messages.geometry import header_ns
 from flowing_puppet_ros.stream.messages.images import compress_image
-from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, SKELETON_2D
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 from flowing_puppet_ros.units import NANOSECONDS
 
@@ -39,8 +47,6 @@ LOG_INTERVAL_S = 5.0
 """Minimum seconds between two log lines about failed messages."""
 MAX_STAMP_LEAD_NS = NANOSECONDS
 """Maximum nanoseconds that a stamp may be ahead of the node's clock; a later one is from another clock."""
-MAX_BODIES = 100
-"""Maximum bodies in a list whose skeletons are subscribed to."""
 _SUBSCRIPTION_QOS = {
     "sensor": qos_profile_sensor_data,
     "reliable": QoSProfile(depth=10),
@@ -78,11 +84,18 @@ class Session[C: Component[Any]]:
         self._transports: dict[str, TransportChoice] = {}
         self._types = {port.name: port.type for port in component.inputs}
         self._unusable: set[str] = set()
-        self._bodies: dict[str, Subscription] = {}
         self._watch: Timer | None = None
         self._topics = {port.name: _resolve_topic(node, port.name) for port in component.inputs}
         self._optional = {port.name: self._topics[port.name] for port in component.inputs if port.optional}
-        self._check_no_loop()
+        outputs = {_resolve_topic(node, port.name) for port in component.outputs if not port.per_person}
+        check_no_loop(self._topics, component.inputs, outputs)
+        self._bodies = {
+            port.name: BodyTopics(
+                node, _SUBSCRIPTION_QOS[port.qos], partial(self._on_skeleton, port.name), self._warn_once
+            )
+            for port in component.inputs
+            if port.alternatives
+        }
         self._lazy = [port for port in component.outputs if port.lazy]
         self._outputs: dict[str, list[tuple[Publisher, Callable[[Any], Any]]]] = {}
         self._unavailable = [port for port in component.outputs if port.optional and not is_installed(port.type)]
@@ -121,7 +134,8 @@ class Session[C: Component[Any]]:
             self._watch = None
         for name in list(self._subscriptions):
             self._node.destroy_subscription(self._subscriptions.pop(name))
-        self._close_bodies()
+        for bodies in self._bodies.values():
+            bodies.close()
         self.reset()
 
     def close(self) -> None:
@@ -170,7 +184,10 @@ class Session[C: Component[Any]]:
         """Subscribe to the transport and type of each input that is published now; say what is asked for in vain."""
         for port in self.component.inputs:
             if port.alternatives:
-                self._follow_type(port)
+                try:
+                    self._follow_type(port)
+                except RuntimeError as error:  # a middleware may allow one type for a topic in a process; tried again
+                    self._warn_once(f"{self._topics[port.name]}: {' '.join(str(error).split())}")
             if port.transport:
                 choice = self._transports[port.name]
                 choice.setting, before = self.image_transport, choice.chosen
@@ -185,14 +202,6 @@ class Session[C: Component[Any]]:
                     f"{topic} is not published, since {package} is not installed: install ros-jazzy-"
                     + package.replace("_", "-")
                 )
-
-    def _check_no_loop(self) -> None:
-        """Raise an InputError if an input for others' results is an output of this node."""
-        outputs = {_resolve_topic(self._node, port.name) for port in self.component.outputs if not port.per_person}
-        for port in self.component.inputs:
-            if port.alternatives and self._topics[port.name] in outputs:
-                topic = self._topics[port.name]
-                raise InputError(f"{port.name} is {topic}, which this node itself publishes: name another topic there")
 
     def _follow_type(self, port: Port) -> None:
         """Subscribe to an input as the type that is published there."""
@@ -209,31 +218,9 @@ class Session[C: Component[Any]]:
             return
         if port.name in self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.pop(port.name))
-            self._close_bodies()
+            self._bodies[port.name].close()
         self._types[port.name] = chosen
-        try:
-            self._subscribe(port)
-        except RuntimeError as error:  # the middleware knows one type for a topic in a process; tried again soon
-            self._warn_once(f"{topic} cannot be subscribed to as {chosen}: {' '.join(str(error).split())}")
-
-    def _follow_bodies(self, port: Port, ids: Sequence[str]) -> None:
-        """Subscribe to the skeletons of the bodies in a list, and no longer to those that nobody publishes."""
-        wanted = {skeleton_topic(self._topics[port.name], identity): identity for identity in ids}
-        for topic in self._bodies.keys() - wanted.keys():
-            if not self._node.count_publishers(topic):
-                self._node.destroy_subscription(self._bodies.pop(topic))
-        for topic in sorted(wanted.keys() - self._bodies.keys())[: MAX_BODIES - len(self._bodies)]:
-            receive = partial(self._on_skeleton, port.name, topic, wanted[topic])
-            try:
-                self._bodies[topic] = self._node.create_subscription(
-                    message_type(SKELETON_2D), topic, receive, copy(_SUBSCRIPTION_QOS[port.qos])
-                )
-            except (RuntimeError, ValueError, NameValidationException):
-                self._warn_once(f"{self._topics[port.name]}: a topic cannot be named after the id {wanted[topic]!r}")
-
-    def _close_bodies(self) -> None:
-        while self._bodies:
-            self._node.destroy_subscription(self._bodies.popitem()[1])
+        self._subscribe(port)
 
     def _subscribe(self, port: Port) -> None:
         """Open an input, for an image that with the transport that is chosen for it."""
@@ -308,11 +295,11 @@ class Session[C: Component[Any]]:
     def _on_message(self, port: Port, topic: str, message: Any) -> None:
         self._diagnostics.count_received(port.name)
         if port.alternatives and hasattr(message, "ids"):
-            self._follow_bodies(port, message.ids)
+            self._bodies[port.name].follow(topic, message.ids)
         self.worker.put(port.name, partial(self._handle, port.name, topic, message))
 
-    def _on_skeleton(self, port: str, topic: str, identity: str, message: Any) -> None:
-        self.worker.put(port, partial(self._handle, port, topic, BodySkeleton(identity, message)), identity)
+    def _on_skeleton(self, port: str, topic: str, skeleton: BodySkeleton) -> None:
+        self.worker.put(port, partial(self._handle, port, topic, skeleton), skeleton.id)
 
     def _handle(self, port: str, topic: str, message: Any) -> None:
         """Pass one message to the component and publish the results (on the worker thread)."""

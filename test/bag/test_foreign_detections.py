@@ -15,6 +15,8 @@ from flowing_puppet_ros.bag.reader import Record, open_bag
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
+from flowing_puppet_ros.stream.messages.detections import BodySkeleton
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, PUPPETS
 from test.helpers.foreign_detections import (
@@ -185,3 +187,37 @@ def test_a_file_without_an_index_has_its_definitions_too(tmp_path: Path) -> None
     with open_bag(path, salvage=True) as bag:
         (record,) = bag.messages()
         assert record.message.detections[0].left == 3.0
+
+
+def test_an_image_waits_for_the_skeletons_of_all_listed_bodies_but_not_for_ever() -> None:
+    component = PuppetTrackerComponent(PuppetTrackerSettings.from_mapping({"parts": 10}), FACTORY)
+    component.set_expected("detections", True)
+    images = [record.message for record in recorded(IMAGE_TOPIC)]
+    first, second, *_ = (stamp_ns(image) for image in images)
+    bodies = {stamp: BodySkeleton("ada", make_skeleton(stamp, joints, SIZE)) for stamp, joints in given().items()}
+
+    def released(port: str, message: Any) -> list[tuple[int, int]]:
+        found = component.handle(port, message)
+        return [(stamp_ns(made), len(made.puppets)) for name, made in found if name == "puppets"]
+
+    assert released("image", images[0]) == []
+    assert released("detections", bodies[first]) == []
+    assert released("detections", make_ids(first, ["ada", "zoe"])) == []
+    elsewhere = {name: (x + 60, y, c) for name, (x, y, c) in given()[first].items()}
+    assert released("detections", BodySkeleton("zoe", make_skeleton(first, elsewhere, SIZE))) == [(first, 2)]
+    assert released("image", images[1]) == []
+    assert released("detections", bodies[second]) == []
+    assert released("image", images[2]) == [(second, 2)]
+    assert (component._tracker.tracks[0].unseen, component._tracker.tracks[1].unseen) == (0, 1)
+    assert released("detections", BodySkeleton("zoe", make_skeleton(second, elsewhere, SIZE))) == []
+    assert component.counters["late detections"] == 1
+
+
+def test_detections_that_are_none_cost_no_image() -> None:
+    component = PuppetTrackerComponent(PuppetTrackerSettings.from_mapping({"parts": 10}), FACTORY)
+    component.set_expected("detections", True)
+    (image, *_), boxes = (record.message for record in recorded(IMAGE_TOPIC)), [FACTORY.make("other_msgs/msg/Box")]
+    component.handle("detections", FACTORY.make(BOXES, header=image.header, detections=boxes))
+    ((port, message),) = component.handle("image", image)
+    assert (port, message.puppets, component.counters["unusable"]) == ("puppets", [], 1)
+    assert "other_msgs/msg/Box describes no person by keypoints" in component.report.drain_warnings()[0]

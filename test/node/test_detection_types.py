@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import rclpy
+from flowing_puppet_msgs.msg import PuppetArray
 from geometry_msgs.msg import Point
 from hri_msgs.msg import IdsList, Skeleton2D
 from rclpy.executors import SingleThreadedExecutor
@@ -24,7 +25,8 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.component_node import ComponentNode
 from flowing_puppet_ros.node.diagnostics import Diagnostics
-from flowing_puppet_ros.node.factory import RosMessageFactory, choose_type
+from flowing_puppet_ros.node.factory import RosMessageFactory
+from flowing_puppet_ros.node.inputs import choose_type
 from flowing_puppet_ros.node.session import Session
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.component import Component, Output, Port
@@ -225,9 +227,11 @@ def test_the_tracker_takes_the_bodies_of_ros4hri(bench: Bench) -> None:
     arguments += ["-p", "detection.source:=none"]
     node = bench.add(ComponentNode("puppet_tracker", cli_args=arguments, use_global_arguments=False))
     found: dict[int, Any] = {}
-    bench.peer.create_subscription(
-        type(next(iter(expected.values()))), "puppets", lambda message: found.update({stamp_ns(message): message}), 10
-    )
+
+    def keep(message: PuppetArray) -> None:
+        found[stamp_ns(message)] = message
+
+    bench.peer.create_subscription(PuppetArray, "puppets", keep, 10)
     listing = bench.peer.create_publisher(IdsList, "/humans/bodies/tracked", 10)
     skeleton = bench.peer.create_publisher(Skeleton2D, "/humans/bodies/ada/skeleton2d", 10)
     image = bench.peer.create_publisher(CompressedImage, "image/compressed", 10)
