@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -248,7 +249,7 @@ def test_the_tracker_takes_the_bodies_of_ros4hri(bench: Bench) -> None:
         image.publish(deserialize_message(record.raw, CompressedImage))
         skeleton.publish(make_skeleton(stamp, joints, SIZE, FACTORY))
         listing.publish(make_ids(stamp, ["ada"], FACTORY))
-        bench.spin_until(lambda stamp=stamp: stamp in found, "puppets")
+        bench.spin_until(partial(found.__contains__, stamp), "puppets")
     for stamp, message in expected.items():
         (puppet,), (other,) = found[stamp].puppets, message.puppets
         assert puppet.id == other.id
