@@ -15,7 +15,7 @@ from flowing_puppet_ros.image.tracking.track import Track
 type Detection = tuple[F64, F64]  # joints (J, 2) px with NaN unknown, confidence (J,)
 
 APPEARANCE_WEIGHT_M = 0.6  # distance of joints that costs as much as the maximum appearance distance
-SAME_ID_BONUS_M = 0.1  # distance of joints that an id of the detector, the same as last time, makes up for
+SAME_ID_BONUS_M = 0.05  # distance of joints that an id of the detector, the same as last time, makes up for
 MAX_SAME_DISTANCE = 0.45  # appearance distance up to which a lost person is recognised ...
 MIN_OTHER_MARGIN = 0.15  # ... if all others differ by so much more
 REIDENTIFY_FACTOR = 3.0  # search radius for a person after an occlusion, in match distances

@@ -49,12 +49,12 @@ def test_ids_decide_between_people_at_the_same_distance() -> None:
 
 
 def test_one_id_is_enough() -> None:
-    assert match((0.0, 0.1), (0.03, 0.07), ["2", "9"]) == {0: 1, 1: 0}
-    assert match((0.0, 0.1), (0.03, 0.07), ["9", "8"]) == {0: 0, 1: 1}, "unknown ids say nothing"
+    assert match((0.0, 0.1), (0.04, 0.06), ["2", "9"]) == {0: 1, 1: 0}
+    assert match((0.0, 0.1), (0.04, 0.06), ["9", "8"]) == {0: 0, 1: 1}, "unknown ids say nothing"
 
 
 def test_ids_that_jump_do_not_override_geometry() -> None:
-    for apart in (0.25, 0.4, 0.8):
+    for apart in (0.12, 0.25, 0.8):
         assert match((0.0, apart), (0.01, apart - 0.01), ["2", "1"]) == {0: 0, 1: 1}, apart
 
 
