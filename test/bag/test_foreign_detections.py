@@ -172,6 +172,22 @@ def test_a_type_without_a_usable_definition_is_named(text: str, sentence: str) -
     assert sentence in str(caught.value)
 
 
+@pytest.mark.parametrize("place", ["type", "part", "field"])
+def test_a_definition_runs_no_code(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The library makes Python code of the names; its grammar must let no other code through."""
+    monkeypatch.chdir(tmp_path)
+    code = 'A(open("trace","w"))'
+    kind = f"new_msgs/msg/{code if place == 'type' else 'A'}"
+    text = {
+        "type": "uint8 a",
+        "part": f"new_msgs/B b\n{'=' * 80}\nMSG: new_msgs/{code}\nuint8 a",
+        "field": f"uint8 {code}",
+    }[place]
+    with pytest.raises(InputError, match="cannot be understood"):
+        Record("/a", kind, 0, b"\0\1\0\0\7", text).message  # noqa: B018
+    assert not list(tmp_path.iterdir())
+
+
 def test_two_bags_may_define_one_type_differently() -> None:
     for text, data, value in (("uint8 x", b"\0\1\0\0\7", 7), ("float32 x", b"\0\1\0\0\0\0\0?", 0.5)):
         assert Record("/a", "new_msgs/msg/A", 0, data, text).message.x == value
