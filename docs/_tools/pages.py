@@ -101,10 +101,12 @@ def port_row(port: Port, humans: bool = False, output: bool = False) -> list[str
         notes.append(f"{'also' if output else 'or'} `{port.name}/{port.transport}`")
     if port.alternatives:
         notes.append("or " + ", ".join(f"`{other.replace('/msg/', '/')}`" for other in port.alternatives))
-    if port.optional:
-        notes.append(f"where `{package}` is installed, and in bags" if output else "optional")
+    if port.optional and not output:
+        notes.append("optional")
     if port.lazy:
         notes.append("made only while subscribed to")
+    if port.optional and output:
+        notes.append(f"where `{package}` is installed, and in bags")
     if humans:
         notes.append("with `ros4hri.publish:=true`")
     if port.per_person:
