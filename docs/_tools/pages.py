@@ -99,6 +99,8 @@ def port_row(port: Port, humans: bool = False, output: bool = False) -> list[str
     notes = []
     if port.transport:
         notes.append(f"{'also' if output else 'or'} `{port.name}/{port.transport}`")
+    if port.alternatives:
+        notes.append("or " + ", ".join(f"`{other.replace('/msg/', '/')}`" for other in port.alternatives))
     if port.optional and not output:
         notes.append("optional")
     if port.lazy:

@@ -71,6 +71,7 @@ class McapFile:
     Attributes:
         channels: by id; only those whose messages are CDR of a named type.
         types: message type of each channel, by id.
+        definitions: text of the type's definition, by id of the channel; only those in the form of `.msg` files.
         counts: number of messages of each channel, by id.
         damaged: chunks and records that could not be read.
         skipped_bytes: bytes that were skipped because of damage.
@@ -93,7 +94,13 @@ class McapFile:
             self._scan(stream)
         usable = {number for number, channel in self.channels.items() if self._is_usable(channel)}
         self.channels = {number: self.channels[number] for number in sorted(usable)}
-        self.types = {number: self._schemas[channel.schema_id].name for number, channel in self.channels.items()}
+        schemas = {number: self._schemas[channel.schema_id] for number, channel in self.channels.items()}
+        self.types = {number: schema.name for number, schema in schemas.items()}
+        self.definitions = {
+            number: schema.data.decode("utf8", "replace")
+            for number, schema in schemas.items()
+            if schema.encoding == "ros2msg"
+        }
 
     def messages(self, numbers: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
         """Yield (channel id, log time, bytes) of the messages of some channels in the order of log times."""

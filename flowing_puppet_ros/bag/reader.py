@@ -12,31 +12,33 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 from mcap.reader import make_reader
-from rosbags.interfaces import Qos
+from rosbags.interfaces import MessageDefinitionFormat, Qos
 from rosbags.rosbag2 import Reader
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from flowing_puppet_ros.bag.mcap_file import McapFile, is_mcap, is_truncated
-from flowing_puppet_ros.bag.typestore import typestore
+from flowing_puppet_ros.bag.typestore import typestore_with
 from flowing_puppet_ros.errors import InputError
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """One recorded message: its topic, type, time of recording (nanoseconds) and CDR bytes."""
+    """One recorded message: topic, type, time of recording (ns), CDR bytes, and the type's definition in the bag."""
 
     topic: str
     type: str
     log_time: int
     raw: bytes
+    definition: str = ""
 
     @property
     def message(self) -> Any:
         """The message object; InputError if the type is unknown or the bytes are not a message of it."""
-        store = typestore()
-        if self.type not in store.fielddefs:
-            raise InputError(f"the messages on {self.topic} have the type {self.type}, which is not known here")
+        try:
+            store = typestore_with(self.type, self.definition)
+        except InputError as error:
+            raise InputError(f"the messages on {self.topic} cannot be read: {error}") from error
         try:
             return store.deserialize_cdr(self.raw, self.type)
         except Exception as error:  # wrong bytes make the library raise anything
@@ -98,7 +100,8 @@ class _IndexedPart:
             return
         try:
             for connection, log_time, raw in self._reader.messages(connections):
-                yield Record(connection.topic, connection.msgtype, log_time, bytes(raw))
+                text = connection.msgdef.data if connection.msgdef.format == MessageDefinitionFormat.MSG else ""
+                yield Record(connection.topic, connection.msgtype, log_time, bytes(raw), text)
         except Exception as error:  # as above; errors of the caller between two messages do not arrive here
             reason = str(error).rstrip(".") or type(error).__name__
             raise InputError(f"{self.path} is damaged: {reason}; add --salvage to read the rest") from error
@@ -131,7 +134,10 @@ class _ScannedPart:
     def messages(self, topics: set[str]) -> Iterator[Record]:
         numbers = [number for number, channel in self._file.channels.items() if channel.topic in topics]
         for number, log_time, raw in self._file.messages(numbers):
-            yield Record(self._file.channels[number].topic, self._file.types[number], log_time, raw)
+            file = self._file
+            yield Record(
+                file.channels[number].topic, file.types[number], log_time, raw, file.definitions.get(number, "")
+            )
 
     def close(self) -> None:
         pass

@@ -25,9 +25,16 @@ from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.component import Output, Port
 from flowing_puppet_ros.stream.components.registry import COMPONENTS
+from flowing_puppet_ros.stream.messages.detections import find_body_id, name_body, skeleton_topic
 from flowing_puppet_ros.stream.messages.geometry import FrameTree
 from flowing_puppet_ros.stream.messages.images import compress_image
-from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, PUPPETS, TRANSFORMS
+from flowing_puppet_ros.stream.messages.message_types import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IDS_LIST,
+    PUPPETS,
+    TRANSFORMS,
+)
 from flowing_puppet_ros.threads import one_opencv_thread
 
 STATIC_TRANSFORMS = "/tf_static"
@@ -87,7 +94,7 @@ class _Replay:
     def __init__(self, bag: Bag, options: ReplayOptions) -> None:
         self._bag = bag
         self._options = options
-        self._new_name = {name: options.topic_map.get(name, name) for name in bag.topics}
+        self._new_name = _rename_topics(bag.topics, options.topic_map)
         self._factory = BagMessageFactory()
         self.warnings: list[str] = list(bag.notes)
         topics = {self._new_name[name]: kind for name, kind in bag.topics.items()}
@@ -222,7 +229,8 @@ class _Replay:
                 self.warnings.append(str(error))
             return
         for instance, port in routes:
-            self._emit(writer, log_time, instance, self._handle(instance, port, message))
+            named = name_body(instance.resolve(port), topic, message)
+            self._emit(writer, log_time, instance, self._handle(instance, port, named))
 
     def _handle(self, instance: Instance, port: str, message: Any) -> Output:
         return self._run_timed(instance, lambda: instance.component.handle(port, message))
@@ -285,6 +293,16 @@ class _Replay:
             "messages": dict(counts),
             **self.describe(),
         }
+
+
+def _rename_topics(topics: Mapping[str, str], topic_map: Mapping[str, str]) -> dict[str, str]:
+    """Return old topic -> new topic; with a list of bodies, their skeletons move beside its new name."""
+    found = {name: topic_map.get(name, name) for name in topics}
+    for listing, new in topic_map.items():
+        if topics.get(listing) == IDS_LIST:
+            bodies = {name: find_body_id(listing, name) for name in topics if name not in topic_map}
+            found |= {name: skeleton_topic(new, identity) for name, identity in bodies.items() if identity}
+    return found
 
 
 def pace(records: Iterator[Record], rate: float) -> Iterator[Record]:

@@ -17,7 +17,7 @@ from std_msgs.msg import String
 
 from flowing_puppet_ros.node.diagnostics import Diagnostics
 from flowing_puppet_ros.node.factory import RosMessageFactory
-from flowing_puppet_ros.node.image_transport import CHECK_INTERVAL_S
+from flowing_puppet_ros.node.inputs import CHECK_INTERVAL_S
 from flowing_puppet_ros.node.session import Session
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.component import Component, Output, Port

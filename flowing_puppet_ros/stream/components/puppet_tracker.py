@@ -25,11 +25,17 @@ from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, P
 from flowing_puppet_ros.stream.components import warm_up
 from flowing_puppet_ros.stream.components.optical_flow import make_flow_preview
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, make_image_messages
+from flowing_puppet_ros.stream.messages.detections import (
+    OTHER_DETECTIONS,
+    collect_detections,
+    decode_detections,
+    is_complete,
+)
 from flowing_puppet_ros.stream.messages.geometry import header_ns, stamp_ns
 from flowing_puppet_ros.stream.messages.image_annotations import make_annotations, make_detections_2d
 from flowing_puppet_ros.stream.messages.images import decode_flow, decode_image, make_image
 from flowing_puppet_ros.stream.messages.message_types import ANNOTATIONS, DETECTIONS_2D, IMAGE, PUPPETS, MessageFactory
-from flowing_puppet_ros.stream.messages.puppets import decode_keypoints, make_puppets
+from flowing_puppet_ros.stream.messages.puppets import make_puppets
 from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 
@@ -66,7 +72,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         Port("image", IMAGE, "sensor", transport=COMPRESSED),
         Port("flow/forward", IMAGE, optional=True),
         Port("flow/backward", IMAGE, optional=True),
-        Port("detections", PUPPETS, "sensor", optional=True),
+        Port("detections", PUPPETS, "sensor", optional=True, alternatives=OTHER_DETECTIONS),
     )
     outputs: tuple[Port, ...] = (
         Port("puppets", PUPPETS),
@@ -131,6 +137,9 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
             self._take(stamp, message)
         elif port != "flow/forward" and self._line.is_late(stamp):
             self.counters[f"late {port}"] += 1
+        elif port == "detections":
+            shelf = self._shelves[port]
+            shelf.put(stamp, collect_detections(shelf.get(stamp), message))
         else:
             self._shelves[port].put(stamp, message)
         return self._release(final=False)
@@ -160,14 +169,16 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
 
     def _is_ready(self, stamp: int) -> bool:
         """Return whether everything that is expected for the image of `stamp` is there."""
-        needs = [("detections", stamp)]
+        if "detections" in self._expected and not is_complete(self._shelves["detections"].get(stamp)):
+            return False
+        needs = []
         if self._header is not None:
-            needs += [("flow/backward", stamp), ("flow/forward", header_ns(self._header))]
+            needs = [("flow/backward", stamp), ("flow/forward", header_ns(self._header))]
         return all(self._shelves[port].get(at) is not None for port, at in needs if port in self._expected)
 
     def _step(self, stamp: int, message: Any) -> Output:
         image, flow = decode_image(message), self._flow(stamp)
-        people = self._decode_detections(stamp)
+        people = self._decode_detections(stamp, (image.shape[1], image.shape[0]))
         if people is None and "detections" not in self._expected and self.settings.detection.source != "none":
             if self.settings.detection.source == "auto" and isinstance(self._live, LiveTracker):
                 self.report.warn(NOT_INSTALLED)
@@ -183,15 +194,19 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         self.counters["puppets"] += len(result.puppets)
         return self._publish(message.header, earlier, image, result)
 
-    def _decode_detections(self, stamp: int) -> list[Keypoints] | None:
-        """Return the people whom a published detection found in the image of this stamp, None without one."""
+    def _decode_detections(self, stamp: int, size: tuple[int, int]) -> list[Keypoints] | None:
+        """Return the people whom a published detection found in the image of this stamp and size, None without one."""
         detections = self._shelves["detections"].get(stamp)
         if detections is None:
             if "detections" in self._expected:
                 self.counters["images without detection"] += 1
             return None
         self.counters["paired detections"] += 1
-        return decode_keypoints(detections)
+        try:
+            return decode_detections(detections, size, self.report)
+        except InputError as error:  # the image is good
+            self.report.count_unusable(error)
+            return None
 
     def _forget(self, stamp: int) -> None:
         """Drop what was for images up to this one; what no image has used is counted."""

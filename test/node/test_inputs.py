@@ -16,7 +16,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from flowing_puppet_ros.node.component_node import ComponentNode
 from flowing_puppet_ros.node.diagnostics import Diagnostics
 from flowing_puppet_ros.node.factory import RosMessageFactory
-from flowing_puppet_ros.node.image_transport import AUTO, CHECK_INTERVAL_S, COMPRESSED, RAW, TransportChoice
+from flowing_puppet_ros.node.inputs import AUTO, CHECK_INTERVAL_S, COMPRESSED, RAW, TransportChoice
 from flowing_puppet_ros.node.session import Session
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.component import Component, Output, Port
