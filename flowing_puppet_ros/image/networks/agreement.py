@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64
-from flowing_puppet_ros.image.networks.poses import COCO, OTHER_SIDE, NetworkPose
+from flowing_puppet_ros.image.formats.skeletons import COCO_17
+from flowing_puppet_ros.image.networks.poses import OTHER_SIDE, NetworkPose
 
 DISTANCES = (0.0, 0.1, 0.2, 0.4, 0.7, 1.0)  # between networks, in shoulder widths ...
 PROBABILITIES = (1.0, 0.9, 0.7, 0.35, 0.12, 0.05)  # ... and how probably the mean is right
@@ -67,7 +68,7 @@ def turn_sides(poses: Sequence[NetworkPose], known: F64 | None) -> list[NetworkP
 
 def _is_crossed(one: F64, other: F64) -> bool:
     """Return whether two poses (17, 2) px fit far better with the sides of one exchanged."""
-    paired = np.arange(len(COCO)) != OTHER_SIDE
+    paired = np.arange(len(COCO_17)) != OTHER_SIDE
     straight, crossed = one - other, one[OTHER_SIDE] - other
     known = paired & np.isfinite(straight).all(axis=1) & np.isfinite(crossed).all(axis=1)
     if not known.any():

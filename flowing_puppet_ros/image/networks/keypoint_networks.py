@@ -8,7 +8,7 @@ weighted by their scores, and their confidence is how well the poses agree.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -17,10 +17,10 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Image
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.formats.skeletons import COCO_17
 from flowing_puppet_ros.image.networks.agreement import combine, turn_sides
 from flowing_puppet_ros.image.networks.pose_networks import EXTRA, BlazePose, Landmarks, MoveNet
 from flowing_puppet_ros.image.networks.poses import (
-    COCO,
     HIPS,
     MAX_SAME_DISTANCE,
     NetworkPose,
@@ -41,9 +41,10 @@ MAX_MOVE = 0.6  # median distance of joints, in shoulder widths, from a person t
 MAX_KNOWN_MOVE = 1.5  # the same from where a known person is expected
 MIN_PRESENCE = 0.3  # of BlazePose's landmarks
 MAX_LANDMARK_DISTANCE = 1.0  # shoulder widths between the landmarks and MoveNet's joints of one person
-LANDMARK_TRUST: F64 = np.array([{"elbow": 0.5, "knee": 0.3}.get(name.partition("_")[2], 1.0) for name in COCO])
+LANDMARK_TRUST: F64 = np.array([{"elbow": 0.5, "knee": 0.3}.get(name.partition("_")[2], 1.0) for name in COCO_17])
 """Weight of BlazePose's joints relative to MoveNet's of the same score: it is worse at elbows and knees."""
 MAX_PEOPLE = 6
+UNKNOWN: F64 = np.array([np.nan, np.nan])
 MIN_CONFIDENCE = 0.08  # joints below it are unknown
 
 DARK_LEVEL = 40.0  # mean of an image, 0 to 255, below which it is brightened
@@ -163,27 +164,28 @@ class KeypointNetworks:
     def _finish(self, image: Image, person: _Person) -> Keypoints:
         """Return the keypoints of a person from MoveNet's poses and BlazePose's landmarks."""
         landmarks = self.blazepose.locate(image, person.poses[-1])
-        own = landmarks.pose
-        poses, others = [*person.poses], [own]
+        poses, seen = [*person.poses], [landmarks.pose]
         if self.thorough:
-            mirrored, width = np.ascontiguousarray(image[:, ::-1]), image.shape[1]
-            same = self._find_in_square(mirrored, person.poses[-1].mirror(width), MAX_MOVE)
-            poses += [] if same is None else [same.mirror(width)]
-            others.insert(0, self.blazepose.locate(mirrored, person.poses[-1].mirror(width)).pose.mirror(width))
-        turned = turn_sides([*poses, *others], None if person.expected is None else person.expected.joints)
+            more, again = self._look_in_mirror(image, person.poses[-1])
+            poses, seen = [*poses, *more], [again, *seen]
+        turned = turn_sides([*poses, *seen], None if person.expected is None else person.expected.joints)
         agree = landmarks.presence >= MIN_PRESENCE and pose_distance(turned[-1], turned[0]) <= MAX_LANDMARK_DISTANCE
-        trusts = [np.ones(len(COCO))] * len(poses) + [LANDMARK_TRUST] * (len(others) if agree else 0)
+        trusts = [np.ones(len(COCO_17))] * len(poses) + [LANDMARK_TRUST] * (len(seen) if agree else 0)
         joints, confidence = combine(turned[: len(trusts)], trusts, turned[0].size)
-        names, points, sure = [*COCO], list(joints), confidence.tolist()
+        found = dict(zip(COCO_17, zip(joints, confidence.tolist(), strict=True), strict=True))
         if agree:
-            crossed = turned[-1] is not own
-            for name, point, probability in _extra_points(landmarks, dict(zip(COCO, confidence, strict=True)), crossed):
-                names.append(name)
-                points.append(point)
-                sure.append(probability)
-        known_points = np.array(sure) >= MIN_CONFIDENCE
-        xy = np.where(known_points[:, None], np.array(points), np.nan)
-        return Keypoints(tuple(names), xy, np.where(known_points, np.array(sure), 0.0))
+            found |= _place_extremities(landmarks, found, crossed=turned[-1] is not seen[-1])
+        known = {name: place if sure >= MIN_CONFIDENCE else UNKNOWN for name, (place, sure) in found.items()}
+        sure = [found[name][1] if np.isfinite(place).all() else 0.0 for name, place in known.items()]
+        return Keypoints(tuple(known), np.array(list(known.values())), np.array(sure))
+
+    def _look_in_mirror(self, image: Image, pose: NetworkPose) -> tuple[list[NetworkPose], NetworkPose]:
+        """Return a person by MoveNet, unless it finds nobody, and by BlazePose in the mirror image."""
+        mirrored, width = np.ascontiguousarray(image[:, ::-1]), image.shape[1]
+        expected = pose.mirror(width)
+        same = self._find_in_square(mirrored, expected, MAX_MOVE)
+        landmarks = self.blazepose.locate(mirrored, expected)
+        return [] if same is None else [same.mirror(width)], landmarks.pose.mirror(width)
 
 
 def _drop_repeated(people: Sequence[_Person]) -> list[_Person]:
@@ -208,15 +210,17 @@ def _find_square(pose: NetworkPose) -> tuple[F64, float]:
     return center, max(TRUNK_REACH * pose.trunk, JOINT_REACH * farthest, MIN_HALF_SIDE_PX)
 
 
-def _extra_points(
-    landmarks: Landmarks, confidence: dict[str, float], crossed: bool
-) -> Iterator[tuple[str, F64, float]]:
-    """Yield name, place (2,) px and confidence of hands, heels and toes: no better than that of wrist or ankle."""
+def _place_extremities(
+    landmarks: Landmarks, joints: Mapping[str, tuple[F64, float]], crossed: bool
+) -> dict[str, tuple[F64, float]]:
+    """Return place (2,) px and confidence of hands, heels and toes: no better than that of wrist or ankle."""
+    found = {}
     for name, row in EXTRA.items():
         side, _, part = name.partition("_")
         side = {"left": "right", "right": "left"}[side] if crossed else side
-        nearest = confidence[f"{side}_{'wrist' if part == 'hand' else 'ankle'}"]
-        yield f"{side}_{part}", landmarks.points[row], float(landmarks.visibility[row]) * nearest
+        nearest = joints[f"{side}_{'wrist' if part == 'hand' else 'ankle'}"][1]
+        found[f"{side}_{part}"] = landmarks.points[row], float(landmarks.visibility[row]) * nearest
+    return found
 
 
 def brighten(image: Image) -> Image:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """MoveNet MultiPose and BlazePose: how their inputs are made and their outputs read.
 
-MoveNet finds up to six people in an image, or the people in a square of it; BlazePose the 33 landmarks of one person, in a
-square turned along the trunk.
+MoveNet finds up to six people in an image, or the people in a square of it; BlazePose the 33 landmarks of one person,
+in a square turned along the trunk.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Image
+from flowing_puppet_ros.image.formats.skeletons import COCO_17, MEDIAPIPE_33
 from flowing_puppet_ros.image.networks.decoders import decode_movenet
 from flowing_puppet_ros.image.networks.files import BLAZEPOSE, MOVENET, read_file
 from flowing_puppet_ros.image.networks.poses import (
-    COCO,
     HIPS,
     SHOULDERS,
     NetworkPose,
@@ -27,10 +27,10 @@ from flowing_puppet_ros.image.networks.runtime import LiteRtNetwork, Network
 
 SIDE_PX = 256
 LANDMARKS = 33
-COCO_ROWS = (0, 2, 5, 7, 8, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
-"""The landmarks that are COCO's joints, in COCO's order."""
+COCO_ROWS = [MEDIAPIPE_33.index(name) for name in COCO_17]
+"""The landmarks that are COCO_17's joints, in COCO_17's order."""
 EXTRA = {"left_hand": 19, "right_hand": 20, "left_heel": 29, "right_heel": 30, "left_foot": 31, "right_foot": 32}
-"""Landmarks that COCO lacks: index fingers, heels and toes."""
+"""Landmarks that COCO_17 lacks: index fingers, heels and toes."""
 
 MARGIN = 1.5  # of the square around the person
 TRUNK_REACH, JOINT_REACH = 1.2, 1.1  # of the square's half side: trunks, and distances of the farthest joint
@@ -57,7 +57,7 @@ class MoveNet:
         return self._run(*cut_square(image, center, half, side))
 
     def _run(self, canvas: Image, warp: Warp) -> list[NetworkPose]:
-        people = decode_movenet(self._network.run(canvas[None]), (canvas.shape[1], canvas.shape[0]), len(COCO))
+        people = decode_movenet(self._network.run(canvas[None]), (canvas.shape[1], canvas.shape[0]), len(COCO_17))
         return [NetworkPose(warp.to_image(joints), scores, score) for joints, scores, score in people]
 
 
@@ -71,9 +71,8 @@ class Landmarks:
 
     @property
     def pose(self) -> NetworkPose:
-        """The landmarks that are joints of COCO; their scores are the visibilities."""
-        rows = list(COCO_ROWS)
-        return NetworkPose(self.points[rows], self.visibility[rows], self.presence)
+        """The landmarks that are joints of COCO_17; their scores are the visibilities."""
+        return NetworkPose(self.points[COCO_ROWS], self.visibility[COCO_ROWS], self.presence)
 
 
 class BlazePose:

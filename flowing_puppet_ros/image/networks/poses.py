@@ -11,15 +11,9 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, I64, Image
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.formats.skeletons import COCO_17
 
-COCO = (
-    "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder", "left_elbow",
-    "right_elbow", "left_wrist", "right_wrist", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle",
-    "right_ankle",
-)  # fmt: skip
-"""Joints of COCO people, which most networks find."""
-
-OTHER_SIDE: I64 = np.array([0, *(row + (1 if row % 2 else -1) for row in range(1, len(COCO)))])
+OTHER_SIDE: I64 = np.array([0, *(row + (1 if row % 2 else -1) for row in range(1, len(COCO_17)))])
 """For each joint the one of the other side."""
 SHOULDERS, HIPS = (5, 6), (11, 12)
 STRIDE = 32  # the sides of a network's input are multiples of it
@@ -31,7 +25,7 @@ MIN_SHOULDER_SHARE = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NetworkPose:
-    """One person: `joints` (17, 2) px in the order of COCO, raw `scores` (17,), and `score` of the person."""
+    """One person: `joints` (17, 2) px in the order of COCO_17, raw `scores` (17,), and `score` of the person."""
 
     joints: F64
     scores: F64
@@ -144,10 +138,10 @@ def drop_duplicates(poses: Sequence[NetworkPose]) -> list[NetworkPose]:
 
 
 def as_pose(person: Keypoints) -> NetworkPose | None:
-    """Return the joints that a person shares with COCO, NaN where unknown; None without shoulders and hips."""
-    joints, scores = np.full((len(COCO), 2), np.nan), np.zeros(len(COCO))
+    """Return the joints that a person shares with COCO_17, NaN where unknown; None without shoulders and hips."""
+    joints, scores = np.full((len(COCO_17), 2), np.nan), np.zeros(len(COCO_17))
     for name, (x, y, confidence) in person.select_usable().items():
-        if name in COCO:
-            joints[COCO.index(name)], scores[COCO.index(name)] = (x, y), confidence
+        if name in COCO_17:
+            joints[COCO_17.index(name)], scores[COCO_17.index(name)] = (x, y), confidence
     known = np.isfinite(joints).all(axis=1)
     return NetworkPose(joints, scores, 1.0) if known[[*SHOULDERS, *HIPS]].all() else None

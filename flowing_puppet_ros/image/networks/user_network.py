@@ -24,9 +24,10 @@ import yaml
 from flowing_puppet_ros.arrays import F64, Image
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, normalise_name
+from flowing_puppet_ros.image.formats.skeletons import COCO_17
 from flowing_puppet_ros.image.networks.decoders import DECODERS, ONE_PERSON, DecodedPerson
 from flowing_puppet_ros.image.networks.keypoint_networks import MAX_PEOPLE, FoundPerson, KeypointSource
-from flowing_puppet_ros.image.networks.poses import COCO, Warp, cut_rectangle, fit_to_rectangle
+from flowing_puppet_ros.image.networks.poses import Warp, cut_rectangle, fit_to_rectangle
 from flowing_puppet_ros.image.networks.runtime import LiteRtNetwork, Network, OnnxNetwork
 
 KEYS = ("file", "decoder", "input", "joints", "colours", "mean", "deviation", "min_score")
@@ -90,7 +91,7 @@ class NetworkDescription:
 
 def _check_joints(path: Path, given: object) -> tuple[str, ...]:
     if given == "coco":
-        return COCO
+        return COCO_17
     if not isinstance(given, list) or not any(normalise_name(str(name)) for name in given):
         raise InputError(f"{path}: joints are `coco` or a list of names, such as left_shoulder; it has {given!r}")
     return tuple(str(name) for name in given)
@@ -129,7 +130,8 @@ class UserNetwork:
     ) -> list[FoundPerson]:
         """Return the people in an image (H, W, 3) RGB.
 
-        A network that sees one person at a time looks at the `known` ones, and with `everybody` at whom the finder finds.
+        A network that sees one person at a time looks at the `known` ones, and with `everybody` at whom the finder
+        finds.
         """
         if self._description.decoder not in ONE_PERSON:
             people = self._run(*fit_to_rectangle(image, self._description.size))
