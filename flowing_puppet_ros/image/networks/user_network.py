@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from flowing_puppet_ros.arrays import F64, Image
 from flowing_puppet_ros.errors import InputError
@@ -52,10 +53,10 @@ class NetworkDescription:
     def read(cls, path: Path) -> NetworkDescription:
         """Read a description file; InputError when it cannot be read or something in it cannot be."""
         try:
-            data = yaml.safe_load(path.read_text(encoding="utf-8"))
+            data = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}") from error
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+        except (YAMLError, UnicodeDecodeError) as error:
             raise InputError(f"{path} is not a YAML file; it describes a network by {', '.join(KEYS)}") from error
         if not isinstance(data, dict) or not {"file", "decoder", "input"} <= set(data):
             raise InputError(f"{path} needs at least file, decoder and input (width and height)")
