@@ -46,7 +46,7 @@ OPTIONAL = {
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10
 MAY_IMPORT: dict[str, set[str]] = {
-    "annotate": {"draw", "flow", "image.formats", "image.tracking", "model.ds"},
+    "annotate": {"draw", "flow", "image.detector", "image.formats", "image.networks", "image.tracking", "model.ds"},
     "bag": {"image.formats", "multiview", "stream", "stream.components", "stream.messages"},
     "body": set(),
     "body.cloud": {"evidence.cloud"},
