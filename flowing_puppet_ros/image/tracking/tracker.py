@@ -44,8 +44,8 @@ type DetectInTracks = Callable[
     [Sequence[Track], FlowPair | None], tuple[Sequence[Keypoints] | None, Collection[str] | None]
 ]
 """From the tracks in an image, and the flow at working scale from the image before, to the people detected there and
-the ids that were searched. None for the flow: there is no image before, or nobody was tracked in it. None for the people:
-no detector ran."""
+the ids that were searched. None for the flow: there is no image before, or nobody was tracked in it. None for the
+people: no detector ran."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
