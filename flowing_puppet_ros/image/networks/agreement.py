@@ -37,8 +37,8 @@ def combine(networks: Sequence[Sequence[NetworkPose]], trusts: Sequence[F64], si
         trusts: for each network a factor (17,) on the scores of its joints.
         size: the person's shoulder width, px.
 
-    Poses are weighted by their scores. Two poses by one network agree even when they are wrong: the confidence is how well
-    the means of the networks agree, or the scores alone where there is one network.
+    Poses are weighted by their scores. Two poses by one network agree even when they are wrong: the confidence is how
+    well the means of the networks agree, or the scores alone where there is one network.
     """
     joints = [np.array([pose.joints for pose in poses]) for poses in networks]
     scores = [np.maximum([pose.scores for pose in poses], MIN_WEIGHT) for poses in networks]
