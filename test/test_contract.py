@@ -36,7 +36,17 @@ OPTIONAL = {
 MAX_FILES = 10
 MAY_IMPORT: dict[str, set[str]] = {
     "annotate": {"draw", "flow", "image.formats", "image.tracking", "model.ds"},
-    "bag": {"image.formats", "multiview", "stream", "stream.components", "stream.messages"},
+    "bag": {
+        "bag.foreign",
+        "bag.storage",
+        "image.formats",
+        "multiview",
+        "stream",
+        "stream.components",
+        "stream.messages",
+    },
+    "bag.foreign": {"bag.storage", "stream.messages"},
+    "bag.storage": set(),
     "body": set(),
     "body.cloud": {"evidence.cloud"},
     "body.fit": {"body.cloud", "body.refine", "body.scans", "body.search", "evidence.cloud", "model"},
@@ -48,6 +58,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cli": {
         "annotate",
         "bag",
+        "bag.storage",
         "body.fit",
         "body.scans",
         "body.segmentation",
@@ -85,7 +96,16 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cli.sample": {"body.scans", "draw", "model", "model.ds"},
     "draw": {"flow"},
     "evaluate": {"image.formats", "model"},
-    "evaluate.bag": {"bag", "body.scans", "evaluate", "image.formats", "multiview", "stream", "stream.messages"},
+    "evaluate.bag": {
+        "bag",
+        "bag.storage",
+        "body.scans",
+        "evaluate",
+        "image.formats",
+        "multiview",
+        "stream",
+        "stream.messages",
+    },
     "evaluate.body": {"body.fit", "body.scans", "learn.anny", "model"},
     "evaluate.image": {
         "evidence.image",
@@ -368,14 +388,8 @@ def test_limits_are_called_min_and_max() -> None:
     other = re.compile(r"(?:^|_)(least|most|fewest|farthest|longest|shortest|largest|smallest)(?:_|$)", re.IGNORECASE)
     for path in MODULES:
         for node in parsed(path).body:
-            targets = (
-                node.targets
-                if isinstance(node, ast.Assign)
-                else [node.target]
-                if isinstance(node, ast.AnnAssign)
-                else []
-            )
-            for target in (item for each in targets for item in ast.walk(each) if isinstance(item, ast.Name)):
+            sides = getattr(node, "targets", [getattr(node, "target", None)])
+            for target in (item for each in sides if each for item in ast.walk(each) if isinstance(item, ast.Name)):
                 assert not other.search(target.id), f"{module_name(path)}.{target.id}: say MIN_ or MAX_"
     for settings in (kind for name in COMPONENTS for kind in (COMPONENTS[name].settings_type, node_settings(name))):
         assert not [info.name for info in settings.describe() if other.search(info.name.replace(".", "_"))]

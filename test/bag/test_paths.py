@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from flowing_puppet_ros.bag.paths import is_bag
+from flowing_puppet_ros.bag.storage.paths import is_bag
 
 
 @pytest.mark.parametrize(

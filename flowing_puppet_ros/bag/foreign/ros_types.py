@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names and definitions of ROS types as files have them."""
+
+from __future__ import annotations
+
+import re
+from functools import lru_cache
+
+from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from flowing_puppet_ros.bag.storage.stored_file import StoredTopic
+
+_RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
+"""Types of ROS 1 with another name in ROS 2."""
+_IDL_RULE = "=" * 80 + "\n"
+
+
+def normalise_type(name: str, rename: bool = True) -> str:
+    """Return `package/msg/Name` for the ways in which types are written, as it is for other names.
+
+    These are `package/Name`, `package::msg::Name`, `package::msg::dds_::Name_` and `package.msg.Name`. With `rename`,
+    the type of ROS 2 is returned for that of ROS 1.
+    """
+    parts = [part for part in re.split(r"::|[/.]", name.strip()) if part not in ("msg", "dds_")]
+    if len(parts) != 2 or not all(re.fullmatch(r"\w+", part) for part in parts):
+        return name
+    normal = f"{parts[0]}/msg/{parts[1].removesuffix('_')}"
+    return _RENAMED.get(normal, normal) if rename else normal
+
+
+def make_source_store(topic: StoredTopic) -> Typestore | None:
+    """Return the types in the definition that the file has for a topic; None if it has none that is readable."""
+    return _parse_definition(normalise_type(topic.type, rename=False), topic.schema_encoding, topic.schema)
+
+
+@lru_cache(maxsize=256)
+def _parse_definition(kind: str, encoding: str, schema: bytes) -> Typestore | None:
+    try:
+        text = schema.decode()
+        if encoding in ("ros1msg", "ros2msg") and text.strip():
+            types = get_types_from_msg(text, kind)
+        elif encoding in ("ros2idl", "omgidl"):
+            types = {}
+            for part in text.split(_IDL_RULE) if _IDL_RULE in text else [text]:
+                types.update(get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part))
+        else:
+            return None
+        if encoding == "ros1msg":
+            known = get_typestore(Stores.ROS1_NOETIC).fielddefs
+            types = {name: known[name] for name in ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
+                     if name in known} | types  # fmt: skip
+        store = get_typestore(Stores.EMPTY)
+        store.register(types)
+    except Exception:  # definitions by others make the library raise anything
+        return None
+    return store if kind in store.fielddefs else None
