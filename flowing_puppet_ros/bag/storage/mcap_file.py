@@ -11,6 +11,7 @@ import heapq
 import io
 import re
 import struct
+import zlib
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -261,15 +262,17 @@ def _unpack_chunk(code: int, data: bytes) -> list[McapRecord]:
 def _unpack_cut_chunk(data: bytes) -> list[McapRecord]:
     """Return the whole records at the beginning of a chunk that ends too early.
 
-    Nothing vouches for them, so they have to be what a chunk may contain, with log times in the range of the chunk.
+    Nothing vouches for them unless all are there, so they have to be what a chunk may contain, with log times in the range of the chunk.
     """
     if len(data) < _CHUNK_HEAD.size:
         return []
-    first, last, size, _, length = _CHUNK_HEAD.unpack_from(data)
+    first, last, size, checksum, length = _CHUNK_HEAD.unpack_from(data)
     (name, start) = (data[_CHUNK_HEAD.size : _CHUNK_HEAD.size + length], _CHUNK_HEAD.size + length + 8)
     if name not in (b"", b"zstd", b"lz4") or size > MAX_RECORD_BYTES or len(data) <= start:
         return []
     unpacked, found, offset = decompress_prefix(name.decode(), data[start:])[:size], list[McapRecord](), 0
+    if len(unpacked) == size and checksum and zlib.crc32(unpacked) != checksum:
+        return []
     while offset + _RECORD_HEADER.size <= len(unpacked):
         code, length = _RECORD_HEADER.unpack_from(unpacked, offset)
         offset, end = offset + _RECORD_HEADER.size, offset + _RECORD_HEADER.size + length
