@@ -17,10 +17,11 @@ from typing import Any
 from tqdm import tqdm
 
 from flowing_puppet_ros import __version__
-from flowing_puppet_ros.bag.depth_topics import read_encodings
+from flowing_puppet_ros.bag.depth_topics import read_samples
 from flowing_puppet_ros.bag.graph import Instance, build_graph, find_info_topics
 from flowing_puppet_ros.bag.reader import Bag, Record, open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
+from flowing_puppet_ros.bag.unused import count_used, explain_unused
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.component import Output, Port
@@ -66,7 +67,8 @@ def replay(source: Path, target: Path, options: ReplayOptions | None = None) -> 
     """Replay the bag `source` into the bag `target` and return a summary that JSON can hold.
 
     `target` is one file if its name ends in .mcap, otherwise a folder. InputError if the source cannot be read or has
-    no usable topic. What a component cannot use is counted, and each reason is one of the summary's `warnings`.
+    no usable topic. What a component cannot use is counted, and each reason is one of the summary's `warnings`. If no
+    message at all was used, `unused` has the reason of each topic.
     """
     options = options or ReplayOptions()
     if source.exists() and source.resolve() in (target.resolve(), target.parent.resolve()):
@@ -99,13 +101,15 @@ class _Replay:
             raise InputError(f"--topic-map gives two topics the name {new}: choose another name")
         self._static = self._read_static_transforms(topics)
         infos = self._read_first_infos(topics)
-        encoded = {self._new_name[name]: encoding for name, encoding in read_encodings(bag).items()}
+        samples = {self._new_name[name]: sample for name, sample in read_samples(bag).items()}
         self._graph = build_graph(
-            topics, encoded, self._build_frame_tree(), infos, self._collect_settings(), self._factory
+            topics, samples, self._build_frame_tree(), infos, self._collect_settings(), self._factory
         )
         self.warnings += self._graph.notes
-        recorded = {self._new_name[name]: detail.type for name, detail in bag.details.items() if detail.count}
-        self._routes = self._graph.find_routes(recorded)
+        self._recorded = {self._new_name[name]: detail for name, detail in bag.details.items()}
+        self._routes = self._graph.find_routes(
+            {name: detail.type for name, detail in self._recorded.items() if detail.count}
+        )
         self._outputs = self._graph.find_outputs()
         copied = {self._new_name[name] for name, kind in bag.topics.items() if kind in _COPIED_TYPES}
         self._copied = copied - set(self._outputs)
@@ -283,6 +287,7 @@ class _Replay:
             "frames_per_second": round(frames / seconds, 2),
             "seconds_of": {instance.name: round(instance.seconds, 2) for instance in instances},
             "messages": dict(counts),
+            **({} if count_used(instances) else {"unused": explain_unused(self._graph, self._recorded, self.warnings)}),
             **self.describe(),
         }
 

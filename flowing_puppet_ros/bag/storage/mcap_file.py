@@ -262,7 +262,8 @@ def _unpack_chunk(code: int, data: bytes) -> list[McapRecord]:
 def _unpack_cut_chunk(data: bytes) -> list[McapRecord]:
     """Return the whole records at the beginning of a chunk that ends too early.
 
-    Nothing vouches for them unless all are there, so they have to be what a chunk may contain, with log times in the range of the chunk.
+    Nothing vouches for them unless all are there, so they have to be what a chunk may contain, with log times in the
+    range of the chunk.
     """
     if len(data) < _CHUNK_HEAD.size:
         return []

@@ -7,6 +7,8 @@ from pathlib import Path
 SUFFIXES = (".mcap", ".db3", ".bag")
 PACKED_SUFFIXES = (".zst", ".zstd", ".lz4", ".gz", ".bz2", ".xz")
 """Endings of compressed files, after that of the bag; what is in a file decides, not these."""
+MAGICS = (b"\x89MCAP0\r\n", b"#ROSBAG V", b"SQLite format 3\0")
+"""How bag files begin; a renamed one is known by that."""
 _SPLIT = re.compile(r"(?P<series>.*?)(?:_\d{4}(?:-\d\d){5})?_(?P<number>\d+)")
 """Stem of a split file: rosbag2 counts from 0, `rosbag record --split` adds the time before the number."""
 
@@ -34,13 +36,13 @@ def split_series(path: Path) -> str | None:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a file or folder looks like one bag: by its suffix, its metadata, or the bag files in it.
+    """Return whether a file or folder looks like one bag: by its suffix or content, its metadata, or the files in it.
 
     A recorder that was killed leaves no metadata, but its files are `<folder>_0`, `<folder>_1`, ... A renamed folder
     has files that still count from 0.
     """
     if not path.is_dir():
-        return bool(bag_suffix(path))
+        return bool(bag_suffix(path)) or _begins_as_bag(path)
     files = [file for file in path.iterdir() if file.is_file() and bag_suffix(file)]
     if (path / "metadata.yaml").is_file() or len(files) == 1:
         return True
@@ -49,6 +51,14 @@ def is_bag(path: Path) -> bool:
         return False
     numbers = {int(found["number"]) for file in files if (found := _SPLIT.fullmatch(_stem(file)))}
     return series == {path.resolve().name} or numbers == set(range(len(files)))
+
+
+def _begins_as_bag(path: Path) -> bool:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(16).startswith(MAGICS)
+    except OSError:
+        return False
 
 
 def _stem(path: Path) -> str:

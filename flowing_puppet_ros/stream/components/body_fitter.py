@@ -92,7 +92,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._fitter = BodyFitter(self._model, settings.fitter)
         self._scene = SceneTracker(self._fitter, settings, self.report)
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
-        self._depth = DepthPairs()
+        self._depth = DepthPairs(self.report)
         self._line = PendingQueue()
         self._initial = StampBuffer()
         self._outputs = BodyOutputs(settings.output, settings.ros4hri, factory, self._model)
