@@ -20,6 +20,7 @@ from flowing_puppet_ros import __version__
 from flowing_puppet_ros.bag.depth_topics import read_samples
 from flowing_puppet_ros.bag.graph import Instance, build_graph, find_info_topics
 from flowing_puppet_ros.bag.reader import Bag, Record, open_bag
+from flowing_puppet_ros.bag.stuck_stamps import StuckStamps
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.unused import count_used, explain_unused
 from flowing_puppet_ros.bag.writer import BagWriter
@@ -36,6 +37,9 @@ METADATA_NAME = "flowing_puppet_ros"
 """Name of the output bag's metadata whose "replay" is JSON of the version, settings and counters of the replay."""
 _COPIED_TYPES = (CAMERA_INFO, PUPPETS, TRANSFORMS)
 """Types of input topics that are copied to the output bag, so that a viewer needs no other bag."""
+
+_SENSOR_PORTS = ("image", "points", "depth")
+"""Inputs whose messages have to follow one another in time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +96,7 @@ class _Replay:
         self._new_name = {name: options.topic_map.get(name, name) for name in bag.topics}
         self._factory = BagMessageFactory()
         self.warnings: list[str] = list(bag.notes)
+        self._stuck = StuckStamps()
         topics = {self._new_name[name]: kind for name, kind in bag.topics.items()}
         unknown = sorted(set(options.topic_map) - set(bag.topics))
         if unknown:
@@ -225,6 +230,8 @@ class _Replay:
             if str(error) not in self.warnings:
                 self.warnings.append(str(error))
             return
+        if any(port in _SENSOR_PORTS for _, port in routes):
+            self.warnings += self._stuck.advance(topic, record.log_time, message)
         for instance, port in routes:
             self._emit(writer, log_time, instance, self._handle(instance, port, message))
 
