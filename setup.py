@@ -55,6 +55,7 @@ setup(
         "annotate": requirements("annotate"),
         "cluster": requirements("cluster"),
         "rerun": requirements("rerun"),
+        "video": requirements("video"),
     },
     entry_points={
         "console_scripts": [

@@ -22,7 +22,7 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
 FOUNDATION = {"arrays", "errors", "ids", "images", "reporting", "settings", "threads", "units"}
 """Modules beside the rooms, which everything may import."""
-OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug"}
+OPTIONAL_PACKAGES = {"anny", "av", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug"}
 ONLY_WITH_EXTRA = "flowing_puppet_ros.annotate.server"
 """Nothing but an extra's own module imports what the extra brings at its top."""
 OPTIONAL = {
@@ -31,6 +31,7 @@ OPTIONAL = {
     "learn": "learn",
     "cli.batch.cluster": "cluster",
     "report.rerun_file": "rerun",
+    "bag.foreign.video": "video",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10

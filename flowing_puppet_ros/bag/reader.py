@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -14,11 +14,13 @@ from mcap.reader import make_reader
 
 from flowing_puppet_ros.bag.foreign.convert import Converter
 from flowing_puppet_ros.bag.foreign.ros_types import normalise_type
+from flowing_puppet_ros.bag.foreign.video import VideoImages
 from flowing_puppet_ros.bag.storage.folder import RecordingFiles, find_recording
 from flowing_puppet_ros.bag.storage.open_file import open_file
 from flowing_puppet_ros.bag.storage.stored_file import StoredFile
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,10 +89,23 @@ class Bag:
         return {name: topic.type for name, topic in self.details.items()}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Record]:
-        """Yield the messages of `topics` (all by default) in the order of their log times."""
+        """Yield the messages of `topics` (all by default) in the order of their log times.
+
+        An image of a video whose decoder waits for later ones comes with the time of the packet that completes it.
+        """
         chosen = set(self.details if topics is None else topics)
         files = zip(self._files, self._converters, strict=True)
-        yield from heapq.merge(*(_read(*one, chosen) for one in files), key=lambda record: record.log_time)
+        merged = heapq.merge(*(_read(*one, chosen) for one in files), key=lambda record: record.log_time)
+        video, last = VideoImages(typestore(), BagMessageFactory()), 0
+        for record in merged:
+            if record.type != COMPRESSED_IMAGE:
+                yield record
+                continue
+            last = record.log_time
+            for raw in video.decode(record.topic, record.raw):
+                yield record if raw is record.raw else replace(record, raw=raw)
+        for topic, raw in video.flush():
+            yield Record(topic, COMPRESSED_IMAGE, last, raw)
 
     def read_metadata(self, name: str) -> dict[str, str]:
         """Return the texts that `BagWriter.add_metadata` stored under this name; empty if there are none."""

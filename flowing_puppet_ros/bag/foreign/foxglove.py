@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The schemas of Foxglove (docs.foxglove.dev, "Foxglove schemas") to ROS 2 messages.
+"""The schemas of Foxglove (docs.foxglove.dev, "Foxglove schemas"), and others' packets of video, to ROS 2 messages.
 
 The objects that come in have the fields of a schema as attributes; in JSON any may be missing.
 """
@@ -40,6 +40,8 @@ class ForeignSchema:
 
 def find_schema(name: str) -> ForeignSchema | None:
     """Return what becomes of a schema, by its name in JSON, protobuf, ROS 1, ROS 2 or IDL; None for other types."""
+    if re.fullmatch(r"ffmpeg_image_transport_msgs(?:/msg)?/FFMPEGPacket", name):
+        return ForeignSchema(COMPRESSED_IMAGE, _build_packet)
     found = re.fullmatch(r"foxglove(?:_msgs)?(?:\.|/|::)(?:msg(?:\.|/|::))?(\w+)", name)
     return _SCHEMAS.get(found[1]) if found else None
 
@@ -60,6 +62,13 @@ def _build_image(factory: MessageFactory, image: Any) -> Any:
 def _build_compressed(factory: MessageFactory, image: Any) -> Any:
     header = _make_header(factory, image)
     return factory.make(COMPRESSED_IMAGE, header=header, format=image.format, data=read_bytes(image.data))
+
+
+def _build_packet(factory: MessageFactory, packet: Any) -> Any:
+    stamp = packet.header.stamp
+    header = make_header(factory, int(stamp.sec) * NANOSECONDS + int(stamp.nanosec), packet.header.frame_id)
+    form = packet.encoding.partition(";")[0]  # behind it the names of pixel formats
+    return factory.make(COMPRESSED_IMAGE, header=header, format=form, data=read_bytes(packet.data))
 
 
 def _build_cloud(factory: MessageFactory, cloud: Any) -> Any:

@@ -58,7 +58,16 @@ _PLANAR: dict[str, tuple[float, int]] = {
 }
 _FILES = ("jpeg", "jpg", "mjpeg", "png")
 """Encodings of raw images whose data is a file of that kind."""
-_VIDEO = re.compile(r"\b(?:h\.?26[345]|hevc|avc1?|vp[89]|av1|mpeg-?[24]|theora)\b", re.IGNORECASE)
+_VIDEO_NAMES = {
+    "h264": r"h\.?264|x264|avc1?",
+    "hevc": r"h\.?265|x265|hevc",
+    "vp8": "vp8",
+    "vp9": "vp9",
+    "av1": "av1",
+    "mpeg4": "mpeg-?4",
+}
+"""Codec of FFmpeg -> how formats name it."""
+_VIDEO = {codec: re.compile(rf"(?<![a-z0-9])(?:{names})(?![0-9])") for codec, names in _VIDEO_NAMES.items()}
 # encoding -> (type of a pixel, metres per unit); some drivers call millimetres mono16 (REP-118 has the other two)
 _DEPTH = {"16uc1": ("u2", 0.001), "mono16": ("u2", 0.001), "32fc1": ("f4", 1.0)}
 
@@ -120,12 +129,18 @@ def _not_whole(message: Any) -> InputError:
 def _decode_compressed(message: Any) -> U8:
     if is_compressed_depth(message.format):
         raise InputError(f"the compressed image format {message.format!r} is a depth image, not a picture")
-    if _VIDEO.search(message.format):
+    if find_video_codec(message.format):
         raise InputError(
-            f"the compressed image format {message.format!r} is video, whose images need those before them: record or "
-            "republish the images as JPEG (`ros2 run image_transport republish ffmpeg compressed`)"
+            f"the compressed image format {message.format!r} is video, whose images need those before them: in bags it "
+            "is decoded from the first key frame on if PyAV is there (`pip install av`), nodes need JPEG or raw images"
         )
     return _decode_file(message_bytes(message.data), message.format)
+
+
+def find_video_codec(form: str) -> str:
+    """Return FFmpeg's name of the codec of a `format` that is video, or of any text with such a name; else empty."""
+    words = form.lower()
+    return next((codec for codec, names in _VIDEO.items() if names.search(words)), "")
 
 
 def _decode_file(data: U8, form: str) -> U8:
