@@ -205,6 +205,16 @@ def test_compressed_images_are_rgb() -> None:
     np.testing.assert_array_equal(images.decode_image(lossless), rgb)
 
 
+@pytest.mark.parametrize("suffix", ["png", "webp", "bmp", "tiff"])
+def test_compressed_images_are_known_by_their_content(suffix: str) -> None:
+    rgb = ramp(16, 24)
+    options = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == "webp" else []  # above 100: lossless
+    data = cv2.imencode(f".{suffix}", rgb[:, :, ::-1], options)[1].reshape(-1)
+    for form in (suffix, "", "rgb8; something compressed bgr8"):
+        found = images.decode_image(FACTORY.make("sensor_msgs/msg/CompressedImage", format=form, data=data))
+        np.testing.assert_array_equal(found, rgb)
+
+
 @pytest.mark.parametrize("data", [b"", b"no picture", bytes(1000)])
 def test_broken_compressed_images_are_refused(data: Any) -> None:
     broken = FACTORY.make("sensor_msgs/msg/CompressedImage", format="jpeg", data=np.frombuffer(data, np.uint8))
