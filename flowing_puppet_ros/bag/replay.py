@@ -18,10 +18,11 @@ from tqdm import tqdm
 
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.bag.depth_topics import read_samples
-from flowing_puppet_ros.bag.graph import Instance, build_graph, find_info_topics
+from flowing_puppet_ros.bag.foreign.static_frames import find_static_transforms
+from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Instance, build_graph, find_info_topics
 from flowing_puppet_ros.bag.reader import Bag, Record, open_bag
 from flowing_puppet_ros.bag.stuck_stamps import StuckStamps
-from flowing_puppet_ros.bag.typestore import BagMessageFactory
+from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.unused import count_used, explain_unused
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
@@ -106,6 +107,7 @@ class _Replay:
             raise InputError(f"--topic-map gives two topics the name {new}: choose another name")
         self._static = self._read_static_transforms(topics)
         infos = self._read_first_infos(topics)
+        self._static += self._find_fixed_frames(topics, infos)
         samples = {self._new_name[name]: sample for name, sample in read_samples(bag).items()}
         self._graph = build_graph(
             topics, samples, self._build_frame_tree(), infos, self._collect_settings(), self._factory
@@ -117,7 +119,7 @@ class _Replay:
         )
         self._outputs = self._graph.find_outputs()
         copied = {self._new_name[name] for name, kind in bag.topics.items() if kind in _COPIED_TYPES}
-        self._copied = copied - set(self._outputs)
+        self._copied = (copied | {self._new_name[record.topic] for record in self._static}) - set(self._outputs)
         for instance in self._graph.instances:
             for port in instance.component.outputs:
                 if port.lazy:
@@ -141,6 +143,38 @@ class _Replay:
             topics, lambda name: name == STATIC_TRANSFORMS and topics[name] == TRANSFORMS
         )
         return list(self._bag.messages(names)) if names else []
+
+    def _find_fixed_frames(self, topics: Mapping[str, str], infos: Mapping[str, Any]) -> list[Record]:
+        """Return the transforms that never change of cameras whose frames /tf_static does not connect, as its message.
+
+        Only several cameras need them, so the other recordings are not searched.
+        """
+        frames = self._build_frame_tree()
+        cameras = {info.header.frame_id.lstrip("/") for info in infos.values()}
+        with suppress(InputError):
+            if len(cameras) < MIN_CAMERAS or all(frames.find_root(frame) != frame for frame in cameras):
+                return []
+        names = self._find_recorded_topics(
+            topics, lambda name: name != STATIC_TRANSFORMS and topics[name] == TRANSFORMS
+        )
+        fixed = [
+            item
+            for item in find_static_transforms(self._read_usable(names))
+            if frames.find_root(child := item.child_frame_id.lstrip("/")) == child
+        ]
+        if not fixed:
+            return []
+        children = ", ".join(item.child_frame_id for item in fixed)
+        self.warnings.append(f"the frames {children} on {', '.join(names)} never move: they are used as static")
+        raw = typestore().serialize_cdr(self._factory.make(TRANSFORMS, transforms=fixed), TRANSFORMS)
+        self._new_name[STATIC_TRANSFORMS] = STATIC_TRANSFORMS
+        time_of_first = self._static[0].log_time if self._static else next(iter(self._bag.messages())).log_time
+        return [Record(STATIC_TRANSFORMS, TRANSFORMS, time_of_first, bytes(raw))]
+
+    def _read_usable(self, names: list[str]) -> Iterator[Any]:
+        for record in self._bag.messages(names) if names else ():
+            with suppress(InputError):
+                yield record.message
 
     def _build_frame_tree(self) -> FrameTree:
         """Return the frames of the static transforms; the replay itself warns of unusable ones."""
@@ -209,6 +243,8 @@ class _Replay:
             if self._new_name[name] in self._copied:
                 qos = "latched" if self._new_name[name] == STATIC_TRANSFORMS else detail.qos
                 writer.add_topic(self._new_name[name], detail.type, qos)
+        if self._static and not writer.has_topic(STATIC_TRANSFORMS):  # found on other topics
+            writer.add_topic(STATIC_TRANSFORMS, TRANSFORMS, "latched")
         for topic, port in self._outputs.items():
             if not port.recorded or port.per_person:
                 continue

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 from rosbags.convert.converter import is_same_wireformat, migrate_message
@@ -12,7 +12,7 @@ from rosbags.typesys.store import Typestore
 
 from flowing_puppet_ros.bag.foreign.foxglove import find_schema
 from flowing_puppet_ros.bag.foreign.payloads import make_decoder
-from flowing_puppet_ros.bag.foreign.ros_types import make_source_store, normalise_type
+from flowing_puppet_ros.bag.foreign.ros_types import is_written_as, make_source_store, normalise_type
 from flowing_puppet_ros.bag.storage.compression import ZSTD_MAGIC, decompress_message
 from flowing_puppet_ros.bag.storage.stored_file import StoredTopic
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory
@@ -59,6 +59,8 @@ class Converter:
             return lambda raw: self._serialise(build(self._factory, decode(raw)))
         if self.type not in self._store.fielddefs or topic.encoding not in ("cdr", "ros1"):
             return None
+        if topic.encoding == "cdr" and is_written_as(topic, _write_definition(self._store, self.type)):
+            return None
         source, own_type = make_source_store(topic), normalise_type(topic.type, rename=False)
         if source is None or _is_same(source, self._store, own_type, self.type):
             if topic.encoding == "cdr":
@@ -72,6 +74,11 @@ class Converter:
 
     def _serialise(self, message: Any) -> bytes:
         return bytes(self._store.serialize_cdr(message, self.type))
+
+
+@cache
+def _write_definition(store: Typestore, kind: str) -> str:
+    return str(store.generate_msgdef(kind, ros_version=2)[0])
 
 
 def _is_same(source: Typestore, target: Typestore, own_type: str, kind: str) -> bool:

@@ -13,7 +13,7 @@ from flowing_puppet_ros.bag.storage.stored_file import StoredTopic
 
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
 """Types of ROS 1 with another name in ROS 2."""
-_IDL_RULE = "=" * 80 + "\n"
+_RULE = "=" * 80 + "\n"
 
 
 def normalise_type(name: str, rename: bool = True) -> str:
@@ -29,6 +29,23 @@ def normalise_type(name: str, rename: bool = True) -> str:
     return _RENAMED.get(normal, normal) if rename else normal
 
 
+def is_written_as(topic: StoredTopic, text: str) -> bool:
+    """Return whether a topic's definition is `text` but for comments, spaces and the order of the types in it.
+
+    That is quicker to see than a definition is to parse; others may be the same too.
+    """
+    try:
+        return topic.schema_encoding == "ros2msg" and _sections(topic.schema.decode()) == _sections(text)
+    except UnicodeDecodeError:
+        return False
+
+
+def _sections(text: str) -> list[list[str]]:
+    bare = [" ".join(line.partition("#")[0].split()) for line in text.splitlines()]
+    first, *others = "\n".join(line for line in bare if line).split(_RULE)
+    return [first.split("\n"), *sorted(section.split("\n") for section in others)]
+
+
 def make_source_store(topic: StoredTopic) -> Typestore | None:
     """Return the types in the definition that the file has for a topic; None if it has none that is readable."""
     return _parse_definition(normalise_type(topic.type, rename=False), topic.schema_encoding, topic.schema)
@@ -42,7 +59,7 @@ def _parse_definition(kind: str, encoding: str, schema: bytes) -> Typestore | No
             types = get_types_from_msg(text, kind)
         elif encoding in ("ros2idl", "omgidl"):
             types = {}
-            for part in text.split(_IDL_RULE) if _IDL_RULE in text else [text]:
+            for part in text.split(_RULE) if _RULE in text else [text]:
                 types.update(get_types_from_idl(part.split("\n", 1)[1] if part.startswith("IDL: ") else part))
         else:
             return None

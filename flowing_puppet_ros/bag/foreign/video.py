@@ -7,6 +7,7 @@ packets stay as they are, and whoever decodes one says what is missing.
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import cv2
@@ -15,6 +16,7 @@ from rosbags.typesys.store import Typestore
 from flowing_puppet_ros.stream.messages.images import find_video_codec
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, MessageFactory, message_bytes
 
+_MAY_BE_VIDEO = re.compile(rb"26[45]|hevc|avc|vp[89]|av1|mpeg", re.IGNORECASE).search
 _HEAD_BYTES = 512
 """Bytes of a message that contain the format of any image: behind the stamp and the name of the frame."""
 
@@ -71,7 +73,7 @@ class VideoImages:
 
         A packet that cannot be decoded is returned as it is.
         """
-        if not find_video_codec(raw[:_HEAD_BYTES].decode("latin1")):
+        if not _MAY_BE_VIDEO(raw, 0, _HEAD_BYTES):  # cheaper than to read the message
             return [raw]
         try:
             message: Any = self._store.deserialize_cdr(raw, COMPRESSED_IMAGE)
