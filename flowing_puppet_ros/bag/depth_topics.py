@@ -78,7 +78,8 @@ def image_encoding(topic: str, message: Any) -> str:
     if not hasattr(message, "format"):
         return str(message.encoding)
     encoding = source_encoding(message.format)
-    return encoding if is_compressed_depth_topic(topic) or is_depth_encoding(encoding) else ""
+    as_picture = "depth" in topic.lower() and is_depth_encoding(encoding)
+    return encoding if is_compressed_depth_topic(topic) or as_picture else ""
 
 
 def holds_depth(topic: str, encoding: str) -> bool:

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 from flowing_puppet_ros.bag.foreign.convert import Converter
 from flowing_puppet_ros.bag.foreign.ros_types import normalise_type
 from flowing_puppet_ros.bag.foreign.video import VideoImages
-from flowing_puppet_ros.bag.storage.folder import RecordingFiles, find_recording
+from flowing_puppet_ros.bag.storage.folder import METADATA, RecordingFiles, find_recording
 from flowing_puppet_ros.bag.storage.open_file import open_file
 from flowing_puppet_ros.bag.storage.stored_file import StoredFile
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
@@ -154,4 +154,6 @@ def open_bag(path: Path | str, salvage: bool = False) -> Bag:
     path = Path(path)
     if not path.exists():
         raise InputError(f"there is no bag {path}")
+    if path.name == METADATA:
+        path = path.parent
     return Bag(path, find_recording(path) if path.is_dir() else RecordingFiles([path]), salvage)

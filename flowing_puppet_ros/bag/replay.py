@@ -39,9 +39,6 @@ METADATA_NAME = "flowing_puppet_ros"
 _COPIED_TYPES = (CAMERA_INFO, PUPPETS, TRANSFORMS)
 """Types of input topics that are copied to the output bag, so that a viewer needs no other bag."""
 
-_SENSOR_PORTS = ("image", "points", "depth")
-"""Inputs whose messages have to follow one another in time."""
-
 
 @dataclass(frozen=True, slots=True)
 class ReplayOptions:
@@ -266,10 +263,14 @@ class _Replay:
             if str(error) not in self.warnings:
                 self.warnings.append(str(error))
             return
-        if any(port in _SENSOR_PORTS for _, port in routes):
+        if any(self._needs_time(instance, port) for instance, port in routes):
             self.warnings += self._stuck.advance(topic, record.log_time, message)
         for instance, port in routes:
             self._emit(writer, log_time, instance, self._handle(instance, port, message))
+
+    def _needs_time(self, instance: Instance, port: str) -> bool:
+        """Return whether messages of an input must follow one another in time; not if partners have their stamps."""
+        return port in ("points", "depth") and instance.resolve("initial") not in self._recorded
 
     def _handle(self, instance: Instance, port: str, message: Any) -> Output:
         return self._run_timed(instance, lambda: instance.component.handle(port, message))

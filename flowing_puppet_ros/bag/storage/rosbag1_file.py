@@ -32,6 +32,8 @@ class Rosbag1File:
         try:
             self._reader.open()
         except Exception as error:  # a damaged file makes the library raise anything
+            if "encrypt" in str(error):
+                raise InputError(f"{path} is encrypted: `rosbag decrypt` of ROS 1 writes one that is not") from error
             raise InputError(f"{path} was not closed, is cut off or damaged: add --salvage to read the rest") from error
         self._connections = list(self._reader.connections)
         self.topics = [

@@ -44,6 +44,8 @@ from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 
 OPTICAL = re.compile(r"optical(_frame)?$")
 """Frames that look along z with y down (REP-103)."""
+ASSUMED_INTERVAL_NS = 100_000_000
+"""Between clouds whose stamps do not advance (drivers that stamp nothing)."""
 MIN_CAMERA_DISTANCE_M = 0.1
 MAX_FIELD_OF_VIEW = 1.2  # tangent of half of it: 100 degrees from side to side
 
@@ -97,6 +99,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
         self._depth = DepthPairs(self.report)
         self._up_of_nameless = ""
+        self._clock: tuple[int, int] | None = None
         self._line = PendingQueue()
         self._initial = StampBuffer()
         self._outputs = BodyOutputs(settings.output, settings.ros4hri, factory, self._model)
@@ -114,6 +117,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._line.clear()
         self._initial.clear()
         self._up_of_nameless = ""
+        self._clock = None
 
     def flush(self) -> Output:
         """Fit the clouds that still wait."""
@@ -234,6 +238,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         occluded: list[str] = []
         try:
             scene, to_z_up = self._decode(cloud, of_depth)
+            scene = replace(scene, stamp=self._advance_clock(stamp))
             if initial is not None and initial.bodies:
                 fits = self._fit_initial(scene, to_z_up, initial, self.seed_of(stamp))
             else:
@@ -243,6 +248,17 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             self.report.count_unusable(error)
         self.counters["bodies"] += len(fits)
         return self._outputs.make(cloud.header, fits, occluded, self._subscribed)
+
+    def _advance_clock(self, stamp: int) -> int:
+        """Return the time of a cloud, ns: its stamp, or some time after the cloud before it if that has the same."""
+        earlier, self._clock = self._clock, (stamp, stamp)
+        if earlier is None or stamp != earlier[0]:
+            return stamp
+        self.report.warn(
+            f"two clouds have the stamp {stamp} ns: they are taken as {ASSUMED_INTERVAL_NS * 1e-9:g} s apart"
+        )
+        self._clock = stamp, earlier[1] + ASSUMED_INTERVAL_NS
+        return self._clock[1]
 
     def _fit_silhouettes(self, message: Any) -> Output:
         self.counters["silhouettes"] += 1

@@ -76,7 +76,7 @@ def decode_image(message: Any) -> U8:
     """Return the RGB image (H, W, 3) of an Image or a CompressedImage; InputError when it cannot be decoded."""
     if hasattr(message, "format"):
         return _decode_compressed(message)
-    encoding = message.encoding.lower()
+    encoding = message.encoding.lower().strip()
     if encoding in _FILES:
         return _decode_file(message_bytes(message.data), message.encoding)
     if encoding in _PLANAR:
