@@ -199,7 +199,8 @@ def test_types_are_known_however_they_are_written(kind: str, tmp_path: Path) -> 
 
 
 def test_names_that_are_no_ros_types_stay() -> None:
-    assert normalise_type("foxglove.Log") == "foxglove/msg/Log"
+    assert normalise_type("foxglove.Log") == "foxglove.Log"
+    assert normalise_type("sensor_msgs.msg.Image") == IMAGE
     assert normalise_type("a.b.Log") == "a.b.Log"
     assert normalise_type("Log") == "Log"
     assert normalise_type("tf/tfMessage") == TRANSFORMS

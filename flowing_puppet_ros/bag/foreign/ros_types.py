@@ -22,7 +22,8 @@ def normalise_type(name: str, rename: bool = True) -> str:
     These are `package/Name`, `package::msg::Name`, `package::msg::dds_::Name_` and `package.msg.Name`. With `rename`,
     the type of ROS 2 is returned for that of ROS 1.
     """
-    parts = [part for part in re.split(r"::|[/.]", name.strip()) if part not in ("msg", "dds_")]
+    separator = r"::|[/.]" if ".msg." in name else r"::|/"
+    parts = [part for part in re.split(separator, name.strip()) if part not in ("msg", "dds_")]
     if len(parts) != 2 or not all(re.fullmatch(r"\w+", part) for part in parts):
         return name
     normal = f"{parts[0]}/msg/{parts[1].removesuffix('_')}"
