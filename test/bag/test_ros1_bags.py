@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import gzip
+import sqlite3
 import struct
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,8 @@ import pytest
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from flowing_puppet_ros.bag.foreign.ros_types import normalise_type
@@ -20,6 +23,7 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
+from flowing_puppet_ros.stream.messages.geometry import make_header
 from flowing_puppet_ros.stream.messages.images import decode_image
 from flowing_puppet_ros.stream.messages.message_types import (
     CAMERA_INFO,
@@ -248,3 +252,26 @@ def test_compressed_images_of_ros1_keep_their_bytes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(good.message.data, np.arange(50))
     with pytest.raises(InputError, match="a message on /eye/image_raw/compressed is not the sensor_msgs/msg/Compr"):
         _ = bad.message
+
+
+def test_clouds_of_the_first_years_are_read(tmp_path: Path) -> None:
+    kind = "sensor_msgs/msg/PointCloud"
+    points = [T["geometry_msgs/msg/Point32"](*map(float, point)) for point in POINTS]
+    with Writer(tmp_path / "a.bag") as writer:
+        connection = writer.add_connection("/points", kind, typestore=ROS1)
+        writer.write(connection, 5, bytes(ROS1.serialize_ros1(T[kind](header(3), points, []), kind)))
+    # A database of an older recorder has no definitions.
+    new, factory = typestore(), BagMessageFactory()
+    points = [factory.make("geometry_msgs/msg/Point32", x=x, y=y, z=z) for x, y, z in POINTS.tolist()]
+    message = factory.make(kind, header=make_header(factory, 1_500_000_000 * 10**9 + 3, "/eye"), points=points)
+    with Rosbag2Writer(tmp_path / "b", version=9, storage_plugin=StoragePlugin.SQLITE3) as other:
+        connection = other.add_connection("/points", kind, typestore=new)
+        other.write(connection, 5, bytes(new.serialize_cdr(message, kind)))
+    with sqlite3.connect(tmp_path / "b" / "b.db3") as database:
+        database.execute("delete from message_definitions")
+    for name in ("a.bag", "b"):
+        with open_bag(tmp_path / name) as bag:
+            assert bag.topics == {"/points": POINT_CLOUD}
+            (record,) = bag.messages()
+        np.testing.assert_array_equal(decode_cloud(record.message)[0], POINTS)
+        assert (record.message.header.stamp.nanosec, record.message.header.frame_id) == (3, "/eye")

@@ -55,7 +55,7 @@ class Converter:
     def _make_plan(self) -> Callable[[bytes], bytes] | None:
         topic = self._topic
         if self._schema is not None:
-            decode, build = make_decoder(topic), self._schema.build
+            decode, build = make_decoder(topic, self._store), self._schema.build
             return lambda raw: self._serialise(build(self._factory, decode(raw)))
         if self.type not in self._store.fielddefs or topic.encoding not in ("cdr", "ros1"):
             return None
@@ -67,7 +67,7 @@ class Converter:
                 return None
             return lambda raw: bytes(self._store.ros1_to_cdr(raw, self.type))
         cache: dict[str, object] = {}
-        decode = make_decoder(topic)
+        decode = make_decoder(topic, self._store)
         return lambda raw: self._serialise(
             migrate_message(source, self._store, own_type, self.type, cache, decode(raw))
         )

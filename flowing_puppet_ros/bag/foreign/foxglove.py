@@ -15,7 +15,7 @@ import numpy as np
 
 from flowing_puppet_ros.bag.foreign.payloads import read_bytes
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud, make_cloud
-from flowing_puppet_ros.stream.messages.geometry import make_header, rotation_matrix
+from flowing_puppet_ros.stream.messages.geometry import header_ns, make_header, rotation_matrix
 from flowing_puppet_ros.stream.messages.message_types import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
@@ -39,7 +39,12 @@ class ForeignSchema:
 
 
 def find_schema(name: str) -> ForeignSchema | None:
-    """Return what becomes of a schema, by its name in JSON, protobuf, ROS 1, ROS 2 or IDL; None for other types."""
+    """Return what becomes of a schema, by its name in JSON, protobuf, ROS 1, ROS 2 or IDL; None for other types.
+
+    The cloud of the first years of ROS, `sensor_msgs/PointCloud`, is one too.
+    """
+    if re.fullmatch(r"sensor_msgs/(?:msg/)?PointCloud", name):
+        return ForeignSchema(POINT_CLOUD, _build_old_cloud)
     if re.fullmatch(r"ffmpeg_image_transport_msgs(?:/msg)?/FFMPEGPacket", name):
         return ForeignSchema(COMPRESSED_IMAGE, _build_packet)
     found = re.fullmatch(r"foxglove(?:_msgs)?(?:\.|/|::)(?:msg(?:\.|/|::))?(\w+)", name)
@@ -65,8 +70,7 @@ def _build_compressed(factory: MessageFactory, image: Any) -> Any:
 
 
 def _build_packet(factory: MessageFactory, packet: Any) -> Any:
-    stamp = packet.header.stamp
-    header = make_header(factory, int(stamp.sec) * NANOSECONDS + int(stamp.nanosec), packet.header.frame_id)
+    header = _copy_header(factory, packet.header)
     form = packet.encoding.partition(";")[0]  # behind it the names of pixel formats
     return factory.make(COMPRESSED_IMAGE, header=header, format=form, data=read_bytes(packet.data))
 
@@ -102,6 +106,11 @@ def _build_cloud(factory: MessageFactory, cloud: Any) -> Any:
     points, normals = decode_cloud(message)
     turned = None if normals is None else normals @ rotation.T
     return make_cloud(factory, header, points @ rotation.T + translation, turned)
+
+
+def _build_old_cloud(factory: MessageFactory, cloud: Any) -> Any:
+    header = _copy_header(factory, cloud.header)
+    return make_cloud(factory, header, np.array([[point.x, point.y, point.z] for point in cloud.points]).reshape(-1, 3))
 
 
 def _build_calibration(factory: MessageFactory, camera: Any) -> Any:
@@ -148,6 +157,11 @@ def _make_transform(factory: MessageFactory, transform: Any) -> Any:
 
 def _make_header(factory: MessageFactory, message: Any) -> Any:
     return make_header(factory, _read_time(message), getattr(message, "frame_id", ""))
+
+
+def _copy_header(factory: MessageFactory, header: Any) -> Any:
+    """Return a header of another version of ROS as one of ROS 2."""
+    return make_header(factory, header_ns(header), header.frame_id)
 
 
 def _read_time(message: Any) -> int:

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from rosbags.typesys.store import Typestore
 
 from flowing_puppet_ros.arrays import U8
 from flowing_puppet_ros.bag.foreign.ros_types import make_source_store, normalise_type
@@ -18,13 +19,18 @@ from flowing_puppet_ros.bag.storage.stored_file import StoredTopic
 Decoder = Callable[[bytes], Any]
 
 
-def make_decoder(topic: StoredTopic) -> Decoder:
-    """Return the function from a message's bytes to an object; ValueError without a definition that it needs."""
+def make_decoder(topic: StoredTopic, known: Typestore) -> Decoder:
+    """Return the function from a message's bytes to an object; ValueError without a definition that it needs.
+
+    Databases of older recorders have no definitions: of ROS 2 messages those that are `known` are taken.
+    """
     if topic.encoding == "json":
         return lambda raw: json.loads(raw, object_hook=lambda fields: SimpleNamespace(**fields))
     if topic.encoding == "protobuf":
         return _make_protobuf_decoder(topic)
     store, kind = make_source_store(topic), normalise_type(topic.type, rename=False)
+    if store is None and topic.encoding == "cdr" and kind in known.fielddefs:
+        store = known
     if store is None:
         raise ValueError(f"there is no definition of {topic.type}")
     if topic.encoding == "ros1":
