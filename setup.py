@@ -54,6 +54,7 @@ setup(
         "learn": requirements("learn") + requirements("learn-assets"),
         "annotate": requirements("annotate"),
         "cluster": requirements("cluster"),
+        "neural": requirements("neural"),
         "rerun": requirements("rerun"),
         "video": requirements("video"),
     },

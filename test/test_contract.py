@@ -22,7 +22,9 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
 FOUNDATION = {"arrays", "errors", "ids", "images", "reporting", "settings", "threads", "units"}
 """Modules beside the rooms, which everything may import."""
-OPTIONAL_PACKAGES = {"anny", "av", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug"}
+OPTIONAL_PACKAGES = {
+    "ai_edge_litert", "anny", "av", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug",
+}  # fmt: skip
 ONLY_WITH_EXTRA = "flowing_puppet_ros.annotate.server"
 """Nothing but an extra's own module imports what the extra brings at its top."""
 OPTIONAL = {
@@ -30,13 +32,14 @@ OPTIONAL = {
     "cli.annotate": "annotate",
     "learn": "learn",
     "cli.batch.cluster": "cluster",
+    "image.networks.runtime": "neural",
     "report.rerun_file": "rerun",
     "bag.foreign.video": "video",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10
 MAY_IMPORT: dict[str, set[str]] = {
-    "annotate": {"draw", "flow", "image.formats", "image.tracking", "model.ds"},
+    "annotate": {"draw", "flow", "image.detector", "image.formats", "image.networks", "image.tracking", "model.ds"},
     "bag": {
         "bag.foreign",
         "bag.storage",
@@ -68,6 +71,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "evidence.image",
         "image.detector",
         "image.formats",
+        "image.networks",
         "image.pose",
         "image.video",
         "model",
@@ -97,18 +101,10 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cli.sample": {"body.scans", "draw", "model", "model.ds"},
     "draw": {"flow"},
     "evaluate": {"image.formats", "model"},
-    "evaluate.bag": {
-        "bag",
-        "bag.storage",
-        "body.scans",
-        "evaluate",
-        "image.formats",
-        "multiview",
-        "stream",
-        "stream.messages",
-    },
+    "evaluate.bag": {"bag", "body.scans", "evaluate", "image.formats", "multiview", "stream", "stream.messages"},
     "evaluate.body": {"body.fit", "body.scans", "learn.anny", "model"},
     "evaluate.image": {
+        "evaluate",
         "evidence.image",
         "flow",
         "image.formats",
@@ -125,6 +121,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "image.arms",
         "image.detector",
         "image.formats",
+        "image.networks",
         "image.tracking",
         "image.video",
         "model.ds",
@@ -137,6 +134,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "image.arms": {"evidence.image", "flow", "image.detector", "image.pose", "image.tracking", "model.ds"},
     "image.detector": {"evidence.image", "image.formats", "model"},
     "image.formats": {"model", "model.ds"},
+    "image.networks": {"image.formats"},
     "image.pose": {"image.formats", "inference", "model", "model.ds"},
     "image.thesis_loop": {
         "evidence.image",
@@ -155,6 +153,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "image.arms",
         "image.detector",
         "image.formats",
+        "image.networks",
         "image.thesis_loop",
         "image.tracking",
         "model.ds",
@@ -189,6 +188,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "draw",
         "flow",
         "image.formats",
+        "image.networks",
         "image.tracking",
         "image.video",
         "model",
@@ -196,8 +196,10 @@ MAY_IMPORT: dict[str, set[str]] = {
         "multiview",
         "stream",
         "stream.messages",
+        "stream.messages.bodies",
     },
-    "stream.messages": {"body.fit", "image.formats", "image.tracking", "model", "model.ds", "multiview"},
+    "stream.messages": {"body.fit", "draw", "image.formats", "image.tracking", "model", "model.ds"},
+    "stream.messages.bodies": {"model", "multiview", "stream.messages"},
 }
 """The other rooms (folders of modules) that each room imports; the layers in docs/architecture.md are made from it."""
 

@@ -17,27 +17,30 @@ from flowing_puppet_ros.bag.foreign.ros_types import normalise_type
 from flowing_puppet_ros.bag.foreign.video import VideoImages
 from flowing_puppet_ros.bag.storage.folder import METADATA, RecordingFiles, find_recording
 from flowing_puppet_ros.bag.storage.open_file import open_file
+from flowing_puppet_ros.bag.storage.paths import is_bag as is_bag  # for those who open what it recognises
 from flowing_puppet_ros.bag.storage.stored_file import StoredFile
-from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
+from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore, typestore_with
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Record:
-    """One recorded message: its topic, type, time of recording (nanoseconds) and CDR bytes."""
+    """One recorded message: topic, type, time of recording (ns), CDR bytes, and the type's definition in the bag."""
 
     topic: str
     type: str
     log_time: int
     raw: bytes
+    definition: str = ""
 
     @property
     def message(self) -> Any:
         """The message object; InputError if the type is unknown or the bytes are not a message of it."""
-        store = typestore()
-        if self.type not in store.fielddefs:
-            raise InputError(f"the messages on {self.topic} have the type {self.type}, which is not known here")
+        try:
+            store = typestore_with(self.type, self.definition)
+        except InputError as error:
+            raise InputError(f"the messages on {self.topic} cannot be read: {error}") from error
         try:
             return store.deserialize_cdr(self.raw, self.type)
         except Exception as error:  # wrong bytes make the library raise anything
@@ -142,7 +145,7 @@ def _read(file: StoredFile, converters: Sequence[Converter], topics: Collection[
     chosen = [index for index, topic in enumerate(file.topics) if topic.topic in topics]
     for index, log_time, raw in file.messages(chosen) if chosen else ():
         converter = converters[index]
-        yield Record(file.topics[index].topic, converter.type, log_time, converter.convert(raw))
+        yield Record(file.topics[index].topic, converter.type, log_time, converter.convert(raw), converter.definition)
 
 
 def open_bag(path: Path | str, salvage: bool = False) -> Bag:

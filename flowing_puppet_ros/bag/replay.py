@@ -28,9 +28,16 @@ from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.component import Output, Port
 from flowing_puppet_ros.stream.components.registry import COMPONENTS
+from flowing_puppet_ros.stream.messages.detections import find_body_id, name_body, skeleton_topic
 from flowing_puppet_ros.stream.messages.geometry import FrameTree
 from flowing_puppet_ros.stream.messages.images import compress_image
-from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, PUPPETS, TRANSFORMS
+from flowing_puppet_ros.stream.messages.message_types import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IDS_LIST,
+    PUPPETS,
+    TRANSFORMS,
+)
 from flowing_puppet_ros.threads import one_opencv_thread
 
 STATIC_TRANSFORMS = "/tf_static"
@@ -91,7 +98,7 @@ class _Replay:
     def __init__(self, bag: Bag, options: ReplayOptions) -> None:
         self._bag = bag
         self._options = options
-        self._new_name = {name: options.topic_map.get(name, name) for name in bag.topics}
+        self._new_name = _rename_topics(bag.topics, options.topic_map)
         self._factory = BagMessageFactory()
         self.warnings: list[str] = list(bag.notes)
         self._stuck = StuckStamps()
@@ -266,7 +273,8 @@ class _Replay:
         if any(self._needs_time(instance, port) for instance, port in routes):
             self.warnings += self._stuck.advance(topic, record.log_time, message)
         for instance, port in routes:
-            self._emit(writer, log_time, instance, self._handle(instance, port, message))
+            named = name_body(instance.resolve(port), topic, message)
+            self._emit(writer, log_time, instance, self._handle(instance, port, named))
 
     def _needs_time(self, instance: Instance, port: str) -> bool:
         """Return whether messages of an input must follow one another in time; not if partners have their stamps."""
@@ -334,6 +342,16 @@ class _Replay:
             **({} if count_used(instances) else {"unused": explain_unused(self._graph, self._recorded, self.warnings)}),
             **self.describe(),
         }
+
+
+def _rename_topics(topics: Mapping[str, str], topic_map: Mapping[str, str]) -> dict[str, str]:
+    """Return old topic -> new topic; with a list of bodies, their skeletons move beside its new name."""
+    found = {name: topic_map.get(name, name) for name in topics}
+    for listing, new in topic_map.items():
+        if topics.get(listing) == IDS_LIST:
+            bodies = {name: find_body_id(listing, name) for name in topics if name not in topic_map}
+            found |= {name: skeleton_topic(new, identity) for name, identity in bodies.items() if identity}
+    return found
 
 
 def pace(records: Iterator[Record], rate: float) -> Iterator[Record]:

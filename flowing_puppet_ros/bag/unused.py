@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from flowing_puppet_ros.bag.graph import IMAGE_NAMES, Graph, Instance
 from flowing_puppet_ros.bag.reader import Topic
@@ -36,7 +36,7 @@ def explain_unused(graph: Graph, recorded: Mapping[str, Topic], warnings: Iterab
     return {name: _explain(name, topic, routes.get(name, []), said) for name, topic in sorted(recorded.items())}
 
 
-def _explain(name: str, topic: Topic, routes: Iterable[tuple[Instance, str]], warnings: list[str]) -> str:
+def _explain(name: str, topic: Topic, routes: Sequence[tuple[Instance, str]], warnings: list[str]) -> str:
     if not topic.count:
         return "no messages"
     if topic.type in _HELPERS:
@@ -49,6 +49,8 @@ def _explain(name: str, topic: Topic, routes: Iterable[tuple[Instance, str]], wa
     about = [text for text in warnings if base_topic(name) in text.replace(",", " ").replace(":", " ").split()]
     if about:
         return about[0]
+    if routes:
+        return f"{topic.type} alone gives no result"
     if topic.type in (IMAGE, COMPRESSED_IMAGE):
         namespace = base_topic(name).rpartition("/")[0]
         return f"images are wanted on {', '.join(IMAGE_NAMES)}; --topic-map {name}:={namespace}/image renames them"

@@ -26,7 +26,7 @@ from flowing_puppet_ros.bag.storage.paths import is_bag
 from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.errors import InputError, PuppetError
 
-_OF_NODES_ONLY = ("queue", "autostart", "use_sim_time")
+_OF_NODES_ONLY = ("queue", "image_transport", "autostart", "use_sim_time")
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 
+from flowing_puppet_ros.bag.depth_topics import ImageSample
+from flowing_puppet_ros.bag.graph import build_graph
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
@@ -18,7 +20,7 @@ from flowing_puppet_ros.evaluate.bag.recording import read_recording, to_cloud
 from flowing_puppet_ros.report.data import gather_data
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud, make_cloud
-from flowing_puppet_ros.stream.messages.geometry import make_header
+from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import BODIES, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
 
@@ -90,6 +92,17 @@ def compressed(message: Any) -> Any:
     pixels = message.data.view("<u2").reshape(message.height, message.width)
     data = np.concatenate([np.zeros(12, np.uint8), cv2.imencode(".png", pixels)[1].reshape(-1)])
     return FACTORY.make(COMPRESSED_IMAGE, header=message.header, format="16UC1; compressedDepth png", data=data)
+
+
+def test_a_depth_image_that_was_also_recorded_compressed_is_used_once() -> None:
+    image, info_topic = "/rig/depth/image_rect", "/rig/depth/camera_info"
+    packed = f"{image}/compressedDepth"
+    for recorded, fed in ({packed: COMPRESSED_IMAGE, image: IMAGE}, image), ({packed: COMPRESSED_IMAGE}, packed):
+        topics = recorded | {info_topic: CAMERA_INFO}
+        samples = dict.fromkeys(recorded, ImageSample("16UC1", "eye", (WIDTH, HEIGHT)))
+        graph = build_graph(topics, samples, FrameTree(), {info_topic: info(0)}, {"body_fitter": FAST}, FACTORY)
+        routes = {topic: [port for _, port in found] for topic, found in graph.find_routes(topics).items()}
+        assert [topic for topic in recorded if routes.get(topic) == ["depth"]] == [fed]
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,8 @@ NO_MESSAGE = b""
 class Converter:
     """Converts the messages of one topic; `type` is the ROS 2 type that they have afterwards.
 
+    `definition` is the text of the type in the file, for types that are not known here.
+
     The topic's own definition is read with its first message, so topics that nobody reads cost nothing.
     """
 
@@ -34,6 +36,8 @@ class Converter:
         self._factory = factory
         self._schema = find_schema(topic.type)
         self.type = self._schema.type if self._schema else normalise_type(topic.type)
+        as_written = topic.encoding == "cdr" and topic.schema_encoding == "ros2msg" and not self._schema
+        self.definition = topic.schema.decode("utf8", "replace") if as_written else ""
 
     def convert(self, raw: bytes) -> bytes:
         """Return the message in CDR, or NO_MESSAGE; of a type that is not known here as it is."""

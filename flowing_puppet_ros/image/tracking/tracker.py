@@ -171,9 +171,13 @@ class FlowingPuppetTracker:
         if detections is not None:
             found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
             appearances = self._measure_appearances(image, found)
-            matched, unmatched = associate(self.tracks, found, self.settings.match_distance, appearances)
+            ids = [keypoints.track_id for keypoints in detections]
+            matched, unmatched = associate(self.tracks, found, self.settings.match_distance, appearances, ids)
             self._fuse_detections(found, appearances, matched, searched_ids)
             self._start_tracks(found, unmatched, warnings)
+            for track in self.tracks:
+                if track.detection is not None:
+                    track.detector_id = ids[track.detection] or track.detector_id
         self.tracks = [track for track in self.tracks if self._is_alive(track, frame.grid.image)]
         for track in self.tracks:
             track.complete_and_redraw(self.model)

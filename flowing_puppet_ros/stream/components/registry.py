@@ -33,6 +33,11 @@ class NodeSettings(Settings):
     """Settings that every node has beside those of its component."""
 
     queue: int = setting(1, QUEUE_HELP, low=1, high=1000)
+    image_transport: str = setting(
+        "auto",
+        "images to subscribe to, never both: auto: those that are published, raw ones first",
+        choices=("auto", "raw", "compressed"),
+    )
     autostart: bool = setting(True, "configure and activate on start-up; off: a lifecycle manager does it")
 
 

@@ -19,9 +19,9 @@ from flowing_puppet_ros.image.detector.detection import PersonCandidate
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.video.detection_worker import DetectedPerson
-from flowing_puppet_ros.image.video.flow_history import propagate_points
 from flowing_puppet_ros.image.video.known_people import KnownPeople
-from flowing_puppet_ros.image.video.live_tracker import FRAME_NS, LiveTracker
+from flowing_puppet_ros.image.video.live_tracker import LiveTracker
+from flowing_puppet_ros.image.video.pending_detection import FRAME_NS, propagate_points
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
