@@ -20,7 +20,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from flowing_puppet_ros.bag.paths import is_bag
+from flowing_puppet_ros.bag.storage.paths import is_bag
 from flowing_puppet_ros.draw.overlay_video import check_overlay, read_drawn_tracks, write_overlay
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.frame_names import FrameNames, Size
