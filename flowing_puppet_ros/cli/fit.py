@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import FitterSettings
-from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
+from flowing_puppet_ros.body.scans.scan import SCAN_SUFFIXES, SUFFIXES, read_scan
 from flowing_puppet_ros.body.scans.scan_frame import UNITS, UP_AXES
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli.batch import runner
@@ -135,9 +135,9 @@ def _find_scans(given: Path) -> list[Path]:
     """Yield an input, or the files of a folder that may be scans, by name."""
     if not given.is_dir():
         return [given]
-    found = sorted(path for path in given.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    found = sorted(path for path in given.iterdir() if path.suffix.lower() in SCAN_SUFFIXES and path.is_file())
     if not found:
-        raise InputError(f"the folder {given} has no scan; wanted are files ending in {' '.join(SUFFIXES)}")
+        raise InputError(f"the folder {given} has no scan; wanted are files ending in {' '.join(SCAN_SUFFIXES)}")
     return found
 
 
