@@ -7,7 +7,6 @@ import os
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,62 +14,16 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
-from flowing_puppet_ros.body.fit.up_axis_search import fit_in_best_frame
-from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
-from flowing_puppet_ros.body.scans.scan_frame import (
-    UNITS,
-    ScanFrame,
-    guess_scale,
-    is_seen_from_origin,
-    parse_axis,
-    propose_all_up_axes,
-    propose_up_axes,
-)
-from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
-from flowing_puppet_ros.body.segmentation.up_axis import segment_people_unknown_up
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame
+from flowing_puppet_ros.body.scans.scan import read_scan, to_smallest_float, write_ply
+from flowing_puppet_ros.body.scans.unit import GUESS
+from flowing_puppet_ros.cli.fit_people import FitOptions, ScanPerson, find_people
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 WRITTEN_SHAPE_COEFFICIENTS = 4  # of each part, as in the thesis; all are in `all_shape_coefficients`
-MAX_SCENE_POINTS = 300_000  # sampled from a scene
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScanPerson:
-    """One person's cloud in a scan's frame and unit.
-
-    Attributes:
-        suffix: appended to the input's stem for the result.
-        points: (N, 3).
-        normals: (N, 3) or None.
-        scale: metres per unit.
-        ups: directions (3,) that may be up, the most likely first.
-        sensor: (3,) position of the sensor if the cloud shows one side, else None.
-    """
-
-    suffix: str
-    points: np.ndarray
-    normals: np.ndarray | None
-    scale: float
-    ups: list[np.ndarray]
-    sensor: np.ndarray | None
-
-
-@dataclass(frozen=True, slots=True)
-class FitOptions:
-    """All options of a fit; see the flags of `fit`. Only `settings.threads` does not change the result."""
-
-    out: Path = field(repr=False)
-    model: str
-    up: str
-    upright: str
-    unit: str
-    view: str
-    scene: bool
-    settings: FitterSettings
-    segmentation: SegmentationSettings
 
 
 def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str, Any]:
@@ -81,12 +34,11 @@ def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str
     started = time.perf_counter()
     fitter = _make_fitter(options.model, options.settings)
     _refuse_overwriting(source, options)
-    scan = read_scan(source)
-    if not options.scene:
-        person = _take_whole_scan(scan, fitter, options)
-        return {"input": str(source)} | _fit_person(source, person, fitter, options, started, shown)
+    people = find_people(read_scan(source), source, fitter, options)
+    if not people[0].suffix:
+        return {"input": str(source)} | _fit_person(source, people[0], fitter, options, started, shown)
     fits = []
-    for person in _segment_scene(scan, source, fitter, options):
+    for person in people:
         fits.append(_fit_person(source, person, fitter, options, started, shown))
         started = time.perf_counter()
     return {"input": str(source), "people": fits}
@@ -109,94 +61,74 @@ def _refuse_overwriting(source: Path, options: FitOptions) -> None:
         raise InputError(f"the fit of {source} would overwrite it; choose another folder for --out")
 
 
-def _take_whole_scan(scan: Scan, fitter: BodyFitter, options: FitOptions) -> ScanPerson:
-    """Return the only person of a scan."""
-    scale = guess_scale(scan) if options.unit == "auto" else UNITS[options.unit]
-    points, normals = scan.sample_surface(fitter.settings.max_points, np.random.default_rng(fitter.settings.seed))
-    sensor = _locate_sensor(points, normals, scale, options.view)
-    ups = propose_up_axes(points, sensor is not None) if options.up == "auto" else [parse_axis(options.up)]
-    return ScanPerson("", points, normals, scale, _candidate_ups(points, ups, options), sensor)
-
-
-def _segment_scene(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> list[ScanPerson]:
-    """Segment the people in the cloud of a scene; PuppetError if there is none."""
-    scale = UNITS["m" if options.unit == "auto" else options.unit]
-    points, normals = scan.sample_surface(MAX_SCENE_POINTS, np.random.default_rng(fitter.settings.seed))
-    ups = [parse_axis(name) for name in (("z", "y", "-y") if options.up == "auto" else (options.up,))]
-    sensor = None if options.view == "full" else np.zeros(3)
-    up, found = segment_people_unknown_up(points, normals, scale, ups, sensor, options.segmentation)
-    if not found:
-        raise PuppetError(
-            f"{path} shows no person among its {len(points)} points; check --up and --unit, lower "
-            "--segmentation-min-score, or cut the person out and leave --scene"
-        )
-    people = []
-    for number, cloud in enumerate(found, start=1):
-        seen = _locate_sensor(cloud.points, cloud.normals, scale, options.view)
-        ways = _candidate_ups(cloud.points, [up], options)
-        people.append(ScanPerson(f"-{number}", cloud.points, cloud.normals, scale, ways, seen))
-    return people
-
-
-def _candidate_ups(points: np.ndarray, ups: list[np.ndarray], options: FitOptions) -> list[np.ndarray]:
-    return propose_all_up_axes(points) if options.upright == "any" else ups
-
-
 def _fit_person(
     path: Path, person: ScanPerson, fitter: BodyFitter, options: FitOptions, started: float, shown: bool
 ) -> dict[str, Any]:
     output = options.out / f"{path.stem}{person.suffix}.npz"
     with tqdm(total=100, desc=output.stem, unit="%", file=sys.stderr, disable=not shown) as bar:
-        frame, fit = fit_in_best_frame(
+        found = fit_in_best_frame(
             fitter,
             person.points,
             person.normals,
-            scale=person.scale,
+            units=person.units,
             ups=person.ups,
             sensor=person.sensor,
             progress=_progress_on(bar),
         )
     seconds = time.perf_counter() - started
     try:
-        _write_fit(output, fitter.model, frame, fit, seconds)
+        _write_fit(output, fitter.model, found, seconds)
     except OSError as error:
         raise PuppetError(f"{output} cannot be written: {error.strerror}") from error
+    fit, unit = found.fit, found.unit
     return {
         "output": str(output),
         "model": fitter.model.name,
         "energy": fit.energy,
         "confidence": fit.confidence,
         "reliable": fit.reliable,
-        "two_way_distance_m": fit.two_way_distance,
-        "metres_per_unit": frame.scale,
-        "up": np.round(frame.up, 6).tolist(),
+        "two_way_distance_m": fit.two_way_distance * unit.metres / unit.fitted,
+        "unit": unit.name,
+        "metres_per_unit": unit.metres,
+        "unit_clear": found.unit_clear,
+        "child": unit.is_child,
+        "up": np.round(found.frame.up, 6).tolist(),
+        "up_clear": found.up_clear,
         "view": "full" if person.sensor is None else "single",
+        "notes": [*person.notes, *_describe_frame(found)],
         "seconds": seconds,
     }
+
+
+def _describe_frame(found: FrameFit) -> list[str]:
+    """Return what the user should know about the unit and the axes, a sentence each."""
+    notes = []
+    if not found.up_clear:
+        notes.append(f"which way is up is not clear, {_name_axis(found.frame.up)} was taken; name it with --up")
+    if found.unit.is_child:
+        notes.append(f"the person is smaller than an adult and was fitted as a child; check --unit {found.unit.name}")
+    if found.unit.name == GUESS:
+        notes.append(
+            f"no unit gives an adult's size, {found.unit.metres:.4g} metres per unit was guessed from the proportions;"
+            " name --unit, also for a child"
+        )
+    elif not found.unit_clear:
+        notes.append(f"the unit is not clear, {found.unit.name} was taken; name it with --unit")
+    return notes
+
+
+def _name_axis(up: np.ndarray) -> str:
+    k = int(np.abs(up).argmax())
+    return ("-" if up[k] < 0 else "") + "xyz"[k]
 
 
 def _progress_on(bar: tqdm) -> Callable[[float], None]:
     return lambda done: bar.update(int(100 * done) - bar.n) and None
 
 
-def _locate_sensor(points: np.ndarray, normals: np.ndarray | None, scale: float, view: str) -> np.ndarray | None:
-    """Return the position (3,) of the sensor of a cloud from one side, None for a cloud from all sides.
-
-    It is the origin if that lies outside the cloud, otherwise in the mean direction of the normals.
-    """
-    if view == "full" or (view == "auto" and not is_seen_from_origin(scale * points)):
-        return None
-    low, high = points.min(axis=0), points.max(axis=0)
-    if np.any((low > 0) | (high < 0)):
-        return np.zeros(3)
-    if normals is None:
-        raise InputError("--view single needs the sensor at the origin of the input's frame, or normals; give either")
-    mean = normals.mean(axis=0)
-    return points.mean(axis=0) + 3 * float(np.ptp(points, axis=0).max()) * mean / max(float(np.linalg.norm(mean)), 1e-9)
-
-
-def _write_fit(output: Path, model: StitchedPuppet, frame: ScanFrame, fit: BodyFit, seconds: float) -> None:
+def _write_fit(output: Path, model: StitchedPuppet, found: FrameFit, seconds: float) -> None:
     """Write the fit, in the scan's frame and unit, as `output` and as a mesh beside it."""
+    frame, fit = found.frame, found.fit
     vertices = to_smallest_float(frame.to_scan(fit.vertices))
     arrays: dict[str, Any] = {
         "vertices": vertices,
@@ -215,6 +147,12 @@ def _write_fit(output: Path, model: StitchedPuppet, frame: ScanFrame, fit: BodyF
         "confidence": fit.confidence,
         "reliable": fit.reliable,
         "two_way_distance": fit.two_way_distance / frame.scale,
+        "metres_per_unit": found.unit.metres,
+        "unit": found.unit.name,
+        "unit_clear": found.unit_clear,
+        "child": found.unit.is_child,
+        "up": frame.up,
+        "up_clear": found.up_clear,
         "seconds": seconds,
         "model": model.name,
     }
