@@ -17,7 +17,7 @@ from tqdm import tqdm
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame
 from flowing_puppet_ros.body.scans.scan import read_scan, to_smallest_float, write_ply
-from flowing_puppet_ros.body.scans.unit import GUESS
+from flowing_puppet_ros.body.scans.unit import GUESS, has_size_of_person
 from flowing_puppet_ros.cli.fit_people import FitOptions, ScanPerson, find_people
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
@@ -75,6 +75,7 @@ def _fit_person(
             sensor=person.sensor,
             progress=_progress_on(bar),
         )
+    _refuse_no_person(person, found)
     seconds = time.perf_counter() - started
     try:
         _write_fit(output, fitter.model, found, seconds)
@@ -98,6 +99,17 @@ def _fit_person(
         "notes": [*person.notes, *_describe_frame(found)],
         "seconds": seconds,
     }
+
+
+def _refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
+    """Raise InputError when a cloud has no person's size and, scaled to one, no person's shape."""
+    guessed = found.unit.name == GUESS and len(person.units) > 1
+    if guessed and not found.fit.reliable and not has_size_of_person(person.points):
+        longest = float(np.ptp(person.points, axis=0).max())
+        raise InputError(
+            f"the longest side is {longest:.3g} units, which is not the size of an adult in m, cm or mm, and no scaled"
+            " body fits; cut out one person, add --scene or name --unit"
+        )
 
 
 def _describe_frame(found: FrameFit) -> list[str]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.up_axis_search import choose_up_axes, explain_roughly
 from flowing_puppet_ros.body.scans.scan import Scan
@@ -32,6 +33,11 @@ from flowing_puppet_ros.errors import InputError, PuppetError
 MAX_SCENE_POINTS = 300_000  # sampled from a scene
 SCENE_UPS = ("z", "y", "-y")
 """Axes that are tried first for a scene; all are compared for the people that are found."""
+
+
+MAX_ALONE_COST = 0.7
+"""Cost of a rough body in a piece, in that of one in the whole scan, up to which the pieces are people: more than 1 for
+halves of one person, a third for two people."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,9 +109,10 @@ def _take_people_apart(pieces: Pieces, path: Path, fitter: BodyFitter, options: 
     ]
     one = _take_person(pieces.scan, "", fitter, options, ())
     together, *alone = (
-        explain_roughly(fitter, person.points, person.units, person.ups, person.sensor) for person in (one, *people)
+        explain_roughly(fitter, person.points, person.units[0], person.ups, person.sensor).cost
+        for person in (one, *people)
     )
-    return people if min(alone) > together else []
+    return people if max(alone) < MAX_ALONE_COST * together else []
 
 
 def _describe_pieces(pieces: Pieces, path: Path) -> tuple[str, ...]:
@@ -176,15 +183,17 @@ def _segment_scene(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptio
     ups = [parse_axis(name) for name in (SCENE_UPS if options.up == "auto" else (options.up,))]
     sensor = None if options.view == "full" else _place_scene_sensor(scan, options)
     names = [options.unit] if options.unit != "auto" else _propose_scene_units(scan) or ["m"]
-    for name in names:
-        unit = ScanUnit.named(name)
+    best: tuple[float, ScanUnit, np.ndarray, list[PersonCloud]] = (np.inf, ScanUnit.named(names[0]), ups[0], [])
+    for unit in map(ScanUnit.named, names):
 
         def choose(clouds: Sequence[np.ndarray], unit: ScanUnit = unit) -> np.ndarray:
             return choose_up_axes(fitter, clouds, propose_up_axes(points, True), unit, None)[0]
 
         up, found = segment_people_unknown_up(points, normals, unit.metres, ups, sensor, options.segmentation, choose)
         if found:
-            break
+            rough = 0.0 if len(names) == 1 else explain_roughly(fitter, found[0].points, unit, [up], None).cost
+            best = min(best, (rough * unit.metres, unit, up, found), key=lambda result: result[0])
+    _, unit, up, found = best
     if not found:
         raise PuppetError(
             f"{path} shows no person among its {len(points)} points; check --up and --unit, lower "

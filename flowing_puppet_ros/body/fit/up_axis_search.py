@@ -11,7 +11,7 @@ import numpy as np
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, check_cloud
 from flowing_puppet_ros.body.fit.hypotheses import Progress, sub_progress
 from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, rotation_to_z_up
-from flowing_puppet_ros.body.scans.unit import ScanUnit
+from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit
 
 MAX_UPS, MAX_FITS = 3, 3  # directions that are compared by rough bodies, and frames that are fitted in
 MAX_COARSE_RATIO, MIN_PRIOR_RATIO = 1.25, 1.08
@@ -25,7 +25,6 @@ MIN_CLEAR_RATIO = 1.25
 """Cost of the best fit in another direction or unit, in that of the best fit, from which the answer is clear."""
 GUESS_COST_RATIO = 1.2
 """How much farther than a body in a unit of measure one of guessed size counts to be."""
-MIN_GUESSED_CONFIDENCE = 0.2  # of a rough body below which a cloud of guessed size is refused
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +98,7 @@ def fit_in_best_frame(
     cloud = _ScanCloud(fitter, points, normals, sensor)
     hypotheses = [FrameHypothesis(up, unit) for unit in units for up in cloud.find_ups(ups, units)]
     if len(hypotheses) > 1:
-        hypotheses = sorted(map(cloud.compare_roughly, hypotheses), key=lambda hypothesis: hypothesis.cost)
+        hypotheses = _drop_other_guesses(sorted(map(cloud.compare_roughly, hypotheses), key=lambda found: found.cost))
     best = hypotheses[0]
     chosen = [other for other in hypotheses if other.cost <= MAX_ROUGH_RATIO_IF_WRONG * best.cost][:MAX_FITS]
     fits: list[tuple[FrameHypothesis, BodyFit]] = []
@@ -118,21 +117,21 @@ def fit_in_best_frame(
         hypothesis.unit,
         fit,
         all(np.allclose(other.up, hypothesis.up) for other in rivals),
-        all(other.unit == hypothesis.unit for other in rivals),
+        hypothesis.unit.name != GUESS and all(other.unit == hypothesis.unit for other in rivals),
     )
 
 
 def explain_roughly(
     fitter: BodyFitter,
     points: np.ndarray,
-    units: Sequence[ScanUnit],
+    unit: ScanUnit,
     ups: Sequence[np.ndarray],
     sensor: np.ndarray | None,
-) -> float:
-    """Return the confidence (0 to 1) of a rough body in a cloud in its best frame; arguments as in the fit."""
+) -> FrameHypothesis:
+    """Return the frame whose rough body is closest to a cloud, in one unit; other arguments as in the fit."""
     cloud = _ScanCloud(fitter, points, None, sensor)
-    found = [cloud.compare_roughly(FrameHypothesis(up, units[0])) for up in cloud.find_ups(ups, units[:1])]
-    return min(found, key=lambda hypothesis: hypothesis.cost).confidence
+    found = [cloud.compare_roughly(FrameHypothesis(up, unit)) for up in cloud.find_ups(ups, [unit])]
+    return min(found, key=lambda hypothesis: hypothesis.cost)
 
 
 def choose_up_axes(
@@ -208,6 +207,12 @@ def _select_ups(ups: Sequence[np.ndarray], costs: np.ndarray) -> list[np.ndarray
     return [ups[k] for k in near[:MAX_UPS]]
 
 
+def _drop_other_guesses(hypotheses: Sequence[FrameHypothesis]) -> list[FrameHypothesis]:
+    """Return the hypotheses without those of guessed size that another guess before them explains better."""
+    guess = next((found.unit for found in hypotheses if found.unit.name == GUESS), None)
+    return [found for found in hypotheses if found.unit.name != GUESS or found.unit == guess]
+
+
 def _cost_of_fit(hypothesis: FrameHypothesis, fit: BodyFit) -> float:
     """Return the distance between body and cloud in the scan's unit, the farther the less of both is explained."""
     distance = fit.two_way_distance / hypothesis.unit.fitted
@@ -215,4 +220,4 @@ def _cost_of_fit(hypothesis: FrameHypothesis, fit: BodyFit) -> float:
 
 
 def _prefer(unit: ScanUnit) -> float:
-    return 1.0 if unit.fitted == unit.metres and unit.name != "guess" else GUESS_COST_RATIO
+    return 1.0 if unit.fitted == unit.metres and unit.name != GUESS else GUESS_COST_RATIO

@@ -11,6 +11,7 @@ from flowing_puppet_ros.body.scans.scan import Scan
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 """Metres per unit."""
+METRIC_UNITS = ("m", "cm", "mm")
 GUESS = "guess"
 """The unit of scans whose size was changed: metres per unit follow from an adult's size."""
 MIN_ADULT_AREA_M2, MEAN_ADULT_AREA_M2, MAX_ADULT_AREA_M2 = 1.2, 1.8, 3.0
@@ -19,6 +20,8 @@ MIN_PERSON_EXTENT_M, MIN_ADULT_EXTENT_M, MAX_ADULT_EXTENT_M = 0.6, 1.3, 2.6
 """Longest side of the box around a child or a crouching adult, and around an adult who stands or lies."""
 ADULT_EXTENTS_M = (1.7, 1.25)
 """Longest sides, standing and crouching, to which a scan of another size is scaled."""
+SAME_LOG_SCALE = 0.2
+"""Logarithm of the ratio of two scales below which a body fits equally well in both."""
 MAX_NORMALISED_ERROR = 0.002
 """Relative departure from 1 or 2 of the longest side, or from 1 of the radius, of scans that were normalised."""
 MIN_SCENE_EXTENT_M, MAX_SCENE_EXTENT_M = 0.6, 200.0  # longest side of the cloud of a scene
@@ -72,9 +75,14 @@ def propose_units(scan: Scan) -> list[ScanUnit]:
     guessed = [ScanUnit.guessed(extent / longest) for extent in ADULT_EXTENTS_M]
     if is_normalised(scan.points):
         return [*guessed, *map(ScanUnit.named, adult)]
-    if adult and not any(name in ("m", "cm", "mm") for name in smaller):
-        return [ScanUnit.named(name) for name in adult]
-    return [*(ScanUnit.named(name) for name in (*adult, *smaller)), *guessed]
+    if adult:
+        return [ScanUnit.named(name) for name in (*adult, *smaller) if name in adult or name in METRIC_UNITS]
+    named = [ScanUnit.named(name) for name in smaller]
+    return [*named, *(unit for unit in guessed if not any(_are_alike(unit, other) for other in named))]
+
+
+def _are_alike(first: ScanUnit, second: ScanUnit) -> bool:
+    return abs(np.log(first.fitted / second.fitted)) < SAME_LOG_SCALE
 
 
 def propose_named_unit(points: np.ndarray, name: str) -> list[ScanUnit]:
@@ -91,9 +99,14 @@ def propose_sensor_units(points: np.ndarray) -> list[ScanUnit]:
     longest = float(np.ptp(points, axis=0).max())
     return [
         ScanUnit.named(name)
-        for name in ("m", "cm", "mm")
+        for name in METRIC_UNITS
         if MIN_PERSON_EXTENT_M <= longest * UNITS[name] <= MAX_ADULT_EXTENT_M
     ]
+
+
+def has_size_of_person(points: np.ndarray) -> bool:
+    """Return whether the longest side of a cloud (N, 3) is a person's in m, cm or mm."""
+    return bool(propose_sensor_units(points))
 
 
 def is_normalised(points: np.ndarray) -> bool:

@@ -24,6 +24,8 @@ CURVED_RADIUS, MIN_CURVED_POINTS = 0.07, 8
 MIN_CONVEX_MAJORITY = 0.12
 """By how much the share of convex places differs from a half where front and back can be told apart."""
 MIN_THICKNESS = 0.01  # thickness, in longest sides, of a cloud that is not flat
+MIN_SAME_COSINE = np.cos(np.radians(40.0))
+"""Cosine of the angle between a named place and the estimated one up to which the named one is believed."""
 VIEW_EXTENTS = 2.5  # longest sides of the cloud at which the sensor is supposed
 
 
@@ -80,11 +82,11 @@ def find_viewpoint(points: np.ndarray, named: np.ndarray | None) -> np.ndarray |
     The place `named` (3,) by the file and the origin come first, unless the surface bulges elsewhere.
     """
     estimated = estimate_viewpoint(points)
-    for sensor in (named, np.zeros(3)):
-        if sensor is not None and is_seen_from(points, sensor):
-            middle = points.mean(axis=0)
-            if estimated is None or (sensor - middle) @ (estimated - middle) > 0:
-                return sensor
+    middle = points.mean(axis=0)
+    for sensor in (place for place in (named, np.zeros(3)) if place is not None):
+        believed = estimated is None or _cosine(middle, sensor, estimated) > MIN_SAME_COSINE
+        if believed and is_seen_from(points, sensor):
+            return sensor
     return estimated
 
 
@@ -104,6 +106,12 @@ def choose_viewpoint(points: np.ndarray, normals: np.ndarray | None, named: np.n
         return None
     mean = normals.mean(axis=0) / max(float(np.linalg.norm(normals.mean(axis=0))), 1e-9)
     return np.asarray(points.mean(axis=0) + VIEW_EXTENTS * float(np.ptp(points, axis=0).max()) * mean)
+
+
+def _cosine(middle: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
+    """Return the cosine of the angle between two places (3,) as seen from a third."""
+    a, b = first - middle, second - middle
+    return float(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)))
 
 
 def _is_outside(points: np.ndarray, place: np.ndarray) -> bool:

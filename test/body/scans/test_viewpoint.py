@@ -69,6 +69,18 @@ def test_the_file_and_the_origin_are_believed_unless_the_surface_contradicts() -
     assert behind is not None and (behind - front.mean(axis=0) - 2 * sensor) @ sensor > 0
 
 
+@pytest.mark.parametrize("angle", [60.0, 120.0, 180.0, 240.0])
+def test_the_origin_of_a_map_is_not_taken_for_the_sensor(angle: float) -> None:
+    sensor = PLACES[0]
+    front = limbs(2000, sensor)
+    turn = np.radians(angle)
+    away = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]]) @ sensor
+    found = find_viewpoint(front - 3 * away, None)
+    assert found is not None
+    seen = found - (front - 3 * away).mean(axis=0)
+    assert seen @ sensor / np.linalg.norm(seen) / np.linalg.norm(sensor) > np.cos(np.radians(30))
+
+
 def test_a_view_known_to_be_single_takes_what_there_is() -> None:
     whole = limbs(500, None)
     np.testing.assert_array_equal(choose_viewpoint(whole + np.array([3.0, 0, 0]), None, None), np.zeros(3))
