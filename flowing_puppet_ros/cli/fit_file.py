@@ -92,7 +92,7 @@ def _fit_person(
         "unit": unit.name,
         "metres_per_unit": unit.metres,
         "unit_clear": found.unit_clear,
-        "child": unit.is_child,
+        "child": found.is_child,
         "up": np.round(found.frame.up, 6).tolist(),
         "up_clear": found.up_clear,
         "view": "full" if person.sensor is None else "single",
@@ -117,12 +117,15 @@ def _describe_frame(found: FrameFit) -> list[str]:
     notes = []
     if not found.up_clear:
         notes.append(f"which way is up is not clear, {_name_axis(found.frame.up)} was taken; name it with --up")
-    if found.unit.is_child:
-        notes.append(f"the person is smaller than an adult and was fitted as a child; check --unit {found.unit.name}")
     if found.unit.name == GUESS:
         notes.append(
             f"no unit gives an adult's size, {found.unit.metres:.4g} metres per unit was guessed from the proportions;"
             " name --unit, also for a child"
+        )
+    elif found.is_child:
+        notes.append(
+            f"the person is {found.stature:.2f} m tall in {found.unit.name}: a child, or the scan was scaled; check"
+            " --unit"
         )
     elif not found.unit_clear:
         notes.append(f"the unit is not clear, {found.unit.name} was taken; name it with --unit")
@@ -162,7 +165,7 @@ def _write_fit(output: Path, model: StitchedPuppet, found: FrameFit, seconds: fl
         "metres_per_unit": found.unit.metres,
         "unit": found.unit.name,
         "unit_clear": found.unit_clear,
-        "child": found.unit.is_child,
+        "child": found.is_child,
         "up": frame.up,
         "up_clear": found.up_clear,
         "seconds": seconds,

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,6 +13,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, check_cloud
 from flowing_puppet_ros.body.fit.hypotheses import Progress, sub_progress
 from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, rotation_to_z_up
 from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit
+from flowing_puppet_ros.model.sp import StitchedPuppet
 
 MAX_UPS, MAX_FITS = 3, 3  # directions that are compared by rough bodies, and frames that are fitted in
 MAX_COARSE_RATIO, MIN_PRIOR_RATIO = 1.25, 1.08
@@ -23,6 +25,8 @@ MAX_ROUGH_RATIO, MAX_ROUGH_RATIO_IF_WRONG = 1.3, 1.7
 reliable. Upside down it is 1.6 to 3 times as much as upright."""
 MIN_CLEAR_RATIO = 1.25
 """Cost of the best fit in another direction or unit, in that of the best fit, from which the answer is clear."""
+MIN_ADULT_STATURE_M = 1.4
+SIDES = ("left", "right")
 GUESS_COST_RATIO = 1.2
 """How much farther than a body in a unit of measure one of guessed size counts to be."""
 
@@ -58,6 +62,7 @@ class FrameFit:
         unit: the scan's unit.
         fit: in metres, z up.
         up_clear, unit_clear: whether no other direction or unit explains the cloud about as well.
+        stature: of the person standing, in metres of the scan's unit.
     """
 
     frame: ScanFrame
@@ -65,6 +70,12 @@ class FrameFit:
     fit: BodyFit
     up_clear: bool
     unit_clear: bool
+    stature: float
+
+    @property
+    def is_child(self) -> bool:
+        """Whether the person is too small for an adult in a unit of measure."""
+        return self.unit.name != GUESS and self.stature < MIN_ADULT_STATURE_M
 
 
 def fit_in_best_frame(
@@ -118,7 +129,24 @@ def fit_in_best_frame(
         fit,
         all(np.allclose(other.up, hypothesis.up) for other in rivals),
         hypothesis.unit.name != GUESS and all(other.unit == hypothesis.unit for other in rivals),
+        measure_stature(fitter.model, fit.joints) * hypothesis.unit.metres / hypothesis.unit.fitted,
     )
+
+
+def measure_stature(model: StitchedPuppet, joints: np.ndarray) -> float:
+    """Return the stature of a person standing, by the lengths between joints (J, 3), in the unit of the joints."""
+    rest = model.vertices(model.rest_state())
+    share = float(np.ptp(rest[:, 2])) / _measure_bones(model, model.joints(rest))
+    return share * _measure_bones(model, joints)
+
+
+def _measure_bones(model: StitchedPuppet, joints: np.ndarray) -> float:
+    place = dict(zip(model.joint_names, joints, strict=True))
+    chains = [("head_top", "neck", "pelvis"), *((f"{side}_hip", f"{side}_knee", f"{side}_ankle") for side in SIDES)]
+    lengths = [
+        sum(float(np.linalg.norm(place[a] - place[b])) for a, b in itertools.pairwise(chain)) for chain in chains
+    ]
+    return lengths[0] + (lengths[1] + lengths[2]) / 2
 
 
 def explain_roughly(

@@ -51,11 +51,6 @@ class ScanUnit:
         """Return the unit of a scan that is to have an adult's size."""
         return cls(GUESS, metres, metres)
 
-    @property
-    def is_child(self) -> bool:
-        """Whether the person is smaller than an adult in this unit."""
-        return self.fitted > self.metres
-
 
 def propose_units(scan: Scan) -> list[ScanUnit]:
     """Propose the units that a scan of one person may be in, the likelier first.

@@ -70,10 +70,10 @@ def test_normalised_scans_are_recognised(points: np.ndarray, expected: bool) -> 
 
 
 def test_a_named_unit_stays_and_small_people_in_it_may_be_children() -> None:
-    assert [(unit.metres, unit.is_child) for unit in propose_named_unit(CLOUD, "m")] == [(1.0, False)]
+    assert [(unit.metres, unit.fitted) for unit in propose_named_unit(CLOUD, "m")] == [(1.0, 1.0)]
     adult, child = propose_named_unit(CLOUD * 60, "cm")
-    assert (adult.metres, adult.fitted, adult.is_child) == (0.01, 0.01, False)
-    assert (child.name, child.metres, child.is_child) == ("cm", 0.01, True)
+    assert (adult.metres, adult.fitted) == (0.01, 0.01)
+    assert (child.name, child.metres) == ("cm", 0.01)
     assert child.fitted * np.ptp(CLOUD[:, 2]) * 60 == pytest.approx(1.7, rel=0.01)
 
 
