@@ -48,6 +48,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cli": {
         "annotate",
         "bag",
+        "body.cloud",
         "body.fit",
         "body.scans",
         "body.segmentation",

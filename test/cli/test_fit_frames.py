@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,13 @@ import pytest
 from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 from fit_verb import FAST, fitted  # type: ignore[import-not-found]
 
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.scans.scan import Scan
 from flowing_puppet_ros.body.scans.scan_frame import parse_axis, rotation_to_z_up
+from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli import main
+from flowing_puppet_ros.cli.fit_people import FitOptions, find_people
+from flowing_puppet_ros.model.sp import StitchedPuppet
 
 pytestmark = pytest.mark.slow
 
@@ -42,7 +48,7 @@ def joint_error(fit: dict[str, Any], to_scan: Any, scale: float, joints: dict[st
 
 @pytest.mark.parametrize(
     ("up", "scale", "unit"),
-    [("y", 1.0, "m"), ("-y", 1 / 0.0254, "in"), ("-z", 1 / HEIGHT, "guess"), ("x", 1 / 0.3048, "ft")],
+    [("-y", 1 / 0.0254, "in"), ("-z", 1 / HEIGHT, "guess"), ("x", 1 / 0.3048, "ft")],
 )
 def test_people_in_any_frame_and_unit(
     tmp_path: Path, up: str, scale: float, unit: str, capsys: pytest.CaptureFixture[str]
@@ -79,16 +85,27 @@ def test_one_side_of_a_person_far_from_the_sensor(tmp_path: Path, capsys: pytest
     _, (fit,), _ = fitted(capsys, tmp_path / "map.npy", "--out", tmp_path / "o", *FAST)
     assert fit["view"] == "single" and fit["up"] == [0, -1, 0]
     assert joint_error(fit, to_scan, 1.0) < MAX_ERROR_M
-    named = ",".join(map(str, to_scan(sensor)))
-    _, (fit,), _ = fitted(capsys, tmp_path / "map.npy", "--out", tmp_path / "o", f"--viewpoint={named}", *FAST)
-    assert fit["view"] == "single" and joint_error(fit, to_scan, 1.0) < MAX_ERROR_M
+
+
+def test_a_named_viewpoint_is_the_sensor(model: StitchedPuppet) -> None:
+    fitter = BodyFitter(model, FitterSettings())
+    options = FitOptions(
+        Path(), "neutral", "z", "yes", "auto", "auto", (4.0, 1.0, -2.0), False, fitter.settings, SegmentationSettings()
+    )
+    scan = Scan(POINTS + np.array([1.0, 0, 0]), viewpoint=np.array([9.0, 9.0, 9.0]))
+    (person,) = find_people(scan, Path("a.npy"), fitter, options)
+    np.testing.assert_array_equal(person.sensor, [4.0, 1.0, -2.0])
+    (person,) = find_people(scan, Path("a.npy"), fitter, replace(options, viewpoint=None, view="single"))
+    np.testing.assert_array_equal(person.sensor, [9.0, 9.0, 9.0])
+    (person,) = find_people(scan, Path("a.npy"), fitter, replace(options, view="full"))
+    assert person.sensor is None
 
 
 def test_two_people_in_one_file_become_two_bodies(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     step = np.array([0.2, 1.6, 0.0])
     turn = rotation_to_z_up(parse_axis("y")).T
     np.save(tmp_path / "two.npy", np.concatenate([POINTS, POINTS + step]) @ turn.T)
-    _, (summary,), sentences = fitted(capsys, tmp_path / "two.npy", "--out", tmp_path / "o", *FAST)
+    _, (summary,), sentences = fitted(capsys, tmp_path / "two.npy", "--out", tmp_path / "o", "--up", "y", *FAST)
     assert len(summary["people"]) == 2 and "2 people" in sentences[0]
     errors = [
         [joint_error(fit, lambda joint, move=move: turn @ (joint + move), 1.0) for fit in summary["people"]]

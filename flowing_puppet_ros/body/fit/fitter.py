@@ -167,16 +167,18 @@ class BodyFitter:
         return self.hypotheses.pose_bank.coarse_cost(cloud)
 
     def find_roughly(
-        self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None = None
+        self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None, thorough: bool
     ) -> BodyCandidate:
-        """Find a body in a cloud in a second: enough to tell its frame and unit, not its pose; arguments as in `fit`.
+        """Find a body in a cloud in a fraction of a second: enough to tell its frame and unit, not its pose.
+
+        Arguments as in `fit`; `thorough` starts from more poses and takes twice the time.
 
         Raises:
             InputError: when the cloud cannot be the surface of a person.
         """
         with one_blas_thread():
             points, normals = downsample(points, normals, MAX_COARSE_POINTS)
-            return self.hypotheses.find_roughly(self.prepare_cloud(points, normals, viewpoint))
+            return self.hypotheses.find_roughly(self.prepare_cloud(points, normals, viewpoint), thorough)
 
     def _fit_from_joints(
         self,

@@ -45,7 +45,7 @@ MAX_REPAIRABLE_COST_M = 0.06
 # so much of the cloud is uncovered that the whole body is probably wrong.
 MAX_COST_RATIO, MAX_COST_RATIO_IF_WRONG, MIN_WRONG_UNCOVERED = 0.98, 0.9, 0.25
 # Bodies that are refined to compare frames.
-ROUGH_STARTS = 3
+ROUGH_STARTS = 4
 # Shares of the particles and rounds in a quick search, and in one for the warm-up.
 QUICK_SHARE, WARM_UP_SHARE = 0.5, 0.1
 
@@ -158,8 +158,8 @@ class BodyHypotheses:
         state = self.pose_bank.find_best(CoarseCloud.of(view), 1)[0]
         self.refine(state, view, JointTargets.none(self._model), 1)
 
-    def find_roughly(self, cloud: Cloud) -> BodyCandidate:
-        """Return the closest of a few bodies of the pose bank after a few steps of Gauss-Newton."""
+    def find_roughly(self, cloud: Cloud, thorough: bool) -> BodyCandidate:
+        """Return the closest of a few bodies of the pose bank, of all of it if `thorough`, after some Gauss-Newton."""
         terms = [cloud.free_space_term] if isinstance(cloud, SingleViewCloud) else []
         none = JointTargets.none(self._model)
 
@@ -167,7 +167,11 @@ class BodyHypotheses:
             state = self.gauss_newton.run(body, cloud, none, ROUGH, terms)
             return BodyCandidate(state, assess_fit(self._model, self._model.vertices(state), cloud))
 
-        found = parallel_map(improve, self.pose_bank.find_best(CoarseCloud.of(cloud), ROUGH_STARTS), self._threads)
+        bank = self.pose_bank
+        starts = (
+            bank.find_best(CoarseCloud.of(cloud), ROUGH_STARTS) if thorough else bank.find_roughly(cloud, ROUGH_STARTS)
+        )
+        found = parallel_map(improve, starts, self._threads)
         return min(found, key=lambda candidate: candidate.cost)
 
     def search_near(

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -88,16 +88,33 @@ class PoseBank:
         rows = [yaw * POSES + int(cost[yaw].argmin()) for yaw in yaws]
         return [particles_to_state(self._model, bodies, np.full(len(bodies), row)) for row in rows]
 
+    def find_roughly(self, cloud: Cloud, count: int) -> list[BodyState]:
+        """Return the best body of each of the `count` best yaws of a small bank, moved to the cloud."""
+        costs, shift = self._judge_small_bank(cloud)
+        costs = costs.reshape(YAWS, COARSE_POSES)
+        states = []
+        for yaw in np.argsort(costs.min(axis=1), kind="stable")[:count]:
+            pose = int(costs[yaw].argmin())
+            groups = [group.take(np.array([yaw * POSES + pose])) for group in make_bank(self._model)]
+            body = particles_to_state(self._model, groups, np.zeros(len(groups), dtype=np.int64))
+            states.append(replace(body, center=body.center + shift[yaw * COARSE_POSES + pose]))
+        return states
+
     def coarse_cost(self, cloud: Cloud) -> float:
         """Return the cost in metres of the best upright body of a small bank on a cloud.
 
         It tells a cloud with the head up from the same cloud upside down.
         """
+        return float(self._judge_small_bank(cloud)[0].min())
+
+    def _judge_small_bank(self, cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+        """Return the costs (P,) m of the bodies of the small bank, and the steps (P, 3) m that move them to a cloud."""
         coarse = CoarseCloud.of(cloud, COARSE_TARGETS)
         points, normals, prior = self._small_bank
-        points = points + self._shift_to_cloud(points, normals, coarse)[:, None]
+        shift = self._shift_to_cloud(points, normals, coarse)
+        points = points + shift[:, None]
         misfit, able = _measure_misfit(points, normals, coarse)
-        return float((distances(coarse.targets, points, able).mean(axis=1) + misfit + prior).min())
+        return distances(coarse.targets, points, able).mean(axis=1) + misfit + prior, shift
 
     @cached_property
     def _small_bank(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -16,10 +16,10 @@ from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 MAX_UPS, MAX_FITS = 3, 3  # directions that are compared by rough bodies, and frames that are fitted in
-MAX_COARSE_RATIO, MIN_PRIOR_RATIO = 1.25, 1.08
+MAX_COARSE_RATIO, MIN_PRIOR_RATIO = 1.25, 1.18
 """Coarse cost of a direction, in that of the best one, up to which it is compared further; from the second on it is not
 when the best one is also the likelier axis. Another axis costs 1.2 to 1.8 times as much as the right one, that axis
-upside down 0.94 to 1.2 times."""
+upside down 0.9 to 1.2 times."""
 MAX_ROUGH_RATIO, MAX_ROUGH_RATIO_IF_WRONG = 1.3, 1.7
 """Cost of a rough body, in that of the best one, up to which a frame is fitted in, and if the fits before are not
 reliable. Upside down it is 1.6 to 3 times as much as upright."""
@@ -39,13 +39,11 @@ class FrameHypothesis:
         up: (3,) direction in the scan's frame.
         unit: the scan's unit.
         cost: how far the closest body in it is from the cloud, in the scan's unit; 0 before bodies are compared.
-        confidence: of that body, 0 to 1.
     """
 
     up: np.ndarray
     unit: ScanUnit
     cost: float = 0.0
-    confidence: float = 1.0
 
     @property
     def frame(self) -> ScanFrame:
@@ -109,7 +107,7 @@ def fit_in_best_frame(
     cloud = _ScanCloud(fitter, points, normals, sensor)
     hypotheses = [FrameHypothesis(up, unit) for unit in units for up in cloud.find_ups(ups, units)]
     if len(hypotheses) > 1:
-        hypotheses = _drop_other_guesses(sorted(map(cloud.compare_roughly, hypotheses), key=lambda found: found.cost))
+        hypotheses = _drop_other_guesses(cloud.compare_roughly(hypotheses))
     best = hypotheses[0]
     chosen = [other for other in hypotheses if other.cost <= MAX_ROUGH_RATIO_IF_WRONG * best.cost][:MAX_FITS]
     fits: list[tuple[FrameHypothesis, BodyFit]] = []
@@ -158,8 +156,7 @@ def explain_roughly(
 ) -> FrameHypothesis:
     """Return the frame whose rough body is closest to a cloud, in one unit; other arguments as in the fit."""
     cloud = _ScanCloud(fitter, points, None, sensor)
-    found = [cloud.compare_roughly(FrameHypothesis(up, unit)) for up in cloud.find_ups(ups, [unit])]
-    return min(found, key=lambda hypothesis: hypothesis.cost)
+    return cloud.compare_roughly([FrameHypothesis(up, unit) for up in cloud.find_ups(ups, [unit])])[0]
 
 
 def choose_up_axes(
@@ -202,12 +199,21 @@ class _ScanCloud:
         frames = [ScanFrame(scale, rotation_to_z_up(up)) for up in ups]
         return np.array([self.fitter.coarse_cost(frame.to_body(self.points), self._see(frame)) for frame in frames])
 
-    def compare_roughly(self, hypothesis: FrameHypothesis) -> FrameHypothesis:
-        """Return the hypothesis with the cost and confidence of a rough body."""
+    def compare_roughly(self, hypotheses: Sequence[FrameHypothesis]) -> list[FrameHypothesis]:
+        """Return hypotheses with the costs of rough bodies, the lowest first; close ones from more starts."""
+        found = sorted((self._explain(each, False) for each in hypotheses), key=lambda each: each.cost)
+        near = [each for each in found if each.cost < MAX_ROUGH_RATIO_IF_WRONG * found[0].cost]
+        if len(near) > 1:
+            found[: len(near)] = sorted((self._explain(each, True) for each in near), key=lambda each: each.cost)
+        return found
+
+    def _explain(self, hypothesis: FrameHypothesis, thorough: bool) -> FrameHypothesis:
+        """Return the hypothesis with the cost of a rough body."""
         frame = hypothesis.frame
-        found = self.fitter.find_roughly(frame.to_body(self.points), self._turn_normals(frame), self._see(frame))
-        cost = found.cost / frame.scale * _prefer(hypothesis.unit)
-        return replace(hypothesis, cost=cost, confidence=found.quality.confidence)
+        body = self.fitter.find_roughly(
+            frame.to_body(self.points), self._turn_normals(frame), self._see(frame), thorough
+        )
+        return replace(hypothesis, cost=body.cost / frame.scale * _prefer(hypothesis.unit))
 
     def fit(self, hypothesis: FrameHypothesis, progress: Progress) -> BodyFit:
         """Fit a body in the frame of a hypothesis."""
