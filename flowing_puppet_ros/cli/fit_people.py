@@ -4,18 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
-from flowing_puppet_ros.body.fit.up_axis_search import choose_up_axes, explain_roughly
+from flowing_puppet_ros.body.fit.up_axis_search import choose_up_axis, explain_roughly
 from flowing_puppet_ros.body.scans.scan import Scan
 from flowing_puppet_ros.body.scans.scan_frame import parse_axis, propose_up_axes
 from flowing_puppet_ros.body.scans.unit import (
+    MAX_LEFT_FLOOR_EXTENT_M,
     MAX_SCENE_EXTENT_M,
+    METRIC_UNITS,
     MIN_SCENE_EXTENT_M,
     UNITS,
     ScanUnit,
@@ -151,30 +153,31 @@ def _propose_ups(points: np.ndarray, options: FitOptions) -> list[np.ndarray]:
 
 def _segment_left_floor(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> list[ScanPerson]:
     """Return the people on a floor that was left in the scan, none when there is no floor or nobody on it."""
-    units = [options.unit] if options.unit != "auto" else _propose_scene_units(scan)
-    points = scan.sample_surface(MAX_SCENE_POINTS, np.random.default_rng(fitter.settings.seed))[0]
-    for unit in units[:1]:
-        if has_floor(points * UNITS[unit]):
-            try:
-                people = _segment_scene(scan, path, fitter, options)
-            except PuppetError:
-                return []
-            note = f"{path} shows more than a person: floor and walls were removed, as with --scene"
-            suffix = "" if len(people) == 1 else None
-            return [
-                ScanPerson(
-                    person.suffix if suffix is None else suffix,
-                    person.points, person.normals, person.units, person.ups, person.sensor, (note,),
-                )
-                for person in people
-            ]  # fmt: skip
-    return []
-
-
-def _propose_scene_units(scan: Scan) -> list[str]:
-    """Return the units in which a scan has the size of a room or street with people, the likelier first."""
     longest = float(np.ptp(scan.points, axis=0).max())
-    return [name for name, metres in UNITS.items() if MIN_SCENE_EXTENT_M <= longest * metres <= MAX_SCENE_EXTENT_M]
+    names = list(METRIC_UNITS) if options.unit == "auto" else [options.unit]
+    unit = next(
+        (name for name in names if MIN_SCENE_EXTENT_M <= longest * UNITS[name] <= MAX_LEFT_FLOOR_EXTENT_M), None
+    )
+    points = scan.sample_surface(fitter.settings.max_points, np.random.default_rng(fitter.settings.seed))[0]
+    if unit is None or not has_floor(points * UNITS[unit]):
+        return []
+    try:
+        people = _segment_scene(scan, path, fitter, options)
+    except PuppetError:
+        return []
+    note = f"{path} shows more than a person: floor and walls were removed, as with --scene"
+    people = [replace(person, notes=(note,)) for person in people]
+    return [replace(people[0], suffix="")] if len(people) == 1 else people
+
+
+def _group_scene_units(points: np.ndarray) -> list[list[ScanUnit]]:
+    """Return the units in which a cloud (N, 3) has the size of a room or street: metric ones, then the others."""
+    longest = float(np.ptp(points, axis=0).max())
+    fitting = [name for name, metres in UNITS.items() if MIN_SCENE_EXTENT_M <= longest * metres <= MAX_SCENE_EXTENT_M]
+    groups = [
+        [ScanUnit.named(name) for name in fitting if (name in METRIC_UNITS) is metric] for metric in (True, False)
+    ]
+    return [group for group in groups if group] or [[ScanUnit.named("m")]]
 
 
 def _segment_scene(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> list[ScanPerson]:
@@ -182,18 +185,24 @@ def _segment_scene(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptio
     points, normals = scan.sample_surface(MAX_SCENE_POINTS, np.random.default_rng(fitter.settings.seed))
     ups = [parse_axis(name) for name in (SCENE_UPS if options.up == "auto" else (options.up,))]
     sensor = None if options.view == "full" else _place_scene_sensor(scan, options)
-    names = [options.unit] if options.unit != "auto" else _propose_scene_units(scan) or ["m"]
-    best: tuple[float, ScanUnit, np.ndarray, list[PersonCloud]] = (np.inf, ScanUnit.named(names[0]), ups[0], [])
-    for unit in map(ScanUnit.named, names):
+    groups = _group_scene_units(points) if options.unit == "auto" else [[ScanUnit.named(options.unit)]]
+    found: list[PersonCloud] = []
+    for units in groups:
+        results = []
+        for unit in units:
 
-        def choose(clouds: Sequence[np.ndarray], unit: ScanUnit = unit) -> np.ndarray:
-            return choose_up_axes(fitter, clouds, propose_up_axes(points, True), unit, None)[0]
+            def choose(clouds: Sequence[np.ndarray], unit: ScanUnit = unit) -> np.ndarray:
+                sensors = [_locate_sensor(cloud, None, scan, options) for cloud in clouds]
+                return choose_up_axis(fitter, clouds, propose_up_axes(points, True), unit, sensors)
 
-        up, found = segment_people_unknown_up(points, normals, unit.metres, ups, sensor, options.segmentation, choose)
+            results.append(
+                (unit, *segment_people_unknown_up(
+                    points, normals, unit.metres, ups, sensor, options.segmentation, choose
+                ))
+            )  # fmt: skip
+        unit, up, found = _choose_scene_unit(results, fitter)
         if found:
-            rough = 0.0 if len(names) == 1 else explain_roughly(fitter, found[0].points, unit, [up], None).cost
-            best = min(best, (rough * unit.metres, unit, up, found), key=lambda result: result[0])
-    _, unit, up, found = best
+            break
     if not found:
         raise PuppetError(
             f"{path} shows no person among its {len(points)} points; check --up and --unit, lower "
@@ -205,6 +214,19 @@ def _segment_scene(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptio
         ways = propose_up_axes(cloud.points, False) if options.upright == "any" else [up]
         people.append(ScanPerson(f"-{number}", cloud.points, cloud.normals, [unit], ways, seen))
     return people
+
+
+def _choose_scene_unit(
+    results: list[tuple[ScanUnit, np.ndarray, list[PersonCloud]]], fitter: BodyFitter
+) -> tuple[ScanUnit, np.ndarray, list[PersonCloud]]:
+    """Return the unit, up and people of a scene in which a body explains the likeliest person best."""
+    somebody = [result for result in results if result[2]] or results[:1]
+    if len(somebody) == 1:
+        return somebody[0]
+    costs = [
+        explain_roughly(fitter, people[0].points, unit, [up], None).cost * unit.metres for unit, up, people in somebody
+    ]
+    return somebody[int(np.argmin(costs))]
 
 
 def _place_scene_sensor(scan: Scan, options: FitOptions) -> np.ndarray:

@@ -23,6 +23,8 @@ upside down 0.9 to 1.2 times."""
 MAX_ROUGH_RATIO, MAX_ROUGH_RATIO_IF_WRONG = 1.3, 1.7
 """Cost of a rough body, in that of the best one, up to which a frame is fitted in, and if the fits before are not
 reliable. Upside down it is 1.6 to 3 times as much as upright."""
+MAX_CLOSE_RATIO = 1.6
+"""Cost of a rough body up to which more are tried; `MAX_ROUGH_RATIO` when the best frame is also the likelier one."""
 MIN_CLEAR_RATIO = 1.25
 """Cost of the best fit in another direction or unit, in that of the best fit, from which the answer is clear."""
 MIN_ADULT_STATURE_M = 1.4
@@ -159,26 +161,29 @@ def explain_roughly(
     return cloud.compare_roughly([FrameHypothesis(up, unit) for up in cloud.find_ups(ups, [unit])])[0]
 
 
-def choose_up_axes(
+def choose_up_axis(
     fitter: BodyFitter,
     clouds: Sequence[np.ndarray],
     ups: Sequence[np.ndarray],
     unit: ScanUnit,
-    sensor: np.ndarray | None,
-) -> list[np.ndarray]:
-    """Return the directions of `ups` that explain clouds (N, 3) of people in one scan about as well as the best one.
+    sensors: Sequence[np.ndarray | None],
+) -> np.ndarray:
+    """Return the direction (3,) of `ups` in which bodies explain the people of one scan best.
 
     Args:
         fitter: fitter of the model.
         clouds: points (N, 3) of each person in the scan's frame and unit.
         ups: candidate directions (3,), the likelier first.
         unit: the scan's unit.
-        sensor: (3,) position of the sensor in the scan's frame and unit, or None.
+        sensors: for each person the position (3,) of the sensor in the scan's frame and unit, or None.
     """
-    costs = np.array([_ScanCloud(fitter, points, None, sensor).measure_ups(ups, unit.fitted) for points in clouds]).min(
-        axis=0
-    )
-    return _select_ups(ups, costs)
+    people = [_ScanCloud(fitter, points, None, sensor) for points, sensor in zip(clouds, sensors, strict=True)]
+    costs = np.array([person.measure_ups(ups, unit.fitted) for person in people])
+    near = _select_ups(ups, costs.min(axis=0))
+    if len(near) == 1:
+        return near[0]
+    clearest = people[int(costs.min(axis=1).argmin())]
+    return clearest.compare_roughly([FrameHypothesis(up, unit) for up in near])[0].up
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,7 +196,7 @@ class _ScanCloud:
     sensor: np.ndarray | None
 
     def find_ups(self, ups: Sequence[np.ndarray], units: Sequence[ScanUnit]) -> list[np.ndarray]:
-        """Return the directions worth comparing further, in the size of an adult, the best one first."""
+        """Return the directions worth comparing further, in the size of an adult, the likelier first."""
         return list(ups) if len(ups) == 1 else _select_ups(ups, self.measure_ups(ups, max(u.fitted for u in units)))
 
     def measure_ups(self, ups: Sequence[np.ndarray], scale: float) -> np.ndarray:
@@ -200,11 +205,18 @@ class _ScanCloud:
         return np.array([self.fitter.coarse_cost(frame.to_body(self.points), self._see(frame)) for frame in frames])
 
     def compare_roughly(self, hypotheses: Sequence[FrameHypothesis]) -> list[FrameHypothesis]:
-        """Return hypotheses with the costs of rough bodies, the lowest first; close ones from more starts."""
-        found = sorted((self._explain(each, False) for each in hypotheses), key=lambda each: each.cost)
-        near = [each for each in found if each.cost < MAX_ROUGH_RATIO_IF_WRONG * found[0].cost]
+        """Return hypotheses, the likelier first, by the costs of rough bodies; close ones from more starts."""
+        explained = [self._explain(each, False) for each in hypotheses]
+        best = int(np.argmin([each.cost for each in explained]))
+        found = sorted(explained, key=lambda each: each.cost)
+        near = [
+            each
+            for each in found
+            if each.cost <= (MAX_ROUGH_RATIO if each in explained[best + 1 :] else MAX_CLOSE_RATIO) * found[0].cost
+        ]
         if len(near) > 1:
-            found[: len(near)] = sorted((self._explain(each, True) for each in near), key=lambda each: each.cost)
+            rest = [each for each in found if each not in near]
+            found = sorted([*(self._explain(each, True) for each in near), *rest], key=lambda each: each.cost)
         return found
 
     def _explain(self, hypothesis: FrameHypothesis, thorough: bool) -> FrameHypothesis:
@@ -230,7 +242,7 @@ class _ScanCloud:
 
 
 def _select_ups(ups: Sequence[np.ndarray], costs: np.ndarray) -> list[np.ndarray]:
-    """Return the directions that cost about as much as the best one, which comes first."""
+    """Return the directions that cost about as much as the best one, the likelier first."""
     order = np.argsort(costs, kind="stable")
     best = int(order[0])
     near = [
@@ -238,7 +250,7 @@ def _select_ups(ups: Sequence[np.ndarray], costs: np.ndarray) -> list[np.ndarray
         for k in map(int, order)
         if costs[k] < (MIN_PRIOR_RATIO if k > best else MAX_COARSE_RATIO) * costs[best] or k == best
     ]
-    return [ups[k] for k in near[:MAX_UPS]]
+    return [ups[k] for k in sorted(near[:MAX_UPS])]
 
 
 def _drop_other_guesses(hypotheses: Sequence[FrameHypothesis]) -> list[FrameHypothesis]:

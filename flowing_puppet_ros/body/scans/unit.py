@@ -24,7 +24,8 @@ SAME_LOG_SCALE = 0.2
 """Logarithm of the ratio of two scales below which a body fits equally well in both."""
 MAX_NORMALISED_ERROR = 0.002
 """Relative departure from 1 or 2 of the longest side, or from 1 of the radius, of scans that were normalised."""
-MIN_SCENE_EXTENT_M, MAX_SCENE_EXTENT_M = 0.6, 200.0  # longest side of the cloud of a scene
+MIN_SCENE_EXTENT_M, MAX_SCENE_EXTENT_M, MAX_LEFT_FLOOR_EXTENT_M = 0.6, 200.0, 12.0
+"""Longest side of the cloud of a scene, and of one person's with the floor left in."""
 
 
 @dataclass(frozen=True, slots=True)
