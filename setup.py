@@ -54,7 +54,9 @@ setup(
         "learn": requirements("learn") + requirements("learn-assets"),
         "annotate": requirements("annotate"),
         "cluster": requirements("cluster"),
+        "neural": requirements("neural"),
         "rerun": requirements("rerun"),
+        "video": requirements("video"),
     },
     entry_points={
         "console_scripts": [

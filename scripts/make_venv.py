@@ -25,6 +25,7 @@ VENV = ROOT / ".venv"
 STATE = VENV / ".setup"
 PYTHON = VENV / "bin" / "python"
 SITE_PACKAGES = VENV / "lib" / "python3.12" / "site-packages"
+NETWORK_FILES = ROOT / "flowing_puppet_ros" / "image" / "networks" / "files.py"
 INTERFACES = (ROOT / "msg_defs", ROOT / "standins" / "tf2_msgs", ROOT / "standins" / "hri_msgs")
 # Shared libraries that the wheels need but do not contain, and the Debian and Ubuntu packages that provide them.
 SHARED_LIBRARIES = {
@@ -212,9 +213,18 @@ def check_imports(environment: dict[str, str]) -> None:
     run([PYTHON, "-c", code + ", flowing_puppet_ros"], environment, "check", "An installed package does not import")
 
 
+def install_networks(environment: dict[str, str]) -> None:
+    """Install the keypoint networks; a failure is only told, since the package has a detector of its own."""
+    try:
+        command: list[str | Path] = [VENV / "bin" / "flowing-puppet", "networks", "--install"]
+        run(command, environment, "networks", "The keypoint networks were not installed")
+    except SetupError as error:
+        print(f"\r{error} People are found by the package's own detector instead.", file=sys.stderr)
+
+
 def make_steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]:
     """Return the steps in order."""
-    names = ("runtime", "annotate", "learn", "dev", "docs", "build", *(() if ros else ("ros",)))
+    names = ("runtime", "annotate", "neural", "learn", "dev", "docs", "build", *(() if ros else ("ros",)))
     lists = [ROOT / "requirements" / f"{name}.txt" for name in (*names, "learn-assets", "lock")]
     package = [ROOT / name for name in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "launch", "config")]
     libraries = ROOT / "scripts" / "interface_libraries.py"
@@ -230,6 +240,7 @@ def make_steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]
         Step("interfaces", "messages", [*INTERFACES, libraries], lambda: build_interfaces(ros, environment)),
         Step("package", "flowing_puppet_ros", package, lambda: install_package(environment)),
         Step("check", "imports", ["check 1"], lambda: check_imports(environment)),
+        Step("networks", "keypoint networks", [NETWORK_FILES], lambda: install_networks(environment)),
     ]
     return [step for step in every if not (ros and step.name == "headers")]
 

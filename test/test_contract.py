@@ -22,7 +22,9 @@ MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
 ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
 FOUNDATION = {"arrays", "errors", "ids", "images", "reporting", "settings", "threads", "units"}
 """Modules beside the rooms, which everything may import."""
-OPTIONAL_PACKAGES = {"anny", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug"}
+OPTIONAL_PACKAGES = {
+    "ai_edge_litert", "anny", "av", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug",
+}  # fmt: skip
 ONLY_WITH_EXTRA = "flowing_puppet_ros.annotate.server"
 """Nothing but an extra's own module imports what the extra brings at its top."""
 OPTIONAL = {
@@ -30,13 +32,25 @@ OPTIONAL = {
     "cli.annotate": "annotate",
     "learn": "learn",
     "cli.batch.cluster": "cluster",
+    "image.networks.runtime": "neural",
     "report.rerun_file": "rerun",
+    "bag.foreign.video": "video",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10
 MAY_IMPORT: dict[str, set[str]] = {
-    "annotate": {"draw", "flow", "image.formats", "image.tracking", "model.ds"},
-    "bag": {"image.formats", "multiview", "stream", "stream.components", "stream.messages"},
+    "annotate": {"draw", "flow", "image.detector", "image.formats", "image.networks", "image.tracking", "model.ds"},
+    "bag": {
+        "bag.foreign",
+        "bag.storage",
+        "image.formats",
+        "multiview",
+        "stream",
+        "stream.components",
+        "stream.messages",
+    },
+    "bag.foreign": {"bag.storage", "stream.messages"},
+    "bag.storage": set(),
     "body": set(),
     "body.cloud": {"evidence.cloud"},
     "body.fit": {"body.cloud", "body.refine", "body.scans", "body.search", "evidence.cloud", "model"},
@@ -48,15 +62,17 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cli": {
         "annotate",
         "bag",
-        "body.cloud",
+        "bag.storage",
         "body.fit",
         "body.scans",
         "body.segmentation",
         "cli.batch",
+        "cli.scans",
         "draw",
         "evidence.image",
         "image.detector",
         "image.formats",
+        "image.networks",
         "image.pose",
         "image.video",
         "model",
@@ -83,12 +99,14 @@ MAY_IMPORT: dict[str, set[str]] = {
         "model.ds",
         "report",
     },
+    "cli.scans": {"body.cloud", "body.fit", "body.scans", "body.segmentation", "draw", "model"},
     "cli.sample": {"body.scans", "draw", "model", "model.ds"},
     "draw": {"flow"},
     "evaluate": {"image.formats", "model"},
     "evaluate.bag": {"bag", "body.scans", "evaluate", "image.formats", "multiview", "stream", "stream.messages"},
     "evaluate.body": {"body.fit", "body.scans", "learn.anny", "model"},
     "evaluate.image": {
+        "evaluate",
         "evidence.image",
         "flow",
         "image.formats",
@@ -105,6 +123,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "image.arms",
         "image.detector",
         "image.formats",
+        "image.networks",
         "image.tracking",
         "image.video",
         "model.ds",
@@ -117,6 +136,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "image.arms": {"evidence.image", "flow", "image.detector", "image.pose", "image.tracking", "model.ds"},
     "image.detector": {"evidence.image", "image.formats", "model"},
     "image.formats": {"model", "model.ds"},
+    "image.networks": {"image.formats"},
     "image.pose": {"image.formats", "inference", "model", "model.ds"},
     "image.thesis_loop": {
         "evidence.image",
@@ -135,6 +155,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "image.arms",
         "image.detector",
         "image.formats",
+        "image.networks",
         "image.thesis_loop",
         "image.tracking",
         "model.ds",
@@ -169,6 +190,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "draw",
         "flow",
         "image.formats",
+        "image.networks",
         "image.tracking",
         "image.video",
         "model",
@@ -176,8 +198,10 @@ MAY_IMPORT: dict[str, set[str]] = {
         "multiview",
         "stream",
         "stream.messages",
+        "stream.messages.bodies",
     },
-    "stream.messages": {"body.fit", "image.formats", "image.tracking", "model", "model.ds", "multiview"},
+    "stream.messages": {"body.fit", "draw", "image.formats", "image.tracking", "model", "model.ds"},
+    "stream.messages.bodies": {"model", "multiview", "stream.messages"},
 }
 """The other rooms (folders of modules) that each room imports; the layers in docs/architecture.md are made from it."""
 
@@ -369,14 +393,8 @@ def test_limits_are_called_min_and_max() -> None:
     other = re.compile(r"(?:^|_)(least|most|fewest|farthest|longest|shortest|largest|smallest)(?:_|$)", re.IGNORECASE)
     for path in MODULES:
         for node in parsed(path).body:
-            targets = (
-                node.targets
-                if isinstance(node, ast.Assign)
-                else [node.target]
-                if isinstance(node, ast.AnnAssign)
-                else []
-            )
-            for target in (item for each in targets for item in ast.walk(each) if isinstance(item, ast.Name)):
+            sides = getattr(node, "targets", [getattr(node, "target", None)])
+            for target in (item for each in sides if each for item in ast.walk(each) if isinstance(item, ast.Name)):
                 assert not other.search(target.id), f"{module_name(path)}.{target.id}: say MIN_ or MAX_"
     for settings in (kind for name in COMPONENTS for kind in (COMPONENTS[name].settings_type, node_settings(name))):
         assert not [info.name for info in settings.describe() if other.search(info.name.replace(".", "_"))]

@@ -77,7 +77,7 @@ def node_tables() -> Iterator[tuple[str, str]]:
     for name, component in COMPONENTS.items():
         inputs, outputs = ports(component)
         always = getattr(component, "outputs", outputs)
-        rows = [port_row(port) for port in inputs], [port_row(port, port not in always) for port in outputs]
+        rows = [port_row(port) for port in inputs], [port_row(port, port not in always, True) for port in outputs]
         for kind, lines in zip(("inputs", "outputs"), rows, strict=True):
             yield f"nodes/{name}-{kind}.md", table(["topic", "type", "QoS", ""], lines)
         yield f"nodes/{name}-parameters.md", parameter_table(component.settings_type, node_settings(name))
@@ -93,16 +93,20 @@ def ports(component: type[Component]) -> tuple[tuple[Port, ...], tuple[Port, ...
     return tuple(port for port in made.inputs if not port.name.startswith("other/")), made.outputs
 
 
-def port_row(port: Port, humans: bool = False) -> list[str]:
+def port_row(port: Port, humans: bool = False, output: bool = False) -> list[str]:
     """Return one row of a table of topics; `humans` marks those that are published only on request."""
     package, _, message = port.type.split("/")
     notes = []
     if port.transport:
-        notes.append(f"also `{port.name}/{port.transport}`")
-    if port.optional:
+        notes.append(f"{'also' if output else 'or'} `{port.name}/{port.transport}`")
+    if port.alternatives:
+        notes.append("or " + ", ".join(f"`{other.replace('/msg/', '/')}`" for other in port.alternatives))
+    if port.optional and not output:
         notes.append("optional")
     if port.lazy:
         notes.append("made only while subscribed to")
+    if port.optional and output:
+        notes.append(f"where `{package}` is installed, and in bags")
     if humans:
         notes.append("with `ros4hri.publish:=true`")
     if port.per_person:
@@ -186,7 +190,8 @@ def model_cards() -> Iterator[tuple[str, str]]:
     cards = sorted((PACKAGE / "weights").glob("*.md"))
     shifted = [re.sub(r"^(#+) ", r"#\1 ", card.read_text().strip(), flags=re.MULTILINE) for card in cards]
     heading = (
-        "# Model cards\n\nThe learned models that ship in the package, `flowing_puppet_ros/weights`. "
-        "`flowing-puppet learn` reproduces all of them.\n"
+        "# Model cards\n\nThe learned models that ship in the package, `flowing_puppet_ros/weights`, which "
+        "`flowing-puppet learn` reproduces, and the two keypoint networks, BlazePose and MoveNet, which "
+        "`flowing-puppet networks --install` takes from the package index.\n"
     )
     yield "cards.md", heading + "\n" + "\n\n".join(shifted) + "\n"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from flowing_puppet_ros.bag.depth_topics import holds_depth, select_depth_topics
+from flowing_puppet_ros.bag.depth_topics import DepthTopic, ImageSample, holds_depth, select_depth_topics
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.settings import Settings
@@ -15,19 +15,23 @@ from flowing_puppet_ros.stream.component import Component, Port, base_topic
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent, VisualHullSettings
+from flowing_puppet_ros.stream.messages.detections import UNDERSTOOD, find_body_id
 from flowing_puppet_ros.stream.messages.geometry import FrameTree
 from flowing_puppet_ros.stream.messages.message_types import (
     BODIES,
     CAMERA_INFO,
     COMPRESSED_IMAGE,
+    IDS_LIST,
     IMAGE,
     POINT_CLOUD,
     PUPPETS,
+    SKELETON_2D,
     MessageFactory,
 )
 
 IMAGE_NAMES = ("image", "image_raw", "image_color", "image_rect", "image_rect_color")
 """Last names of the image topics of cameras, in order of preference."""
+_DETECTIONS = next(port for port in PuppetTrackerComponent.inputs if port.name == "detections")
 MIN_CAMERAS = 2
 """Minimum calibrated cameras for a visual hull and the fit to its silhouettes."""
 
@@ -62,8 +66,8 @@ class Graph:
     def find_routes(self, recorded: Mapping[str, str]) -> dict[str, list[tuple[Instance, str]]]:
         """Return topic -> (instance, input port) it feeds; `recorded` is topic -> type of the recording.
 
-        An image's compressed topic feeds the same input, unless the raw image was recorded too. A recorded topic of
-        another type than the input's feeds nothing.
+        An image's compressed topic feeds the same input, unless the raw image was recorded too, and so do the skeletons
+        of the bodies in a list. A recorded topic of another type than the input's feeds nothing.
         """
         found: dict[str, list[tuple[Instance, str]]] = {}
         for instance in self.instances:
@@ -71,9 +75,12 @@ class Graph:
                 topic = instance.resolve(port.name)
                 if not topic:
                     continue
-                kinds = (port.type, COMPRESSED_IMAGE) if port.transport else (port.type,)
-                if recorded.get(topic, port.type) in kinds:
+                kind = recorded.get(topic, port.type)
+                if port.accepts(kind) or (port.transport and kind == COMPRESSED_IMAGE):
                     found.setdefault(topic, []).append((instance, port.name))
+                if port.accepts(kind) and kind == IDS_LIST:
+                    for skeleton in _find_skeletons(topic, recorded):
+                        found.setdefault(skeleton, []).append((instance, port.name))
                 if port.transport and topic not in recorded:
                     found.setdefault(f"{topic}/{port.transport}", []).append((instance, port.name))
         return found
@@ -98,7 +105,7 @@ class CameraTopics:
 
 def build_graph(
     topics: Mapping[str, str],
-    encoded: Mapping[str, str],
+    samples: Mapping[str, ImageSample],
     frames: FrameTree,
     infos: Mapping[str, Any],
     settings: Mapping[str, Mapping[str, Any]],
@@ -109,16 +116,15 @@ def build_graph(
     - One tracker per camera.
     - One visual hull of two or more cameras that `frames` connects (`infos`: topic -> its first CameraInfo), and one
       body fitter for its silhouettes.
-    - One body fitter for every topic of clouds or depth images (`encoded`: image topic -> encoding).
+    - One body fitter for every topic of clouds or depth images (`samples`: image topic -> its first image).
 
     `settings` is component name -> setting -> value. Outputs of these components in the recording are not used but
     made again. InputError lists the topics if nothing can be used.
     """
-    cameras = _find_cameras(
-        {name: kind for name, kind in topics.items() if not holds_depth(name, encoded.get(name, ""))}
-    )
+    of_depth = {name for name, sample in samples.items() if holds_depth(name, sample.encoding)}
+    cameras = _find_cameras({name: kind for name, kind in topics.items() if name not in of_depth})
     clouds = [topic for topic, kind in topics.items() if kind == POINT_CLOUD and not topic.endswith("/body_vertices")]
-    depths, depth_notes = select_depth_topics(topics, encoded, clouds)
+    depths, depth_notes = select_depth_topics(samples, infos, clouds)
     if not cameras and not clouds and not depths:
         raise InputError("; ".join([_describe_unusable(topics), *depth_notes]))
     graph = Graph([_make_tracker(camera, topics, settings, factory) for camera in cameras])
@@ -129,11 +135,11 @@ def build_graph(
         if len(calibrated) >= MIN_CAMERAS:
             graph.instances += _make_hull_and_fitter(calibrated, settings, factory)
     made = graph.find_outputs()
-    for topic in (*(cloud for cloud in clouds if cloud not in made), *depths):
-        port = "depth" if topic in depths else "points"
-        fitter = _make_scene_fitter(port, topic, topics, settings, factory)
+    sources: list[str | DepthTopic] = [*(cloud for cloud in clouds if cloud not in made), *depths]
+    for source in sources:
+        fitter = _make_scene_fitter(source, topics, settings, factory)
         if fitter.resolve("bodies") in graph.find_outputs():  # by another cloud in the same namespace
-            fitter.namespace = topic
+            fitter.namespace = f"/{fitter.name.removesuffix('/body_fitter')}"
         graph.instances.append(fitter)
     return graph
 
@@ -152,15 +158,30 @@ def _describe_unusable(topics: Mapping[str, str]) -> str:
 def _note_missing_detections(trackers: list[Instance], topics: Mapping[str, str]) -> list[str]:
     """Return notes on cameras for which the own detector runs although the recording seems to have detections."""
     wanted = [tracker.resolve("detections") for tracker in trackers]
-    others = sorted(name for name, kind in topics.items() if kind == PUPPETS and name not in wanted)
+    others = sorted(_find_detections(topics, trackers) - set(wanted))
     return [
         f"the detector of this package finds the people in {tracker.resolve('image')}: there are no keypoints "
-        f"({PUPPETS}) on {topic}"
-        + (f", not {topics[topic]}" if topic in topics else "")
+        f"on {topic}"
+        + (f", not {topics[topic]} ({UNDERSTOOD})" if topic in topics else "")
         + (f"; --topic-map {others[0]}:={topic} takes those that are there" if others else "")
         for tracker, topic in zip(trackers, wanted, strict=True)
-        if topics.get(topic) != PUPPETS and (others or topic in topics)
+        if not _DETECTIONS.accepts(topics.get(topic, "")) and (others or topic in topics)
     ]
+
+
+def _find_detections(topics: Mapping[str, str], trackers: list[Instance]) -> set[str]:
+    """Return the topics that may hold somebody's detections, not the trackers' own puppets and bodies."""
+    made = {tracker.resolve(port.name) for tracker in trackers for port in tracker.component.outputs}
+    found = {name for name, kind in topics.items() if _DETECTIONS.accepts(kind)}
+    lists = {name for name in found if topics[name] == IDS_LIST}
+    ours = any(topics[name] == PUPPETS for name in found & made)
+    empty = {name for name in lists if ours or not _find_skeletons(name, topics)}
+    return found - made - empty
+
+
+def _find_skeletons(listing: str, topics: Mapping[str, str]) -> list[str]:
+    """Return the topics of the skeletons of the bodies that are listed on the topic `listing`."""
+    return sorted(name for name, kind in topics.items() if kind == SKELETON_2D and find_body_id(listing, name))
 
 
 def _find_cameras(topics: Mapping[str, str]) -> list[CameraTopics]:
@@ -184,9 +205,9 @@ def _make_tracker(
     chosen = _make_settings(PuppetTrackerSettings, "puppet_tracker", settings)
     component = PuppetTrackerComponent(chosen, factory)
     instance = Instance(f"{camera.name}/puppet_tracker", component, camera.namespace, {"image": camera.image})
-    kinds = {"detections": PUPPETS, "flow/forward": IMAGE, "flow/backward": IMAGE}
-    for port, kind in kinds.items():
-        component.set_expected(port, topics.get(instance.resolve(port)) == kind)
+    for port in component.inputs:
+        if port.optional:
+            component.set_expected(port.name, port.accepts(topics.get(instance.resolve(port.name), "")))
     return instance
 
 
@@ -240,19 +261,21 @@ def _make_hull_and_fitter(
 
 
 def _make_scene_fitter(
-    port: str,
-    topic: str,
+    source: str | DepthTopic,
     topics: Mapping[str, str],
     settings: Mapping[str, Mapping[str, Any]],
     factory: MessageFactory,
 ) -> Instance:
-    """Return a body fitter whose `port` (points, or depth with the camera_info beside it) is `topic`."""
-    namespace = topic.rpartition("/")[0]
+    """Return a body fitter for a topic of clouds, or for depth images with their camera_info."""
+    remapped = {"points": "", "depth": "", "camera_info": "", "silhouettes": ""}
+    if isinstance(source, DepthTopic):
+        topic = base_topic(source.image)
+        remapped |= {"depth": source.image, "camera_info": source.info}
+    else:
+        topic = source
+        remapped["points"] = source
     fitter = BodyFitterComponent(_make_settings(BodyFitterSettings, "body_fitter", settings), factory)
-    remapped = {"points": "", "depth": "", "camera_info": "", "silhouettes": "", port: topic}
-    if port == "depth":
-        remapped["camera_info"] = f"{namespace}/camera_info"
-    instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, namespace, remapped)
+    instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, topic.rpartition("/")[0], remapped)
     fitter.set_expected("initial", topics.get(instance.resolve("initial")) == BODIES)
     return instance
 

@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The `rosbags` type store of ROS 2 Jazzy with this package's messages, and a factory of its message objects.
 
-The message definitions are the `.msg` files of the interface packages in `interfaces/`. ROS is not needed.
+The message definitions are the `.msg` files of the interface packages in `interfaces/`; those of other packages are
+taken from the recording itself. ROS is not needed.
 """
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from flowing_puppet_ros.errors import PuppetError
+from flowing_puppet_ros.errors import InputError, PuppetError
 
 _INTERFACES = Path(__file__).resolve().parents[1] / "interfaces"
-_PACKAGES = ("flowing_puppet_msgs", "hri_msgs")
+_PACKAGES = ("flowing_puppet_msgs", "hri_msgs", "vision_msgs", "foxglove_msgs")
 
 
 def definition_files(package: str) -> tuple[Path, ...]:
@@ -38,6 +39,28 @@ def typestore() -> Typestore:
         for path in definition_files(package):
             definitions.update(get_types_from_msg(path.read_text("utf8"), f"{package}/msg/{path.stem}"))
     store.register(definitions)
+    return store
+
+
+@lru_cache(maxsize=64)
+def typestore_with(type_name: str, definition: str) -> Typestore:
+    """Return the store that knows a type: `typestore()` or, for a foreign type, one with its definition too.
+
+    `definition` is the text of a `.msg` file, with those of the types in it, as a recording keeps it. InputError if it
+    is empty or cannot be understood.
+    """
+    if type_name in typestore().fielddefs:
+        return typestore()
+    if not definition:
+        raise InputError(f"the type {type_name} is not known here, and the recording has no definition of it")
+    store = get_typestore(Stores.ROS2_JAZZY)
+    try:
+        known = typestore().fielddefs
+        store.register(known)
+        added = get_types_from_msg(definition, type_name)
+        store.register({name: fields for name, fields in added.items() if name not in known})
+    except Exception as error:  # a wrong text makes the library raise anything
+        raise InputError(f"the recording's definition of {type_name} cannot be understood") from error
     return store
 
 

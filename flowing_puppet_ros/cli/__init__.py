@@ -22,6 +22,7 @@ VERBS = {
     "track": "track people in a video, a frame folder or a bag with flowing puppets",
     "replay": "run the nodes' algorithms over a bag, losslessly and reproducibly",
     "report": "make the HTML report of a replayed bag",
+    "networks": "list, check and install the keypoint networks",
     "annotate": "pose puppets on images in the browser",
     "learn": "learn the body models, the likelihood and the detector",
     "sample": "draw samples of the learned body models",

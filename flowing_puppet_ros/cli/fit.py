@@ -23,8 +23,8 @@ from flowing_puppet_ros.body.scans.scan_frame import UP_AXES
 from flowing_puppet_ros.body.scans.unit import UNITS
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli.batch import runner
-from flowing_puppet_ros.cli.fit_file import fit_file, list_files
-from flowing_puppet_ros.cli.fit_people import FitOptions
+from flowing_puppet_ros.cli.scans.fit_file import fit_file, list_files
+from flowing_puppet_ros.cli.scans.fit_people import FitOptions
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.settings import Settings, make_out_folder, nested
 

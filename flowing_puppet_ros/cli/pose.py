@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the pose of the people in single images: joints, part outlines, depth order, and other hypotheses of the arms.
 
-The package's own detector, or the keypoints of --init, say where people are. Frames of --init are counted from 0 in the
-order of the images.
+Keypoint networks where these are installed, else the package's own detector, say where people are, or the keypoints of
+--init. The images of --init are found by name where it has names, or else counted from 0 in the order of the images.
 """
 
 from __future__ import annotations
@@ -23,8 +23,18 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.image.detector.detection import PersonDetection
 from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
-from flowing_puppet_ros.image.formats.tracks_json import DECIMALS, puppet_to_json, read_keypoints, write_tracks
-from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, IMAGE_SUFFIXES, open_frames
+from flowing_puppet_ros.image.formats.frame_names import FrameNames
+from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
+from flowing_puppet_ros.image.formats.tracks_json import DECIMALS, puppet_to_json, write_tracks
+from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, IMAGE_SUFFIXES, FrameSource, open_frames
+from flowing_puppet_ros.image.networks.choice import (
+    IMAGE_SIDE_PX,
+    NETWORK_HELP,
+    NOT_INSTALLED,
+    SOURCE_HELP,
+    SOURCES,
+    load_networks,
+)
 from flowing_puppet_ros.image.pose.estimator import PoseEstimator
 from flowing_puppet_ros.image.pose.result import PosedPuppet
 from flowing_puppet_ros.image.pose.settings import PoseSettings
@@ -50,8 +60,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("images", nargs="+", type=Path, help="image files, or folders of images")
     parser.add_argument("--out", required=True, type=Path, help="poses.json to write")
     parser.add_argument(
-        "--init", type=Path, help="keypoints.json or sticks.txt: people of each image, for the detector"
+        "--init",
+        type=Path,
+        help="people of each image, for the detector: keypoints.json, or a file or folder of COCO, OpenPose, AlphaPose "
+        "or MediaPipe keypoints",
     )
+    parser.add_argument("--source", default="auto", choices=SOURCES, help=SOURCE_HELP)
+    parser.add_argument("--network", default="", metavar="FILE", help=NETWORK_HELP)
     parser.add_argument(
         "--model", default="neutral", choices=(*GENDERS, "auto"), help="body; auto: the likeliest [neutral]"
     )
@@ -64,7 +79,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Pose the people of every image; return 1 if an image could not be read, after all others are done."""
     files = list(_find_images(arguments.images))
-    init = None if arguments.init is None else read_keypoints(arguments.init)
+    source = FrameSource(Path(), FOLDER_FPS, len(files), tuple(files))
+    init = None if arguments.init is None else read_keypoints(arguments.init, FrameNames.of(source))
     if arguments.out.resolve() in {file.resolve() for file in files} | {Path(arguments.init or "").resolve()}:
         raise InputError(f"{arguments.out} is an input itself: name another output")
     if init is not None and min(index for index, people in init.items() if people) >= len(files):
@@ -75,7 +91,11 @@ def run(arguments: argparse.Namespace) -> int:
     # The search models upper bodies without separate hands; hands are drawn at the ends of the lower arms.
     drawn = [MultiViewStructures.load(gender, arguments.parts) for gender in genders] if arguments.parts > 10 else []
     settings = PoseVerbSettings.from_arguments(arguments)
-    detector = _ConfiguredDetector(PartDetector.load(), settings.detector) if init is None else None
+    networks = load_networks(arguments.source, IMAGE_SIDE_PX, True, arguments.network) if init is None else None
+    if init is None and networks is None and arguments.source == "auto":
+        print(f"flowing-puppet pose: {NOT_INSTALLED}", file=sys.stderr)
+    own = init is None and networks is None
+    detector = _ConfiguredDetector(PartDetector.load(), settings.detector) if own else None
     estimator = PoseEstimator(models, detector, PartLikelihood.load(), settings.pose, sides, drawn)
     shown = drawn[0].views[0] if drawn else models[0]
     frames = []
@@ -84,6 +104,8 @@ def run(arguments: argparse.Namespace) -> int:
         began = time.monotonic()
         try:
             (frame,) = open_frames(file)
+            if networks is not None:
+                people = [person.keypoints for person in networks.find(frame.image)]
             posed = estimator.estimate(frame.image, people)
         except InputError as error:
             if len(files) == 1:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Track people in a video, a folder of frames or a bag: joints, part outlines and depth order in every frame.
 
-People come from the keypoints of --init or of a bag, else from the package's detector; optical flow propagates them.
+People come from the keypoints of --init or of a bag, else from keypoint networks where these are installed, else from
+the package's own detector; optical flow propagates them.
 At the end the best hypotheses of the arms are chosen and all joints smoothed along the flow, over the whole input. With
 --live no frame is used before its turn; with --method thesis the loop of the thesis places the joints instead.
 """
@@ -19,12 +20,16 @@ from typing import Any
 
 from tqdm import tqdm
 
-from flowing_puppet_ros.bag.paths import is_bag
+from flowing_puppet_ros.bag.storage.paths import is_bag
 from flowing_puppet_ros.draw.overlay_video import check_overlay, read_drawn_tracks, write_overlay
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.formats.frame_names import FrameNames, Size
+from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.formats.tracks_json import puppet_to_json, read_keypoints, write_tracks
+from flowing_puppet_ros.image.formats.tracks_json import puppet_to_json, write_tracks
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame, open_frames
+from flowing_puppet_ros.image.networks.choice import NETWORK_HELP, NOT_INSTALLED, SOURCE_HELP, SOURCES, load_networks
+from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.video.clip import (
     Clip,
     ClipSettings,
@@ -34,14 +39,20 @@ from flowing_puppet_ros.image.video.clip import (
     track_live,
 )
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-from flowing_puppet_ros.threads import one_opencv_thread
+from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of this verb."""
     parser.add_argument("input", help="video file, folder of images, or bag (.mcap, .db3 or a rosbag2 folder)")
     parser.add_argument("--out", required=True, help="tracks.json to write")
-    parser.add_argument("--init", help="keypoints.json or sticks.txt, people of one or more frames, for the detector")
+    parser.add_argument("--source", default="auto", choices=SOURCES, help=SOURCE_HELP)
+    parser.add_argument("--network", default="", metavar="FILE", help=NETWORK_HELP)
+    parser.add_argument(
+        "--init",
+        help="people of one or more frames, for the detector: keypoints.json, or a file or folder of COCO, OpenPose, "
+        "AlphaPose or MediaPipe keypoints",
+    )
     parser.add_argument("--topic", default="", help="image topic of a bag [the first camera with detections]")
     parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated or damaged .mcap")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
@@ -60,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 # Held for the whole run: OpenCV makes its threads anew each time that their number changes, here at every frame.
 @one_opencv_thread()
+@one_blas_thread()
 def run(arguments: argparse.Namespace) -> int:
     """Track through the whole input and write the tracks."""
     if arguments.live and arguments.method != "smoothed":
@@ -68,9 +80,12 @@ def run(arguments: argparse.Namespace) -> int:
     settings = ClipSettings.from_arguments(arguments)
     if arguments.overlay:
         check_overlay(Path(arguments.overlay))
+    networks = load_networks(arguments.source, description=arguments.network)
     source = _open(arguments, _Warnings())
+    if networks is None and not source.clip.has_keypoints and arguments.source == "auto":
+        source.warnings(NOT_INSTALLED)
     began = time.monotonic()
-    people = _track(arguments, source, model, settings)
+    people = _track(arguments, source, model, settings, networks)
     tally = _Tally()
     write_tracks(arguments.out, model.joint_names, source.fps, tally.counted(_entries(people, model)))
     if not tally.frames:
@@ -83,14 +98,26 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _track(
-    arguments: argparse.Namespace, source: _Source, model: DeformableStructures, settings: ClipSettings
+    arguments: argparse.Namespace,
+    source: _Source,
+    model: DeformableStructures,
+    settings: ClipSettings,
+    networks: KeypointSource | None,
 ) -> Iterator[TrackedFrame]:
     def progress(frames: Iterable[DetectedFrame], title: str) -> Iterable[DetectedFrame]:
         return tqdm(frames, title, total=source.count or None, unit="frame", disable=None)
 
     if arguments.live:
-        return track_live(source.clip, model, settings, warn=source.warnings, progress=progress)
-    return track_clip(source.clip, model, settings, method=arguments.method, warn=source.warnings, progress=progress)
+        return track_live(source.clip, model, settings, networks=networks, warn=source.warnings, progress=progress)
+    return track_clip(
+        source.clip,
+        model,
+        settings,
+        method=arguments.method,
+        networks=networks,
+        warn=source.warnings,
+        progress=progress,
+    )
 
 
 def _draw(arguments: argparse.Namespace, fps: float) -> None:
@@ -150,17 +177,19 @@ def _open(arguments: argparse.Namespace, warnings: _Warnings) -> _Source:
     path, init, out = Path(arguments.input), arguments.init, Path(arguments.out)
     if out.resolve() in {Path(name).resolve() for name in (path, init) if name}:
         raise InputError(f"{out} is an input itself: name another output")
-    keypoints = None if init is None else read_keypoints(init)
     if is_bag(path):
         # Only bags need the bag stack, which takes a while to import.
         from flowing_puppet_ros.bag.frames import open_bag_frames
 
         bag = open_bag_frames(path, arguments.topic, arguments.salvage, warnings)
-        if keypoints is None:
+        if init is None:
             return _Source(Clip(bag, bool(bag.detections)), bag.fps, bag.count, warnings)
-        _check_reach(keypoints, bag.count, arguments)
-        return _Source(Clip.of(_Images(bag), keypoints), bag.fps, bag.count, warnings)
+        images = _Images(bag)
+        given = read_keypoints(init, FrameNames(path.stem, count=bag.count, read_size=images.read_size))
+        _check_reach(given, bag.count, arguments)
+        return _Source(Clip.of(images, given), bag.fps, bag.count, warnings)
     source = open_frames(path, warnings)
+    keypoints = None if init is None else read_keypoints(init, FrameNames.of(source))
     if keypoints is not None:
         _check_reach(keypoints, source.count, arguments)
     return _Source(Clip.of(source, keypoints), source.fps, source.count, warnings)
@@ -174,6 +203,10 @@ class _Images:
 
     def __iter__(self) -> Iterator[VideoFrame]:
         return (frame for frame, _ in self.frames)
+
+    def read_size(self, _: int) -> Size | None:
+        """Return width and height of the images, px."""
+        return next(((frame.image.shape[1], frame.image.shape[0]) for frame in self), None)
 
 
 def _check_reach(keypoints: dict[int, list[Keypoints]], count: int, arguments: argparse.Namespace) -> None:

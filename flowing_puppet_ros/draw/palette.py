@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fixed colours of the body parts: the person's left is warm, the right is cool, the midline is neutral.
 
-Neighbouring parts of one limb also differ in lightness, so that they can be told apart without colour vision.
+Neighbouring parts of one limb also differ in lightness, so that they can be told apart without colour vision. People
+have colours too, by their ids.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -29,6 +31,16 @@ PART_COLOURS: dict[str, tuple[int, int, int]] = {
     "right_foot": (40, 70, 130),
 }
 NEUTRAL = (170, 170, 170)  # of unknown parts
+PERSON_COLOURS = (
+    (0, 114, 178),
+    (213, 94, 0),
+    (0, 158, 115),
+    (204, 121, 167),
+    (86, 180, 233),
+    (230, 159, 0),
+    (150, 110, 60),
+)
+"""Colours of people in the order of the numbers in their ids; they differ without colour vision, too."""
 
 
 def part_colours(names: Sequence[str]) -> np.ndarray:
@@ -43,3 +55,9 @@ def joint_colour(name: str) -> tuple[int, int, int]:
     if name.startswith("right_"):
         return (30, 110, 255)
     return (255, 255, 255)
+
+
+def person_colour(identity: str) -> tuple[int, int, int]:
+    """Return the RGB colour of a person by the number that the id (`a1`, `a2`, ...) ends with; they repeat."""
+    number = re.search(r"\d*$", identity)
+    return PERSON_COLOURS[(int(number[0]) - 1 if number and number[0] else 0) % len(PERSON_COLOURS)]

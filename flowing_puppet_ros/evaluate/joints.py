@@ -15,6 +15,8 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import normalise_name
 from flowing_puppet_ros.model.tree import mirrored_name
 
+PCK_SHARE, PCKH_SHARE = 0.2, 0.5
+"""Distances of correct joints, as shares of the lengths of torso and head."""
 ARM_JOINTS = ("shoulder", "elbow", "wrist")
 LEG_JOINTS = ("hip", "knee", "ankle")
 LIMB_JOINTS = tuple(f"{side}_{joint}" for joint in ARM_JOINTS + LEG_JOINTS for side in ("right", "left"))
@@ -151,6 +153,22 @@ def count_id_switches(ids: Sequence[Sequence[str]]) -> int:
         switches += min(len(last - now), len(now - last))
         last = now or last
     return switches
+
+
+def measure_pck(distance: np.ndarray, torso: np.ndarray, head: np.ndarray) -> dict[str, float]:
+    """Return PCK@0.2 and PCKh@0.5 in percent, each if the truth has the length that it needs.
+
+    Args:
+        distance: (P, J) px of P true people's joints; NaN if the truth is unknown, infinite if missed.
+        torso: (P,) px, true lengths; NaN if unknown.
+        head: (P,) px, likewise.
+    """
+    figures = {}
+    for name, share, length in (("PCK@0.2, %", PCK_SHARE, torso), ("PCKh@0.5, %", PCKH_SHARE, head)):
+        known = ~np.isnan(distance) & (length > 0)[:, None]
+        if known.any():
+            figures[name] = 100 * float((distance <= share * length[:, None])[known].mean())
+    return figures
 
 
 def _finite(point: np.ndarray | None) -> bool:

@@ -135,7 +135,8 @@ class ComponentNode[C: Component[Any]](LifecycleNode):
         kind: Any = COMPONENTS[self._component]
         component: C = kind(self._settings, RosMessageFactory())
         component.warm_up()
-        self.session = Session(self, component, self._node_settings.queue, self._diagnostics)
+        settings = self._node_settings
+        self.session = Session(self, component, settings.queue, self._diagnostics, settings.image_transport)
 
     def _activate(self) -> None:
         if self.session is None:
@@ -166,6 +167,7 @@ class ComponentNode[C: Component[Any]](LifecycleNode):
         if self.session is None:
             return
         self.session.worker.limit = self._node_settings.queue
+        self.session.image_transport = self._node_settings.image_transport
         after = self._settings.values()
         different = {name for name, value in before.values().items() if value != after[name]}
         if not different:

@@ -35,6 +35,15 @@ def message_type(type_name: str) -> Any:
     return getattr(import_module(f"{package}.{kind}"), name)
 
 
+def is_installed(type_name: str) -> bool:
+    """Return whether messages of type `package/msg/Name` can be made on this machine."""
+    try:
+        message_type(type_name)
+    except (ImportError, AttributeError):
+        return False
+    return True
+
+
 class RosMessageFactory:
     """Makes rclpy messages from plain values and arrays."""
 

@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
@@ -19,12 +20,23 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_policy_name_from_kind, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.timer import Timer
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.diagnostics import Diagnostics
-from flowing_puppet_ros.node.factory import message_type
+from flowing_puppet_ros.node.factory import is_installed, message_type
+from flowing_puppet_ros.node.inputs import (
+    AUTO,
+    CHECK_INTERVAL_S,
+    COMPRESSED,
+    BodyTopics,
+    TransportChoice,
+    check_no_loop,
+    choose_type,
+)
 from flowing_puppet_ros.node.worker import Worker
 from flowing_puppet_ros.stream.component import Component, Output, Port
+from flowing_puppet_ros.stream.messages.detections import BodySkeleton
 from flowing_puppet_ros.stream.messages.geometry import header_ns
 from flowing_puppet_ros.stream.messages.images import compress_image
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
@@ -56,24 +68,40 @@ class Session[C: Component[Any]]:
     closed is not published.
     """
 
-    def __init__(self, node: Node, component: C, queue: int, diagnostics: Diagnostics) -> None:
+    def __init__(
+        self, node: Node, component: C, queue: int, diagnostics: Diagnostics, image_transport: str = AUTO
+    ) -> None:
         """Open the outputs and start the worker; the inputs are opened by `activate`."""
         self.component = component
+        self.image_transport = image_transport
         self.active = False
         self._node = node
         self._diagnostics = diagnostics
         self._publishing = threading.Lock()
         self._last_stamp: int | None = None
         self._warned: set[str] = set()
-        self._subscriptions: list[Subscription] = []
-        topics = {port.name: _resolve_topic(node, port.name) for port in component.inputs}
-        self._optional = {port.name: topics[port.name] for port in component.inputs if port.optional}
-        self.topics = [topic for name, topic in topics.items() if name not in self._optional]
+        self._subscriptions: dict[str, Subscription] = {}
+        self._transports: dict[str, TransportChoice] = {}
+        self._types = {port.name: port.type for port in component.inputs}
+        self._unusable: set[str] = set()
+        self._watch: Timer | None = None
+        self._topics = {port.name: _resolve_topic(node, port.name) for port in component.inputs}
+        self._optional = {port.name: self._topics[port.name] for port in component.inputs if port.optional}
+        outputs = {_resolve_topic(node, port.name) for port in component.outputs if not port.per_person}
+        check_no_loop(self._topics, component.inputs, outputs)
+        self._bodies = {
+            port.name: BodyTopics(
+                node, _SUBSCRIPTION_QOS[port.qos], partial(self._on_skeleton, port.name), self._warn_once
+            )
+            for port in component.inputs
+            if port.alternatives
+        }
         self._lazy = [port for port in component.outputs if port.lazy]
         self._outputs: dict[str, list[tuple[Publisher, Callable[[Any], Any]]]] = {}
+        self._unavailable = [port for port in component.outputs if port.optional and not is_installed(port.type)]
         try:
             for port in component.outputs:
-                if not port.per_person:
+                if not port.per_person and port not in self._unavailable:
                     self._outputs[port.name] = self._open_output(port)
         except Exception:
             self._close_outputs()
@@ -86,17 +114,28 @@ class Session[C: Component[Any]]:
         self._diagnostics.reset_silence()
         self.active = True
         for port in self.component.inputs:
-            self._subscribe(port, message_type(port.type), port.name)
             if port.transport:
-                self._subscribe(port, message_type(COMPRESSED_IMAGE), self._compressed_topic(port))
+                self._transports[port.name] = TransportChoice(self.image_transport)
+            if port.alternatives:
+                self._follow_type(port)
+            else:
+                self._subscribe(port)
+        # On the clock of the machine, since simulated time may stand still.
+        self._watch = self._node.create_timer(
+            CHECK_INTERVAL_S, self._follow_others, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
 
     def deactivate(self) -> None:
         """Close the inputs and drop what waits; the outputs stay open but silent."""
         with self._publishing:
             self.active = False
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions.clear()
+        if self._watch is not None:
+            self._node.destroy_timer(self._watch)
+            self._watch = None
+        for name in list(self._subscriptions):
+            self._node.destroy_subscription(self._subscriptions.pop(name))
+        for bodies in self._bodies.values():
+            bodies.close()
         self.reset()
 
     def close(self) -> None:
@@ -136,21 +175,71 @@ class Session[C: Component[Any]]:
         last = self._last_stamp
         return last is not None and last > now_ns + BACKWARD_JUMP_NS
 
-    def _subscribe(self, port: Port, kind: Any, topic: str) -> None:
-        name = self._node.resolve_topic_name(topic)
-        made = self._node.create_subscription(
-            kind,
+    @property
+    def topics(self) -> list[str]:
+        """The full names of the topics that the component cannot do without."""
+        return [topic for name, topic in self._topics.items() if name not in self._optional]
+
+    def _follow_others(self) -> None:
+        """Subscribe to the transport and type of each input that is published now; say what is asked for in vain."""
+        for port in self.component.inputs:
+            if port.alternatives:
+                try:
+                    self._follow_type(port)
+                except RuntimeError as error:  # a middleware may allow one type for a topic in a process; tried again
+                    self._warn_once(f"{self._topics[port.name]}: {' '.join(str(error).split())}")
+            if port.transport:
+                choice = self._transports[port.name]
+                choice.setting, before = self.image_transport, choice.chosen
+                names = [self._node.resolve_topic_name(topic) for topic in (port.name, self._compressed_topic(port))]
+                if choice.update(*map(self._node.count_publishers, names)) != before:
+                    self._node.destroy_subscription(self._subscriptions.pop(port.name))
+                    self._subscribe(port)
+        for port in self._unavailable:
+            topic, package = self._node.resolve_topic_name(port.name), port.type.partition("/")[0]
+            if self._node.count_subscribers(topic):
+                self._warn_once(
+                    f"{topic} is not published, since {package} is not installed: install ros-jazzy-"
+                    + package.replace("_", "-")
+                )
+
+    def _follow_type(self, port: Port) -> None:
+        """Subscribe to an input as the type that is published there."""
+        topic, present = self._topics[port.name], self._types[port.name]
+        published = {info.topic_type for info in self._node.get_publishers_info_by_topic(topic)}
+        try:
+            chosen = choose_type(published, port, present)
+            self._unusable.discard(port.name)
+        except InputError as error:
+            chosen = present
+            self._unusable.add(port.name)
+            self._warn_once(f"{topic}: {error}")
+        if chosen == present and port.name in self._subscriptions:
+            return
+        if port.name in self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.pop(port.name))
+            self._bodies[port.name].close()
+        self._types[port.name] = chosen
+        self._subscribe(port)
+
+    def _subscribe(self, port: Port) -> None:
+        """Open an input, for an image that with the transport that is chosen for it."""
+        choice = self._transports.get(port.name)
+        compressed = choice is not None and choice.chosen == COMPRESSED
+        topic = self._compressed_topic(port) if compressed else port.name
+        name = self._topics[port.name] = self._node.resolve_topic_name(topic)
+        self._subscriptions[port.name] = self._node.create_subscription(
+            message_type(COMPRESSED_IMAGE if compressed else self._types[port.name]),
             topic,
-            partial(self._on_message, port.name, name),
+            partial(self._on_message, port, name),
             copy(_SUBSCRIPTION_QOS[port.qos]),  # an override changes the profile itself
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             event_callbacks=SubscriptionEventCallbacks(
                 incompatible_qos=partial(self._on_incompatible_qos, name, "subscription"),
-                incompatible_type=partial(self._on_incompatible_type, name),
+                incompatible_type=partial(self._on_incompatible_type, port, name),
                 message_lost=partial(self._on_message_lost, port.name, name),
             ),
         )
-        self._subscriptions.append(made)
 
     def _open_output(self, port: Port, person: bool = False) -> list[tuple[Publisher, Callable[[Any], Any]]]:
         """Return the publishers of a port, each with the conversion from the component's message to its own."""
@@ -182,8 +271,9 @@ class Session[C: Component[Any]]:
         cure = f"set qos_overrides.{topic}.{side}.{policy} of this node, or the {policy} of the other, to fit"
         self._warn(f"{topic}: a {other} another {policy}, so they do not connect; {cure}")
 
-    def _on_incompatible_type(self, topic: str, _: Any) -> None:
-        self._warn(f"{topic}: another node uses another message type; remap its topic or this node's")
+    def _on_incompatible_type(self, port: Port, topic: str, _: Any) -> None:
+        if not port.alternatives:  # otherwise `_follow_type` sees to it
+            self._warn(f"{topic}: another node uses another message type; remap its topic or this node's")
 
     def _on_message_lost(self, port: str, topic: str, event: Any) -> None:
         """Count the messages that the middleware lost; warn once, with the remedy."""
@@ -202,16 +292,22 @@ class Session[C: Component[Any]]:
             self._warned.add(sentence)
             self._warn(sentence)
 
-    def _on_message(self, port: str, topic: str, message: Any) -> None:
-        self._diagnostics.count_received(port)
-        self.worker.put(port, partial(self._handle, port, topic, message))
+    def _on_message(self, port: Port, topic: str, message: Any) -> None:
+        self._diagnostics.count_received(port.name)
+        if port.alternatives and hasattr(message, "ids"):
+            self._bodies[port.name].follow(topic, message.ids)
+        self.worker.put(port.name, partial(self._handle, port.name, topic, message))
+
+    def _on_skeleton(self, port: str, topic: str, skeleton: BodySkeleton) -> None:
+        self.worker.put(port, partial(self._handle, port, topic, skeleton), skeleton.id)
 
     def _handle(self, port: str, topic: str, message: Any) -> None:
         """Pass one message to the component and publish the results (on the worker thread)."""
         if not self.active:
             return
         for name, optional in self._optional.items():
-            self.component.set_expected(name, self._node.count_publishers(optional) > 0)
+            usable = name not in self._unusable
+            self.component.set_expected(name, usable and self._node.count_publishers(optional) > 0)
         for lazy in self._lazy:
             subscribed = any(publisher.get_subscription_count() for publisher, _ in self._outputs.get(lazy.name, []))
             self.component.set_subscribed(lazy.name, subscribed)

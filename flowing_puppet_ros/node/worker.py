@@ -22,20 +22,23 @@ class Worker:
         self.dropped: Counter[str] = Counter()
         self.limit = limit
         self._on_error = on_error
-        self._tasks: deque[tuple[str | None, Task]] = deque()
+        self._tasks: deque[tuple[tuple[str, str] | None, Task]] = deque()
         self._changed = threading.Condition()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
         self._thread.start()
 
-    def put(self, queue: str, task: Task) -> None:
-        """Append a task to a bounded queue; drop the queue's oldest tasks if it is full."""
+    def put(self, queue: str, task: Task, person: str = "") -> None:
+        """Append a task to a bounded queue; drop the queue's oldest tasks if it is full.
+
+        On an input that has a topic for each person, each `person` has a queue; what is dropped is counted together.
+        """
         with self._changed:
-            waiting = [index for index, (name, _) in enumerate(self._tasks) if name == queue]
+            waiting = [index for index, (name, _) in enumerate(self._tasks) if name == (queue, person)]
             for index in reversed(waiting[: max(0, len(waiting) + 1 - self.limit)]):
                 del self._tasks[index]
                 self.dropped[queue] += 1
-            self._tasks.append((queue, task))
+            self._tasks.append(((queue, person), task))
             self._changed.notify()
 
     def call(self, task: Task) -> None:

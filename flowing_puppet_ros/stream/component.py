@@ -46,7 +46,8 @@ class Port:
     `lazy`: an output that is made only while it has subscribers.
     `transport`: the image also travels as CompressedImage on `<name>/<transport>`; COMPRESSED or, for an input,
     COMPRESSED_DEPTH; empty when it does not.
-    `optional`: an input that the component works without.
+    `optional`: an input that the component works without, or an output whose message package a machine may lack.
+    `alternatives`: other types of message that an input understands.
     `recorded`: a replay writes this output into its bag; False for what is too large.
 
     An output with `{id}` in its name is one topic per person. The component puts `port.person_topic(id)` beside each
@@ -61,6 +62,12 @@ class Port:
     transport: str = ""
     optional: bool = False
     recorded: bool = True
+    alternatives: tuple[str, ...] = ()
+
+    def accepts(self, type_name: str) -> bool:
+        """Return whether this input understands a type, also under the name of a renamed package (zed_interfaces)."""
+        names = {other.rpartition("/")[2] for other in self.alternatives}
+        return type_name == self.type or type_name.rpartition("/")[2] in names
 
     @property
     def per_person(self) -> bool:

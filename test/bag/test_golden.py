@@ -13,10 +13,10 @@ from flowing_puppet_ros.bag.reader import Record, open_bag
 from flowing_puppet_ros.bag.replay import replay
 from flowing_puppet_ros.model.tree import mirrored_name
 from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_silhouettes
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image, decode_labels
-from flowing_puppet_ros.stream.messages.silhouettes import decode_silhouettes
 
 CAMERAS = ("cam1", "cam2", "cam3", "cam4")
 LIMBS = ("elbow", "wrist", "knee", "ankle", "shoulder", "hip")
@@ -57,8 +57,8 @@ def test_nothing_is_lost_and_nothing_is_said(golden: Any) -> None:
     assert golden.summary["bodies"] == counts["/silhouettes"] == counts["/bodies"] == 8
     assert counts["/hull"] == counts["/hull/joints"] == 2
     for name in CAMERAS:
-        made = ("puppets", "part_labels", "overlay/compressed", "camera_info")
-        assert [counts[f"/{name}/{topic}"] for topic in made] == [8] * 4
+        made = ("puppets", "part_labels", "overlay/compressed", "camera_info", "detections_2d", "annotations")
+        assert [counts[f"/{name}/{topic}"] for topic in made] == [8] * 6
         assert counts[f"/{name}/detections"] == 6
     assert counts["/body_topology"] == counts["/tf_static"] == 1
     assert golden.summary["warnings"] == []
@@ -110,6 +110,27 @@ def test_puppets_follow_the_true_joints(golden: Any) -> None:
             found = np.array(errors[f"{side}_{joint}"])
             assert np.median(found) < 3.5, joint
             assert np.quantile(found, 0.9) < 10, joint
+
+
+def test_boxes_and_drawings_lie_on_the_true_person(golden: Any) -> None:
+    """72 px are a metre; the message's origin is half a pixel from ours."""
+    seen = cameras(golden.replay)
+    for name in CAMERAS:
+        drawings = records(golden.replay, f"/{name}/annotations")
+        for record, drawing in zip(records(golden.replay, f"/{name}/detections_2d"), drawings, strict=True):
+            (detection,) = record.message.detections
+            truth = golden.truth[str(stamp_ns(record.message))]
+            true = seen[name].project(np.array(list(truth.values())))[0] + 0.5
+            centre, half = detection.bbox.center.position, np.array([detection.bbox.size_x, detection.bbox.size_y]) / 2
+            corners = np.array([centre.x, centre.y]) + np.array([-half, half])
+            assert (np.abs(corners[0] - true.min(axis=0)) < 18).all() and (
+                np.abs(corners[1] - true.max(axis=0)) < 18
+            ).all()
+            drawn = np.array([(circle.position.x, circle.position.y) for circle in drawing.message.circles])
+            nearest = np.linalg.norm(drawn[:, None] - true, axis=2).min(axis=1)
+            assert len(drawn) == 19 and np.median(nearest) < 3.5
+            assert [text.text for text in drawing.message.texts] == [detection.id]
+            assert drawing.message.timestamp == detection.header.stamp
 
 
 def test_bodies_are_near_the_true_joints_and_never_mirrored(golden: Any) -> None:

@@ -3,8 +3,9 @@
 
 import numpy as np
 import pytest
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
+from flowing_puppet_ros.bag.typestore import BagMessageFactory, definition_files, typestore
 
 FACTORY = BagMessageFactory()
 
@@ -17,6 +18,8 @@ def test_fields_without_a_value_are_zero_and_serialise() -> None:
         "flowing_puppet_msgs/msg/BodyArray",
         "tf2_msgs/msg/TFMessage",
         "hri_msgs/msg/Skeleton2D",
+        "vision_msgs/msg/Detection2DArray",
+        "foxglove_msgs/msg/ImageAnnotations",
     ):
         message = FACTORY.make(name)
         again = typestore().deserialize_cdr(typestore().serialize_cdr(message, name), name)
@@ -35,3 +38,20 @@ def test_numbers_are_what_the_wire_carries() -> None:
 def test_unknown_fields_are_refused() -> None:
     with pytest.raises(TypeError, match="has no field 'colour'"):
         FACTORY.make("std_msgs/msg/Header", colour="red")
+
+
+def test_messages_of_others_are_those_that_they_publish() -> None:
+    """The hashes are those of ROS 2 Jazzy's packages: foxglove_msgs 3.4.3 and vision_msgs 4.1.1."""
+    assert typestore().hash_rihs01("foxglove_msgs/msg/ImageAnnotations") == (
+        "RIHS01_bc4e578b1ef80953415d6f966a4cab305c8a44c8b64fc405312b6f06a08fc45e"
+    )
+    # Known is the hash of the detection in space, which has the same fields and another box.
+    texts = {path.stem: path.read_text() for path in definition_files("vision_msgs")}
+    texts["BoundingBox3D"] = "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size\n"
+    texts["Detection3D"] = texts["Detection2D"].replace("BoundingBox2D", "BoundingBox3D")
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in texts.items():
+        store.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
+    assert store.hash_rihs01("vision_msgs/msg/Detection3D") == (
+        "RIHS01_ddd703be132ab0b69d33121f1bb034132bfbb3b0ac5f9fb1516005ba1c8a265b"
+    )

@@ -17,7 +17,7 @@ from flowing_puppet_ros.body.scans.scan import Scan
 from flowing_puppet_ros.body.scans.scan_frame import parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli import main
-from flowing_puppet_ros.cli.fit_people import FitOptions, find_people
+from flowing_puppet_ros.cli.scans.fit_people import FitOptions, find_people
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 pytestmark = pytest.mark.slow

@@ -125,3 +125,40 @@ def test_unusable_input_is_one_sentence(
     assert main(["pose", image, "--out", str(out), *flags]) == 2
     told = capsys.readouterr().err
     assert told.startswith("flowing-puppet pose: ") and told.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_other_detectors_files_are_read_by_the_names_of_images(
+    tmp_path: Path, person: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same places as ours, as COCO's annotations of `person.jpg` and as shares of the image; other names fail."""
+    out, coco = tmp_path / "poses.json", tmp_path / "coco.json"
+    joints = dict(zip(MODEL.joint_names, JOINTS, strict=True))
+    order = [
+        f"{side}_{part}"
+        for part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+        for side in ("left", "right")
+    ]
+    values = [0.0] * 15 + [number for name in order for number in (*joints[name], 2.0)]
+    annotation = {"image_id": 5, "category_id": 1, "keypoints": values}
+    data = {"images": [{"id": 9, "file_name": "other.jpg"}, {"id": 5, "file_name": "person.jpg"}]}
+    coco.write_text(json.dumps(data | {"annotations": [annotation]}))
+    assert main(["pose", str(person), "--out", str(out), "--init", str(coco), *QUICK]) == 0
+    (found,) = poses(out)["frames"][0]["puppets"]
+    arms = [MODEL.joint_names.index(name) for name in order[:6]]
+    assert np.linalg.norm(np.array(found["joints"])[arms, :2] - JOINTS[arms], axis=1).max() < 12
+    shares = [{"x": x / 220, "y": y / 200, "name": name} for name, (x, y) in joints.items() if name in order]
+    (tmp_path / "media.json").write_text(json.dumps([{"image": "person.png", "landmarks": shares}]))
+    assert (
+        main(["pose", str(person), "--out", str(tmp_path / "b.json"), "--init", str(tmp_path / "media.json"), *QUICK])
+        == 0
+    )
+    np.testing.assert_allclose(
+        np.array(poses(tmp_path / "b.json")["frames"][0]["puppets"][0]["joints"])[arms],
+        np.array(found["joints"])[arms],
+        atol=0.02,
+    )
+    coco.write_text(json.dumps(data | {"annotations": [annotation | {"image_id": 9}]}))
+    capsys.readouterr()
+    assert main(["pose", str(person), "--out", str(out), "--init", str(coco), *QUICK]) == 2
+    assert "has no person in any frame" in capsys.readouterr().err

@@ -82,6 +82,45 @@ def test_same_bits_twice_and_another_seed_another_id(frames: Path, tmp_path: Pat
 
 
 @pytest.mark.slow
+def test_a_folder_of_openpose_starts_the_same_people(frames: Path, tmp_path: Path) -> None:
+    places = dict(zip(MODEL.joint_names, start(), strict=True))
+    order = [f"{side}_{part}" for side in ("right", "left") for part in ("shoulder", "elbow", "wrist")]
+    named = write_keypoints(tmp_path / "k.json", {"1": [[places[name] for name in order]]}, order)
+    values = [0.0] * 75
+    for number, name in enumerate(order, 2):
+        values[3 * number : 3 * number + 3] = places[name]
+    folder = tmp_path / "json"
+    folder.mkdir()
+    for index in range(3):
+        people = [{"pose_keypoints_2d": values}] if index == 1 else []
+        (folder / f"{index}_keypoints.json").write_text(json.dumps({"people": people}))
+    texts = []
+    for init in (named, folder):
+        assert main(["track", str(frames), "--init", str(init), "--out", str(tmp_path / "t.json")]) == 0
+        texts.append(json.loads((tmp_path / "t.json").read_text())["frames"])
+    assert len(texts[0][1]["puppets"]) == 1
+    # In frames 0 and 2 OpenPose looked, and in ours nobody did: only what was found counts here.
+    assert texts[1][1]["puppets"][0]["joints"] == texts[0][1]["puppets"][0]["joints"]
+
+
+@pytest.mark.slow
+def test_landmarks_in_shares_of_the_image_start_people_in_a_bag(tmp_path: Path) -> None:
+    shares = {"shoulder": (0.1, 0.3), "elbow": (0.15, 0.45), "wrist": (0.16, 0.55), "hip": (0.06, 0.6)}
+    texts = []
+    for width, height in ((1, 1), (192, 240)):  # 192x240 are the images of the bag
+        places = {
+            f"{side}_{part}": {"x": (0.5 + sign * dx) * width, "y": y * height}
+            for part, (dx, y) in shares.items()
+            for side, sign in (("left", 1), ("right", -1))
+        }
+        init = tmp_path / "landmarks.json"
+        init.write_text(json.dumps([places]))
+        assert main(["track", str(GOLDEN), "--init", str(init), "--out", str(tmp_path / "t.json")]) == 0
+        texts.append((tmp_path / "t.json").read_text())
+    assert texts[0] == texts[1] and len(json.loads(texts[0])["frames"][0]["puppets"]) == 1
+
+
+@pytest.mark.slow
 def test_live_uses_no_later_frame_and_the_whole_clip_does(frames: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     shift = np.column_stack([rng.normal(0, 4, (6, 2)), np.zeros(6)])

@@ -33,6 +33,10 @@ class Guesser:
     def arm_hypotheses(self, side: str, count: int) -> np.ndarray:
         return self.guesses[side][:count]
 
+    @property
+    def joints_are_independent(self) -> bool:
+        return False
+
     def joint_score(self, joint: str, xy: np.ndarray) -> np.ndarray:
         side, _, name = joint.partition("_")
         at = self.guesses[side][:, ("elbow", "wrist").index(name)]

@@ -19,6 +19,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from benchmarks.drawn_person import JOINTS, DrawnPerson
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.node.factory import RosMessageFactory
+from flowing_puppet_ros.stream.component import base_topic
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header
 from flowing_puppet_ros.stream.messages.images import make_image
@@ -61,8 +62,10 @@ class World:
         return make_header(FACTORY, self.time, "sensor")
 
     def send(self, topic: str, message: Any) -> None:
-        """Publish on a topic that a node has subscribed to."""
+        """Publish on a topic that a node has subscribed to; of an image, nobody publishes the other transport then."""
         if topic not in self.feeds:
+            for other in [name for name in self.feeds if base_topic(name) == base_topic(topic)]:
+                self.peer.destroy_publisher(self.feeds.pop(other))
             feed = self.feeds[topic] = self.peer.create_publisher(type(message), topic, 50)
             self.peer.spin_until(feed.get_subscription_count, f"a subscriber of {topic}")
             self.peer.spin_for(0.3)

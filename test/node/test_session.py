@@ -4,6 +4,7 @@
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +17,7 @@ from std_msgs.msg import String
 
 from flowing_puppet_ros.node.diagnostics import Diagnostics
 from flowing_puppet_ros.node.factory import RosMessageFactory
+from flowing_puppet_ros.node.inputs import CHECK_INTERVAL_S
 from flowing_puppet_ros.node.session import Session
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.component import Component, Output, Port
@@ -62,6 +64,24 @@ def open_session() -> Iterator[Callable[..., tuple[Node, Session[Names]]]]:
         session.close()
         node.destroy_node()
     rclpy.try_shutdown()
+
+
+class Extras(Component[Settings]):
+    """Repeats names on two topics, whose message packages a machine may lack."""
+
+    settings_type = Settings
+    inputs = (Port("names", TEXT, "sensor"),)
+    outputs = (
+        Port("there", "extra_msgs/msg/Text", lazy=True, optional=True),
+        Port("missing", "absent_msgs/msg/Text", lazy=True, optional=True),
+    )
+
+    def __init__(self) -> None:
+        """Make it."""
+        super().__init__(Settings(), RosMessageFactory())
+
+    def _process(self, port: str, message: Any) -> Output:
+        return [(name, message) for name in sorted(self._subscribed)]
 
 
 def people(node: Node) -> set[str]:
@@ -152,3 +172,51 @@ def test_a_publisher_whose_qos_does_not_fit_is_one_warning_with_topic_and_cure(
         "/names: a publisher offers another reliability, so they do not connect; set "
         "qos_overrides./names.subscription.reliability of this node, or the reliability of the other, to fit"
     ]
+
+
+def test_outputs_of_optional_packages_are_made_where_these_are_installed_and_wanted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "extra_msgs" / "msg"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").write_text("from std_msgs.msg import String as Text\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    rclpy.init()
+    node, other = Node("extras"), Node("other")
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    executor.add_node(other)
+    session = Session(node, Extras(), 10, Diagnostics("/extras", "extras"))
+    session.activate()
+    said: list[str] = []
+    session._warn = lambda sentence: said.append(sentence)  # type: ignore[method-assign]
+    names = other.create_publisher(String, "names", 10)
+    heard: list[String] = []
+
+    def spin_until(condition: Callable[[], object]) -> None:
+        until = time.monotonic() + 60
+        while not condition():
+            executor.spin_once(timeout_sec=0.02)
+            assert time.monotonic() < until
+
+    try:
+        spin_until(lambda: other.count_publishers("there") and names.get_subscription_count())
+        assert not other.count_publishers("missing")
+        spin_until(lambda: names.publish(String(data="nobody listens")) or session.component.counters["received names"])
+        assert not session.component._subscribed and not said, "what nobody asks for is not made and not missed"
+        other.create_subscription(String, "there", heard.append, 10)
+        spin_until(lambda: node.count_subscribers("there"))
+        for _ in range(2):
+            other.create_subscription(String, "missing", heard.append, 10)
+        until = time.monotonic() + 6 * CHECK_INTERVAL_S
+        while String(data="ann") not in heard or not said or time.monotonic() < until:
+            assert time.monotonic() < until + 60
+            names.publish(String(data="ann"))
+            executor.spin_once(timeout_sec=0.02)
+        assert said == ["/missing is not published, since absent_msgs is not installed: install ros-jazzy-absent-msgs"]
+    finally:
+        session.close()
+        executor.shutdown()
+        node.destroy_node()
+        other.destroy_node()
+        rclpy.try_shutdown()

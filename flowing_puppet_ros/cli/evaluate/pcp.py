@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Percentage of correct parts (PCP) of poses, or of every method on a folder of images (thesis, Table 1).
+"""Percentage of correct parts (PCP) and joints (PCK) of poses, or of every method on a folder (thesis, Table 1).
 
 Each INPUT is a poses.json of `pose`, or a folder of images, on which the detector alone, NL (no likelihood), NS (no
 shape), plain PMP and D-PMP are measured. Several inputs are shown side by side. The truth is the annotation tool's
-JSON, keypoints.json, or a text file of sticks like those of the Buffy Stickmen.
+JSON, keypoints.json, or a text file of sticks like those of the Buffy Stickmen. PCK and OKS AP are of the arms' joints.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ from flowing_puppet_ros.evaluate.image.pcp_methods import measure_methods
 from flowing_puppet_ros.evaluate.image.pcp_truth import StickTruth, open_true_images, read_stick_truth
 from flowing_puppet_ros.evaluate.output import Chart, EvaluationReport, Figures, Line, name_runs
 from flowing_puppet_ros.evaluate.output import add_arguments as add_output
+from flowing_puppet_ros.evaluate.people import add_unmatched_argument
+from flowing_puppet_ros.evaluate.video.tracks import read_score
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints
@@ -36,8 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `evaluate pcp`."""
     parser.add_argument("inputs", nargs="+", type=Path, metavar="INPUT", help="folder of images, or poses.json")
     parser.add_argument(
-        "--truth", type=Path, help="annotations.json, keypoints.json or sticks.txt [annotations.json in INPUT]"
+        "--truth",
+        type=Path,
+        help="annotations.json, keypoints.json, sticks.txt, or keypoints of COCO, OpenPose, AlphaPose or MediaPipe "
+        "[annotations.json in INPUT]",
     )
+    add_unmatched_argument(parser)
     add_output(parser, "pcp")
     parser.add_argument("--model", default="neutral", choices=("neutral", "female", "male"), help="body [neutral]")
     parser.add_argument("--pixels", type=float, default=20.0, help="distance for elbows and wrists, px [20]")
@@ -68,7 +74,7 @@ def _read_truth(source: Path, given: Path | None) -> StickTruth:
     path = given or (source / "annotations.json" if source.is_dir() else None)
     if path is None:
         raise InputError(f"{source} needs the truth: name it with --truth")
-    truth = read_stick_truth(path)
+    truth = read_stick_truth(path, source)
     if not any(truth.values()):
         raise InputError(f"{path} has no person in any image")
     return truth
@@ -96,6 +102,7 @@ def _measure_images(arguments: argparse.Namespace, folder: Path, truth: StickTru
             PartLikelihood.load(),
             settings,
             arguments.pixels,
+            arguments.unmatched,
             lambda: progress.update() and None,
         )
 
@@ -112,7 +119,7 @@ def _measure_poses(arguments: argparse.Namespace, source: Path, truth: StickTrut
         raise InputError(f"{source} cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{source} is not a file of poses ({error!r})") from error
-    tally = Tally(arguments.pixels)
+    tally = Tally(arguments.pixels, arguments.unmatched)
     matched = 0
     for key, people in truth.items():
         found = [
@@ -131,7 +138,8 @@ def _measure_poses(arguments: argparse.Namespace, source: Path, truth: StickTrut
 def _read_people(names: tuple[str, ...], puppets: list[dict[str, Any]]) -> list[PosedSticks]:
     people = []
     for puppet in puppets:
-        sticks = sticks_from_joints(names, np.array(puppet["joints"], np.float64)[:, :2])
+        joints = np.array(puppet["joints"], np.float64)
+        sticks = sticks_from_joints(names, joints[:, :2])
         others = [sticks_from_joints(names, np.array(one["joints"], np.float64)) for one in puppet.get("solutions", [])]
-        people.append(PosedSticks(sticks, np.stack([sticks, *others])))
+        people.append(PosedSticks(sticks, np.stack([sticks, *others]), read_score(puppet)))
     return people

@@ -21,6 +21,8 @@ from tqdm import tqdm
 
 from flowing_puppet_ros.draw.plots import Series, draw_line_plot
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evaluate.identity import IDENTITY_FIGURES, IdentityCounts
+from flowing_puppet_ros.evaluate.people import Unmatched, add_unmatched_argument
 from flowing_puppet_ros.evaluate.tables import format_table, write_csv, write_json
 from flowing_puppet_ros.evaluate.video.errors import (
     CALIBRATION_DISTANCE_PX,
@@ -34,6 +36,7 @@ from flowing_puppet_ros.evaluate.video.errors import (
     measure_gain,
     summarise,
 )
+from flowing_puppet_ros.evaluate.video.identities import measure_identities
 from flowing_puppet_ros.evaluate.video.methods import (
     INIT,
     MEDIAN,
@@ -61,7 +64,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `evaluate video`."""
     names = ", ".join(METHODS)
     parser.add_argument("input", type=Path, help="folder of videos or of sub-folders of frames")
-    parser.add_argument("--truth", type=Path, required=True, help="JSON of the clips' joints, or folder of keypoints")
+    parser.add_argument(
+        "--truth",
+        type=Path,
+        required=True,
+        help="JSON of the clips' joints, or a file or folder of keypoints, ours or of COCO, OpenPose, AlphaPose or "
+        "MediaPipe",
+    )
     parser.add_argument("--init", type=Path, help="keypoints that rows with init- start from, in a form of the truth's")
     parser.add_argument("--out", type=Path, required=True, help="folder for the tracks, video.json, .csv and .html")
     parser.add_argument("--clips", default="", help="names of clips, with commas between [all that the truth has]")
@@ -71,6 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--again", action="store_true", help="track again what was tracked before")
     parser.add_argument("--processes", type=int, default=2, help="clips at a time [%(default)s]")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    add_unmatched_argument(parser)
     ClipSettings.add_arguments(parser, main="tracker")
 
 
@@ -89,7 +99,11 @@ def run(arguments: argparse.Namespace) -> int:
     for _ in tqdm(_done(tasks, arguments.processes), total=len(tasks), unit="clip", disable=None):
         pass
     errors = {name: {task.name: task.errors(name, truth[task.name]) for task in tasks} for name in methods}
-    _write(arguments, errors, {name: [task.seconds(name) for task in tasks] for name in methods})
+    identities = {
+        name: IdentityCounts.sum(task.identities(name, truth[task.name], arguments.unmatched) for task in tasks)
+        for name in methods
+    }
+    _write(arguments, errors, identities, {name: [task.seconds(name) for task in tasks] for name in methods})
     return 0
 
 
@@ -162,6 +176,19 @@ class _Task:
         }
         return measure_clip(found, truth, (width, height))
 
+    def identities(self, method: str, truth: PeopleByFrame, unmatched: Unmatched) -> IdentityCounts:
+        """Compare the ids of a method's tracks with the truth."""
+        data = json.loads(self.file(method).read_text(encoding="utf-8"))
+        width, height = self._about(method)["size"]
+        names = data["joint_names"]
+        found = {
+            int(frame["index"]): {
+                who: _person(names, person).joints for person in map(_located, frame["puppets"]) for who in [person.id]
+            }
+            for frame in data["frames"]
+        }
+        return measure_identities(found, truth, (width, height), unmatched)
+
     def _about(self, method: str) -> dict[str, Any]:
         return dict(json.loads(self._about_file(method).read_text()))
 
@@ -206,6 +233,7 @@ def _done(tasks: Sequence[_Task], processes: int) -> Iterator[None]:
 def _write(
     arguments: argparse.Namespace,
     errors: Mapping[str, Mapping[str, ClipErrors]],
+    identities: Mapping[str, IdentityCounts],
     seconds: Mapping[str, Sequence[float]],
 ) -> None:
     rows: list[dict[str, Any]] = []
@@ -214,7 +242,8 @@ def _write(
         curves[name] = measure_calibration(clips)
         row = {"method": name} | summarise(clips)
         row |= {"calibration_error": calibration_error(curves[name])}
-        rows.append(row | {"seconds_a_frame": round(float(np.mean(seconds[name])), 3)})
+        row |= {"seconds_a_frame": round(float(np.mean(seconds[name])), 3)}
+        rows.append(row | identities[name].summarise())
     gains = {name: _gains(name, errors) for name in errors}
     by_clip = {name: {clip: summarise({clip: one}) for clip, one in clips.items()} for name, clips in errors.items()}
     figures = {"methods": {row["method"]: row for row in rows}, "gains": gains, "calibration": curves, "clips": by_clip}
@@ -224,7 +253,10 @@ def _write(
     if arguments.json:
         print(json.dumps({row["method"]: row for row in rows}))
         return
-    print(format_table([{key.replace("_px", ""): value for key, value in row.items()} for row in rows]))
+    print(
+        format_table([{key.replace("_px", ""): row[key] for key in row if key not in IDENTITY_FIGURES} for row in rows])
+    )
+    print(format_table([{key: row[key] for key in ("method", *IDENTITY_FIGURES)} for row in rows]))
     for name, text in gains.items():
         if text:
             print(f"{name} over {BASES[INIT if name.startswith(INIT) else '']}: {text}")
@@ -249,7 +281,8 @@ def _page(
 ) -> str:
     heads = list(rows[0])
     cells = [[f"{row[head]:g}" if isinstance(row[head], float) else str(row[head]) for head in heads] for row in rows]
-    figures = table(heads, cells, range(1, len(heads)), "Joints within some pixels, medians, shake")
+    title = "Joints within some pixels, medians, shake; identities at the similarity OKS"
+    figures = table(heads, cells, range(1, len(heads)), title)
     figures += "".join(paragraph(f"{name}: {text}") for name, text in gains.items() if text)
     diagonal = Series("perfect", np.array([0.0, 1.0]), np.array([0.0, 1.0]))
     lines = [diagonal] + [

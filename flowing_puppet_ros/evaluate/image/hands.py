@@ -13,7 +13,7 @@ from flowing_puppet_ros.evidence.image.hands import EXTRAS, SPEED_SCALE_M, HandD
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
 from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.learn.likelihood.samples import PosedPerson
-from flowing_puppet_ros.learn.thesis_loop.hands import find_wrists, make_maps, sample_wrong_places
+from flowing_puppet_ros.learn.thesis_loop.hand_samples import find_wrists, make_maps, sample_wrong_places
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 MIN_MOTION_M = 0.015  # per frame; hands that move less are at rest

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Percentage of correctly estimated body parts (PCP), and elbows and wrists within a distance, over many images.
+"""Percentage of correctly estimated body parts (PCP), and of joints (PCK), and COCO's OKS AP, over many images.
 
 A part is correct if its ends are within half the true stick's length of the true ends: each of them (strict;
 Pishchulin et al., "Articulated people detection and pose estimation", CVPR 2012), or both on average (loose, like the
 Buffy Stickmen software; Ferrari, Marin-Jimenez and Zisserman, CVPR 2008). Sticks are (6, 2, 2) px in the order of
-`image.formats.stickmen.STICKS`; a stick with a NaN is unknown.
+`image.formats.stickmen.STICKS`; a stick with a NaN is unknown. Joints are shoulders, elbows and wrists.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flowing_puppet_ros.arrays import Array
+from flowing_puppet_ros.evaluate.joints import ARM_JOINTS, measure_pck
+from flowing_puppet_ros.evaluate.people import Unmatched, rate_people
+from flowing_puppet_ros.evaluate.precision import ScoredImage, measure_precision
 from flowing_puppet_ros.image.formats.stickmen import STICKS
 
 MAX_END_SHARE = 0.5  # distance of a correct part's ends, as a share of the true stick's length
@@ -28,16 +31,28 @@ GROUPS = {
     "lower arms": ("left_lower_arm", "right_lower_arm"),
     "total": STICKS,
 }
+ARM_JOINT_NAMES = tuple(f"{side}_{joint}" for side in ("left", "right") for joint in ARM_JOINTS)
 _TORSO, _HEAD = STICKS.index("torso"), STICKS.index("head")
 _LOWER_ARMS = [STICKS.index("left_lower_arm"), STICKS.index("right_lower_arm")]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedSticks:
-    """One estimated person: `sticks` (6, 2, 2) px, and `solutions` (n, 6, 2, 2) px including the best one."""
+    """One estimated person: `sticks` (6, 2, 2) px, `solutions` (n, 6, 2, 2) px including the best one, and a score."""
 
     sticks: Array
     solutions: Array
+    score: float = 1.0
+
+
+def joints_of_sticks(sticks: Array) -> dict[str, Array]:
+    """Return the known joints (2,) px of sticks (6, 2, 2): those of the arms, and the ends of torso and head."""
+    (top, bottom), (neck, crown) = sticks[_TORSO], sticks[_HEAD]
+    joints = {"neck": top, "pelvis": bottom, "upper_neck": neck, "head_top": crown}
+    for side in ("left", "right"):
+        joints[f"{side}_shoulder"] = sticks[STICKS.index(f"{side}_upper_arm"), 0]
+        joints[f"{side}_elbow"], joints[f"{side}_wrist"] = sticks[STICKS.index(f"{side}_lower_arm")]
+    return {name: joint for name, joint in joints.items() if np.isfinite(joint).all()}
 
 
 def end_distances(sticks: Array, truth: Array) -> Array:
@@ -78,6 +93,7 @@ class Tally:
     """Counts over all true people; every known part of a missed person counts as wrong."""
 
     pixels: float = 20.0
+    unmatched: Unmatched = "wrong"
     people: int = 0
     found: int = 0
     known: Array = field(default_factory=lambda: np.zeros(len(STICKS)))
@@ -86,11 +102,18 @@ class Tally:
     ends: Array = field(default_factory=lambda: np.zeros(2))
     near: Array = field(default_factory=lambda: np.zeros(2))
     near_of_several: Array = field(default_factory=lambda: np.zeros(2))
+    misses: list[Array] = field(default_factory=list)
+    """Distance px of each arm joint of a true person, then the lengths px of torso and head."""
+    images: list[ScoredImage] = field(default_factory=list)
 
     def add(self, people: Sequence[PosedSticks], truths: Sequence[Array]) -> None:
         """Count one image."""
+        found, true = [joints_of_sticks(person.sticks) for person in people], [joints_of_sticks(one) for one in truths]
+        score = np.array([person.score for person in people])
+        self.images.append(rate_people(found, score, true, ARM_JOINT_NAMES, self.unmatched))
         for truth, person in zip(truths, match_people(people, truths), strict=True):
             self.people += 1
+            self.misses.append(_measure_arms(None if person is None else person.sticks, truth))
             known = np.isfinite(truth).all(axis=(1, 2))
             self.known += known
             ends = np.isfinite(truth[_LOWER_ARMS]).all(axis=2)
@@ -122,7 +145,17 @@ class Tally:
             if self.ends[row]:
                 figures[f"{joint} within {self.pixels:g} px"] = _percent(self.near[row], self.ends[row])
                 figures[f"{joint} of the best solution"] = _percent(self.near_of_several[row], self.ends[row])
-        return figures
+        misses = np.reshape(self.misses, (-1, len(ARM_JOINT_NAMES) + 2))
+        shared = measure_pck(misses[:, :-2], misses[:, -2], misses[:, -1]) | measure_precision(self.images)
+        return figures | {name: round(value, 2) for name, value in shared.items()}
+
+
+def _measure_arms(sticks: Array | None, truth: Array) -> Array:
+    """Return the distances px of the joints of the arms, infinite if missed, and the true lengths of torso and head."""
+    found, true = {} if sticks is None else joints_of_sticks(sticks), joints_of_sticks(truth)
+    missed = {name: np.linalg.norm(found[name] - true[name]) if name in found else np.inf for name in true}
+    lengths = np.linalg.norm(truth[[_TORSO, _HEAD], 1] - truth[[_TORSO, _HEAD], 0], axis=1)
+    return np.array([*(missed.get(name, np.nan) for name in ARM_JOINT_NAMES), *lengths])
 
 
 def _percent(count: float, total: float) -> float:

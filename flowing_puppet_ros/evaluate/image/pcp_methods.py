@@ -11,6 +11,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.evaluate.image.pcp import PosedSticks, Tally
+from flowing_puppet_ros.evaluate.people import Unmatched
 from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
 from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints
 from flowing_puppet_ros.image.pose.estimator import PoseDetectorLike, PoseEstimator
@@ -53,6 +54,7 @@ def measure_methods(
     likelihood: LikelihoodLike,
     settings: PoseSettings,
     pixels: float,
+    unmatched: Unmatched,
     progress: Callable[[], None],
 ) -> dict[str, dict[str, float]]:
     """Return the figures of `Tally` and CPU seconds per image by method, over images (H, W, 3) with true sticks.
@@ -60,7 +62,7 @@ def measure_methods(
     `progress` is called after each image. The time of the search excludes the detector.
     """
     once = _SharedDetector(detector)
-    tallies = {name: Tally(pixels) for name in (DETECTOR, *METHODS)}
+    tallies = {name: Tally(pixels, unmatched) for name in (DETECTOR, *METHODS)}
     seconds = dict.fromkeys(tallies, 0.0)
     estimators = {
         name: PoseEstimator([model], once, likelihood, replace(settings, **changes), [sides])
@@ -87,7 +89,8 @@ def measure_methods(
 
 def _sticks_from_pose(posed: PosedPuppet, model: DeformableStructures) -> PosedSticks:
     solutions = [sticks_from_joints(model.joint_names, solution.joints) for solution in posed.solutions]
-    return PosedSticks(sticks_from_joints(model.joint_names, posed.joints), np.stack(solutions))
+    sticks = sticks_from_joints(model.joint_names, posed.joints)
+    return PosedSticks(sticks, np.stack(solutions), float(posed.confidence.mean()))
 
 
 def _sticks_from_detection(found: PersonHypotheses, model: DeformableStructures) -> PosedSticks:
@@ -96,4 +99,4 @@ def _sticks_from_detection(found: PersonHypotheses, model: DeformableStructures)
     for keypoints, _ in found.modes(10):
         joints, _ = joints_from_keypoints(model, keypoints)
         several.append(sticks_from_joints(model.joint_names, joints))
-    return PosedSticks(several[0], np.stack(several))
+    return PosedSticks(several[0], np.stack(several), found.confidence)

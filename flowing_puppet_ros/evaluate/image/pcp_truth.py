@@ -4,52 +4,81 @@
 annotations.json  {"joint_names": [...], "images": {"a/b.png" or "clip.avi#12": [{"joints": [[x, y, visible], ...]}]}}
 keypoints.json    {"joint_names": [...], "frames": {"0": [[[x, y, confidence], ...], ...]}}
 sticks.txt        frame number and 6 x (x1 y1 x2 y2) per person, see image.formats.stickmen
+others            files or folders of COCO, OpenPose, AlphaPose and MediaPipe, see image.formats.detector_json
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.formats.frame_names import FrameNames, Label
+from flowing_puppet_ros.image.formats.keypoint_files import load_json, read_keypoints, read_labelled
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.stickmen import read_sticks, sticks_from_joints
-from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
-from flowing_puppet_ros.image.formats.video_reader import VideoFrame, open_frames
+from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, FrameSource, VideoFrame, open_frames
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 
 type StickTruth = Mapping[str | int, Sequence[Array]]
 """Sticks (6, 2, 2) px of the people of an image, by its key in annotations.json or by its number."""
 
 
-def read_stick_truth(path: Path) -> StickTruth:
-    """Read one of the three forms; InputError if it is none of them."""
-    if path.suffix.lower() == ".json":
-        return _read_annotations(path) or {
-            number: [_sticks_from_keypoints(one) for one in people] for number, people in read_keypoints(path).items()
-        }
-    return dict(read_sticks(path).items())
+def read_stick_truth(path: Path, source: Path) -> StickTruth:
+    """Read any of these forms; `source` is the folder of images or the poses.json that it tells the truth about.
+
+    InputError if it is none of them.
+    """
+    if path.is_dir():
+        return _read_named(path, source)
+    if path.suffix.lower() != ".json":
+        return dict(read_sticks(path).items())
+    data = load_json(path)
+    if not isinstance(data, dict) or "joint_names" not in data:
+        return _read_named(path, source)
+    if "images" in data:
+        return _read_annotations(data, path)
+    people = read_labelled(path).people
+    # In our own file a number is that in an image's name, see `open_true_images`.
+    return _convert(people) if all(isinstance(label, int) for label in people) else _read_named(path, source)
 
 
-def _read_annotations(path: Path) -> StickTruth | None:
-    """Read the people of annotations.json; None if the file has no images."""
+def _convert(people: Mapping[Label, Sequence[Keypoints]]) -> StickTruth:
+    return {number: [_sticks_from_keypoints(one) for one in found] for number, found in people.items()}
+
+
+def _read_named(path: Path, source: Path) -> StickTruth:
+    """Read the keypoints of another detector; its images are named, or are counted from 0 where it has no names."""
+    files = open_frames(source).files if source.is_dir() else _list_posed(source)
+    frames = FrameNames(source.stem, files, len(files), FrameSource(source, FOLDER_FPS, len(files), files).read_size)
+    people = read_keypoints(path, frames)
+    # An image is known by its name in its folder, and by its whole path in a poses.json.
+    keys = [file.name if source.is_dir() else file.as_posix() for file in files]
+    return _convert({keys[index] if index < len(keys) else index: found for index, found in people.items()})
+
+
+def _list_posed(source: Path) -> tuple[Path, ...]:
+    """Return the images that a poses.json names; none if it has no names."""
+    data = load_json(source)
+    frames = data.get("frames", []) if isinstance(data, dict) else []
+    paths = [frame.get("path") for frame in frames if isinstance(frame, dict)]
+    return tuple(Path(str(path)) for path in paths) if all(paths) else ()
+
+
+def _read_annotations(data: Mapping[str, Any], path: Path) -> StickTruth:
+    """Return the people of annotations.json."""
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-        if "images" not in data:
-            return None
         names = tuple(data["joint_names"])
         return {
             key: [_sticks_from_annotation(names, np.array(person["joints"], np.float64)) for person in people]
             for key, people in data["images"].items()
         }
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path} is not a file of annotations or keypoints ({error!r})") from error
 
 

@@ -70,7 +70,7 @@ def measure_clip(
             chosen = find_nearest(known, [one.joints for one in found])
             for kind in kinds:
                 for name in (f"right_{kind}", f"left_{kind}"):
-                    if name not in known or not _is_inside(known[name], size):
+                    if name not in known or not is_inside(known[name], size):
                         continue
                     mine = None if chosen is None else found[chosen].joints.get(name)
                     miss = np.full(2, np.inf) if mine is None else mine - known[name]
@@ -87,7 +87,8 @@ def measure_clip(
     )
 
 
-def _is_inside(point: Array, size: tuple[int, int]) -> bool:
+def is_inside(point: Array, size: tuple[int, int]) -> bool:
+    """Return whether a point (2,) px is in an image of `size` (width, height)."""
     return bool((point >= -0.5).all() and (point <= np.array(size) - 0.5).all())
 
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The rows of `evaluate video`: every way to track the people of a clip, from the detector alone to the default.
 
-A row whose name begins with `init-` starts from given keypoints instead of the detector.
+A row whose name begins with `init-` starts from given keypoints instead of the detector, one that begins with
+`networks-` from the keypoint networks.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ from flowing_puppet_ros.image.detector.interface import DetectorLike
 from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame
+from flowing_puppet_ros.image.networks.choice import are_installed, load_networks
+from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
 from flowing_puppet_ros.image.video.clip import Clip, ClipSettings, Method, TrackedFrame, track_clip, track_live
 from flowing_puppet_ros.image.video.detection_worker import DetectionWorker
-from flowing_puppet_ros.image.video.live_tracker import FRAME_NS
+from flowing_puppet_ros.image.video.pending_detection import FRAME_NS
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.image.video.tracklets import FIRST
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -80,6 +83,7 @@ class ClipRun:
     worker: DetectionWorker
     given: PeopleByFrame | None
     settings: ClipSettings
+    networks: KeypointSource | None = None
 
     @classmethod
     def load(cls, frames: Sequence[VideoFrame], given: PeopleByFrame | None, settings: ClipSettings) -> ClipRun:
@@ -100,7 +104,15 @@ class ClipRun:
     def track(self, method: Method = "smoothed", flow_of: Callable[[VideoFrame], FlowPair] | None = None) -> ClipTrack:
         """Track the clip with all of it in view."""
         return _locate(
-            track_clip(self.clip(), self.model, self.settings, method=method, worker=self.worker, flow_of=flow_of)
+            track_clip(
+                self.clip(),
+                self.model,
+                self.settings,
+                method=method,
+                worker=self.worker,
+                networks=self.networks,
+                flow_of=flow_of,
+            )
         )
 
 
@@ -118,6 +130,8 @@ def _detect_alone(run: ClipRun) -> ClipTrack:
 def _keypoints(run: ClipRun, frame: VideoFrame) -> Sequence[Keypoints]:
     if run.given is not None:
         return run.given.get(frame.index) or ()
+    if run.networks is not None:
+        return [person.keypoints for person in run.networks.find(frame.image)]
     people, minimum = min(run.settings.tracker.max_people, MAX_PEOPLE), run.settings.detection.min_probability
     settings = DetectorSettings(min_confidence=FIRST * minimum, max_people=people, mirrored=False)
     found = run.worker.detector.detect(frame.image, settings)
@@ -131,7 +145,7 @@ def _zero_flow(run: ClipRun, frame: VideoFrame) -> FlowPair:
 
 
 def _track_live(run: ClipRun) -> ClipTrack:
-    return _locate(track_live(run.clip(), run.model, run.settings, worker=run.worker))
+    return _locate(track_live(run.clip(), run.model, run.settings, worker=run.worker, networks=run.networks))
 
 
 def _track_as_node(run: ClipRun) -> ClipTrack:
@@ -144,7 +158,9 @@ def _track_as_node(run: ClipRun) -> ClipTrack:
     settings = replace(run.settings, flow=replace(run.settings.flow, preset="fast"))
     played = [*run.frames, *run.frames[::-1], *run.frames]
     stamped = [replace(frame, index=k, stamp_ns=k * FRAME_NS) for k, frame in enumerate(played)]
-    frames = track_live(Clip.of(stamped), run.model, settings, LiveDetectionSettings(), worker=run.worker)
+    frames = track_live(
+        Clip.of(stamped), run.model, settings, LiveDetectionSettings(), worker=run.worker, networks=run.networks
+    )
     return _locate(frames)[-len(run.frames) :]
 
 
@@ -195,13 +211,15 @@ METHODS: Mapping[str, Callable[[ClipRun], ClipTrack]] = {
 """Rows by name. `still`: the flow says that nothing moves; `noflow`: it is not used for anything that is scored."""
 
 MEDIAN = "-median"
-INIT = "init-"
+INIT, NETWORKS = "init-", "networks-"
 
 
 def all_names(with_init: bool) -> list[str]:
     """Return the rows that are measured when none is chosen."""
     names = [*METHODS]
     names += [f"{name}{MEDIAN}" for name in ("detector", "thesis")]
+    if are_installed():
+        names += [f"{NETWORKS}{name}" for name in ("detector", "node", "live", "default")]
     from_init = ("detector", f"detector{MEDIAN}", "live", "default", f"thesis{MEDIAN}")
     return names + [f"{INIT}{name}" for name in from_init] if with_init else names
 
@@ -210,10 +228,11 @@ def check_names(names: Sequence[str], with_init: bool) -> list[str]:
     """Return the rows that are asked for; InputError for one that is unknown or has nothing to start from."""
     for name in names:
         bare = name.removesuffix(MEDIAN)
-        if bare.removeprefix(INIT) not in METHODS:
+        if bare.removeprefix(INIT).removeprefix(NETWORKS) not in METHODS:
             raise InputError(
                 f"there is no method {name!r}; known are {', '.join(METHODS)}, each also as {INIT}NAME, from given"
-                f" keypoints, and as NAME{MEDIAN}, with a median filter over three frames"
+                f" keypoints, as {NETWORKS}NAME, from the keypoint networks, and as NAME{MEDIAN}, with a median filter"
+                " over three frames"
             )
         if bare.startswith(INIT) and not with_init:
             raise InputError(f"the method {name} starts from keypoints: name them with --init")
@@ -224,7 +243,9 @@ def run_method(name: str, run: ClipRun) -> ClipTrack:
     """Return the people of each frame by one of the rows, before any median filter."""
     if not name.startswith(INIT):
         run = replace(run, given=None)
-    return METHODS[name.removeprefix(INIT)](run)
+    if name.startswith(NETWORKS):
+        run = replace(run, networks=load_networks("neural"))
+    return METHODS[name.removeprefix(INIT).removeprefix(NETWORKS)](run)
 
 
 def filter_by_median(track: ClipTrack) -> ClipTrack:

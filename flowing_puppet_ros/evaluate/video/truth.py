@@ -1,20 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """A folder of clips, and the people in their frames: the ground truth, or the tracker's initial detections.
 
-A clip is a video file or a sub-folder of images. People are read from one JSON of all clips, from one keypoints.json if
-there is one clip, or from a folder with a keypoints file named after each clip. See `image.formats.annotations`.
+A clip is a video file or a sub-folder of images. People are read from one JSON of all clips, whose images or frames are
+named after their clip, from any file of keypoints if there is one clip, or from a folder with a file or sub-folder of
+keypoints named after each clip. See `image.formats.annotations` and `image.formats.keypoint_files`.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.annotations import Annotations
+from flowing_puppet_ros.image.formats.frame_names import FrameNames
+from flowing_puppet_ros.image.formats.keypoint_files import load_json, place_people, read_keypoints, read_labelled
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
 from flowing_puppet_ros.image.formats.video_reader import IMAGE_SUFFIXES, open_frames
 
 VIDEO_SUFFIXES = frozenset({".avi", ".mp4", ".m4v", ".mkv", ".mov", ".mpg", ".mpeg", ".webm"})
@@ -56,28 +58,50 @@ def _has_images(place: Path) -> bool:
 def read_people(path: Path, clips: Clips) -> dict[str, PeopleByFrame]:
     """Read people by clip from the file or folder `path`; InputError if it covers none of the clips."""
     if path.is_dir():
-        files = {name: path / f"{clip.stem}.json" for name, clip in clips.items()}
-        found: dict[str, PeopleByFrame] = {name: read_keypoints(file) for name, file in files.items() if file.is_file()}
-    elif "frames" in _read_object(path):
-        if len(clips) != 1:
-            raise InputError(f"{path} has the frames of one clip, but there are {len(clips)}; choose one with --clips")
-        found = {name: read_keypoints(path) for name in clips}
-    else:
+        places = {name: _find_keypoints(path, clip.stem) for name, clip in clips.items()}
+        found: dict[str, PeopleByFrame] = {
+            name: read_keypoints(place, FrameNames.of(open_frames(clips[name])))
+            for name, place in places.items()
+            if place
+        }
+        found = found or _select_named(path, clips)
+    elif _is_annotated(load_json(path)):
         found = _select_annotated(Annotations.load(path), clips)
+    else:
+        found = _select_named(path, clips)
     found = {name: people for name, people in found.items() if any(people.values())}
     if not found:
         raise InputError(f"{path} has no person in any of the clips {', '.join(list(clips)[:3])} ...")
     return found
 
 
-def _read_object(path: Path) -> Mapping[str, object]:
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a JSON file: {error}") from error
-    return data if isinstance(data, dict) else {}
+def _find_keypoints(folder: Path, stem: str) -> Path | None:
+    """Return a clip's file of keypoints in the folder, or its sub-folder with one a frame."""
+    file = folder / f"{stem}.json"
+    if file.is_file():
+        return file
+    return folder / stem if any((folder / stem).glob("*.json")) else None
+
+
+def _is_annotated(data: object) -> bool:
+    """Return whether JSON has one of the layouts of `Annotations`."""
+    return isinstance(data, dict) and "joint_names" in data and ("images" in data or "clips" in data)
+
+
+def _select_named(path: Path, clips: Clips) -> dict[str, PeopleByFrame]:
+    """Select the people of the clips from keypoints; with several clips, their frames are named after them."""
+    labelled = read_labelled(path)
+    frames = {name: FrameNames.of(open_frames(clip)) for name, clip in clips.items()}
+    if len(clips) == 1:
+        return {name: place_people(labelled, names, path) for name, names in frames.items()}
+    if any(isinstance(label, int) for label in labelled.people):
+        raise InputError(f"{path} has the frames of one clip, but there are {len(clips)}; choose one with --clips")
+    found: dict[str, PeopleByFrame] = {}
+    for name, names in frames.items():
+        own = {label: people for label, people in labelled.people.items() if names.includes(label)}
+        if any(own.values()):
+            found[name] = place_people(replace(labelled, people=own), names, path)
+    return found
 
 
 def _select_annotated(annotations: Annotations, clips: Clips) -> dict[str, PeopleByFrame]:

@@ -144,6 +144,11 @@ class PersonDetection:
         """Sticks (6, 2, 2) px in the order of `stickmen.STICKS`."""
         return sticks_from_joints(self.keypoints.names, self.keypoints.xy)
 
+    @property
+    def joints_are_independent(self) -> bool:
+        """The score of a joint is that of the best pose with the joint there: a wrong pose costs at all its joints."""
+        return False
+
     def joint_score(self, joint: str, xy: F64) -> F64:
         """Return the score (K,) of the best pose with a joint at each of `xy` (K, 2) px, less that of the best pose.
 

@@ -62,11 +62,15 @@ class JointModel(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keypoints:
-    """One detected person: `names` (K,), `xy` (K, 2) px with NaN where unknown, `confidence` (K,) in [0, 1]."""
+    """One detected person: `names` (K,), `xy` (K, 2) px with NaN where unknown, `confidence` (K,) in [0, 1].
+
+    `track_id` is the id under which the detector itself tracks the person; empty if it does not.
+    """
 
     names: tuple[str, ...]
     xy: F64
     confidence: F64
+    track_id: str = ""
 
     def __post_init__(self) -> None:
         """Convert to float64; InputError when the lengths disagree."""

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""JSON files of the command line: keypoints that start and re-anchor people, and the resulting tracks.
+"""The JSON files that `track` and `pose` write.
 
-    keypoints.json  {"joint_names": [...], "frames": {"0": [[[x, y, confidence], ...], ...]}}   people per frame
-    tracks.json     {"joint_names": [...], "fps": f, "frames": [{"index", "path", "stamp_ns", "puppets": [...]}]}
+    {"joint_names": [...], "fps": f, "frames": [{"index", "path", "stamp_ns", "puppets": [...]}]}
 
 Pixels of the input, person's left and right; NaN is written as null.
 """
@@ -15,19 +14,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.formats.keypoints import Keypoints, normalise_name
-from flowing_puppet_ros.image.formats.stick_regression import StickRegression
-from flowing_puppet_ros.image.formats.stickmen import read_sticks
-from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
 from flowing_puppet_ros.model.tree import PartTree
 
 DECIMALS = 2  # of a pixel
-MAX_INDEX_DIGITS = 18  # of a frame's index; longer ones are refused
 
 
 class PuppetLike(Protocol):
@@ -72,51 +64,6 @@ class PuppetLike(Protocol):
     def depth(self) -> tuple[int, ...]:
         """Paint order of each part, 0 is farthest."""
         ...
-
-
-def read_keypoints(path: str | Path) -> dict[int, list[Keypoints]]:
-    """Read keypoints.json or sticks.txt: {frame index: people}. No detector ran on a frame that is not listed.
-
-    Sticks are converted to puppets, see `stick_regression`. InputError, naming the entry, for any other file.
-    """
-    if Path(path).suffix.lower() == ".txt":
-        regression = StickRegression(DeformableStructures.load())
-        return {
-            number: [regression.to_keypoints(sticks) for sticks in people]
-            for number, people in read_sticks(Path(path)).items()
-        }
-    try:
-        data = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is not a JSON file: {error}") from error
-    if not isinstance(data, dict) or not isinstance(data.get("frames"), dict):
-        raise InputError(f'{path} needs "joint_names" and "frames": {{"0": [[[x, y, confidence], ...], ...]}}')
-    names = data.get("joint_names")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise InputError(f'{path} needs "joint_names", a list of strings')
-    if not any(normalise_name(name) for name in names):
-        raise InputError(f"{path} has no known joint name, only {names[:3]} and the like")
-    frames: dict[int, list[Keypoints]] = {}
-    for key, people in data["frames"].items():
-        if not key.isdecimal() or len(key) > MAX_INDEX_DIGITS or not isinstance(people, list):
-            raise InputError(f"{path}: frame {key[:MAX_INDEX_DIGITS]!r} must be an index with a list of people")
-        frames[int(key)] = [_parse_person(tuple(names), rows, f"{path}, frame {key}") for rows in people]
-    if not any(frames.values()):
-        raise InputError(f"{path} has no person in any frame")
-    return frames
-
-
-def _parse_person(names: tuple[str, ...], rows: Any, where: str) -> Keypoints:
-    try:
-        # null, the JSON for an unknown number, becomes NaN.
-        values = np.array(rows, dtype=np.float64)
-    except (TypeError, ValueError):
-        values = np.empty(0)
-    if values.shape != (len(names), 3):
-        raise InputError(f"{where}: a person needs {len(names)} entries [x, y, confidence], one per joint name")
-    return Keypoints(names, values[:, :2], np.nan_to_num(values[:, 2]))
 
 
 def puppet_to_json(puppet: PuppetLike, tree: PartTree) -> dict[str, Any]:

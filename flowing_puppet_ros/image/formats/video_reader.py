@@ -52,6 +52,13 @@ class FrameSource:
         if index < 0:
             raise InputError(f"{self.path} has no frame that can be decoded; it is broken or its codec is unknown")
 
+    def read_size(self, index: int) -> tuple[int, int] | None:
+        """Return width and height of an image of the folder or of a video's frames, px; None if it cannot be read."""
+        if not self.files:
+            return next(((frame.image.shape[1], frame.image.shape[0]) for frame in self), None)
+        image = cv2.imread(str(self.files[index]), cv2.IMREAD_COLOR) if index < len(self.files) else None
+        return None if image is None else (image.shape[1], image.shape[0])
+
     def _read_images(self) -> Iterator[tuple[int, U8, str]]:
         for index, path in enumerate(self.files):
             image = cv2.imread(str(path), cv2.IMREAD_COLOR)

@@ -124,6 +124,11 @@ class PersonHypotheses(Protocol):
         """Probability that this is a person."""
         ...
 
+    @property
+    def joints_are_independent(self) -> bool:
+        """Whether the score of a joint says nothing about other joints, unlike that of a whole pose."""
+        ...
+
     def modes(self, count: int) -> list[tuple[Keypoints, float]]:
         """Return up to `count` different poses, best first, with their scores relative to the best (0 or less)."""
         ...
@@ -145,6 +150,11 @@ class KeypointPerson:
         """Mean confidence of the known keypoints."""
         known = [point[2] for point in self.keypoints.select_usable().values()]
         return float(np.mean(known)) if known else 0.0
+
+    @property
+    def joints_are_independent(self) -> bool:
+        """Each keypoint was found by itself."""
+        return True
 
     def modes(self, count: int) -> list[tuple[Keypoints, float]]:
         """Return the keypoints, the only pose."""

@@ -141,7 +141,8 @@ class PoseSearch:
         for index, name in enumerate(self._scored_joints[k]):
             score = target.hypotheses.joint_score(name, np.ascontiguousarray(places[:, index]))
             weight = settings.detector_weight * (WRIST_WEIGHT if name.endswith("wrist") else 1.0)
-            cost -= weight / len(self._scored_joints[k]) * score
+            share = 1 if target.hypotheses.joints_are_independent else len(self._scored_joints[k])
+            cost -= weight / share * score
         return ScoredPartParticles(particles, cost)
 
     def _improve(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Association of detections with tracks, by distance and appearance."""
+"""Association of detections with tracks, by distance, appearance and the ids of the detector."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.arrays import F64, Bools
 from flowing_puppet_ros.image.tracking.appearance import TorsoAppearance, hellinger_distance
 from flowing_puppet_ros.image.tracking.track import Track
 
 type Detection = tuple[F64, F64]  # joints (J, 2) px with NaN unknown, confidence (J,)
 
 APPEARANCE_WEIGHT_M = 0.6  # distance of joints that costs as much as the maximum appearance distance
+SAME_ID_BONUS_M = 0.05  # distance of joints that an id of the detector, the same as last time, makes up for
 MAX_SAME_DISTANCE = 0.45  # appearance distance up to which a lost person is recognised ...
 MIN_OTHER_MARGIN = 0.15  # ... if all others differ by so much more
 REIDENTIFY_FACTOR = 3.0  # search radius for a person after an occlusion, in match distances
@@ -34,12 +35,14 @@ def associate(
     detections: Sequence[Detection],
     limit: float,
     appearances: Sequence[TorsoAppearance | None] | None = None,
+    ids: Sequence[str] | None = None,
 ) -> tuple[dict[int, int], list[int]]:
     """Match tracks and detections one to one, by joint distance (at most `limit` metres) and appearance.
 
-    `appearances` are those of the detected people. A track without a match that has overlapped with another, and may
-    have been occluded by it, is re-identified by an appearance that no other track has, within REIDENTIFY_FACTOR times
-    the limit.
+    `appearances` are those of the detected people. `ids` are the detector's own, empty for none: a hint that decides
+    between people at nearly the same distance, since some detectors exchange ids just when people meet. A track without
+    a match that has overlapped with another, and may have been occluded by it, is re-identified by an appearance that
+    no other track has, within REIDENTIFY_FACTOR times the limit.
 
     Returns {track: detection} and the unmatched detections; a second detection of a matched track (within `limit`) is
     not among them.
@@ -49,13 +52,20 @@ def associate(
     distance = np.array([[joint_distance(track, detection) for detection in detections] for track in tracks])
     cost = np.minimum(distance, 1e3 * limit)
     dissimilarity = _appearance_distance(tracks, appearances, distance.shape)
-    rows, columns = linear_sum_assignment(cost + APPEARANCE_WEIGHT_M * dissimilarity)
+    bonus = SAME_ID_BONUS_M * (_has_same_id(tracks, ids, distance.shape) & (distance <= limit))
+    rows, columns = linear_sum_assignment(cost + APPEARANCE_WEIGHT_M * dissimilarity - bonus)
     pairs = zip(rows, columns, strict=True)
     matched = {int(row): int(column) for row, column in pairs if distance[row, column] <= limit}
     matched |= _reidentify(tracks, distance, dissimilarity, matched, REIDENTIFY_FACTOR * limit)
     taken = set(matched.values())
     free = [k for k in range(len(detections)) if k not in taken and not (distance[list(matched), k] <= limit).any()]
     return matched, free
+
+
+def _has_same_id(tracks: Sequence[Track], ids: Sequence[str] | None, shape: tuple[int, int]) -> Bools:
+    """Return where (tracks, detections) the detector's id is the one that the track was last matched with."""
+    same = [[bool(identity) and identity == track.detector_id for identity in ids or ()] for track in tracks]
+    return np.array(same, dtype=bool) if ids else np.zeros(shape, dtype=bool)
 
 
 def _appearance_distance(

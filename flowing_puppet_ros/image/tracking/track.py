@@ -70,6 +70,7 @@ class Track:
     `outlier_position` (J, 2) is the last detected position that the gate rejected (NaN none) and `outlier_count` (J,)
     how often in a row it was seen there. `age` (J,) counts the images since a detection was last accepted. `detected`
     (J, 3) is this image's detection as x, y and confidence, `detection` its index among the detections, or None.
+    `detector_id` is the detector's own id of the last matched detection that had one.
     `unseen` and `missed` count images and detector runs without a match. `appearance` are the colours of the torso (see
     `appearance`) or None; `overlapped` is set if another torso overlapped with it since the last detection.
     """
@@ -85,6 +86,7 @@ class Track:
     view: View
     detected: F64 | None = None
     detection: int | None = None
+    detector_id: str = ""
     view_votes: float = 0.0
     unseen: int = 0
     missed: int = 0

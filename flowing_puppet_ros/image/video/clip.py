@@ -24,6 +24,7 @@ from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame
+from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.thesis_loop.clip import ThesisClip, evidence_from_keypoints
 from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings
 from flowing_puppet_ros.image.thesis_loop.loop import LoopSettings
@@ -32,6 +33,7 @@ from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.video.detection_worker import DetectionWorker
 from flowing_puppet_ros.image.video.live_tracker import LiveTracker
+from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
 from flowing_puppet_ros.image.video.offline_smoother import OfflineSmoother
 from flowing_puppet_ros.image.video.settings import EVERY_IMAGE, ClipDetectionSettings, LiveDetectionSettings
 from flowing_puppet_ros.image.video.tracklets import Tracklet, TrackletLinker
@@ -106,6 +108,7 @@ def track_clip(
     *,
     method: Method = "smoothed",
     worker: DetectionWorker | None = None,
+    networks: KeypointSource | None = None,
     flow_of: Callable[[VideoFrame], FlowPair] | None = None,
     warn: Callable[[str], None] | None = None,
     progress: Progress = lambda frames, title: frames,
@@ -120,6 +123,7 @@ def track_clip(
         method: `smoothed`: the best path of the arms' hypotheses, then all joints smoothed along the flow; `thesis`:
             the loop of the thesis's video chapter (Eqs. 33-37), a slow reference.
         worker: the detector, and the model that scores arms; the package's own when not given.
+        networks: find the people instead of the detector.
         flow_of: (forward, backward) flow to a frame from the one before; computed when not given.
         warn: is told of what is left out; without it the first unusable frame is an error.
         progress: shows how far the passes over the frames are.
@@ -134,7 +138,12 @@ def track_clip(
     run = _ClipRun(clip, model, settings, method, flow_of, warn)
     collector = run.collector()
     stamps = []
-    steps = run.track_keypoints(progress) if clip.has_keypoints else run.track_detections(worker, progress)
+    if clip.has_keypoints:
+        steps = run.track_keypoints(progress)
+    elif networks is not None:
+        steps = run.track_networks(networks, progress)
+    else:
+        steps = run.track_detections(worker, progress)
     for frame, result, evidence in steps:
         collector.add(result, evidence)
         stamps.append((frame.index, frame.stamp_ns, frame.path))
@@ -149,6 +158,7 @@ def track_live(
     detection: LiveDetectionSettings = EVERY_IMAGE,
     *,
     worker: DetectionWorker | None = None,
+    networks: KeypointSource | None = None,
     warn: Callable[[str], None] | None = None,
     progress: Progress = lambda frames, title: frames,
 ) -> Iterator[TrackedFrame]:
@@ -156,10 +166,13 @@ def track_live(
 
     Arguments are those of `track_clip`; `detection` says when the detector runs, by default in every image.
     """
-    settings = settings or ClipSettings()
-    tracker = FlowingPuppetTracker(model, settings.tracker, settings.flow)
-    live = LiveTracker(tracker, detection, worker=worker)
-    run = _ClipRun(clip, model, settings, "smoothed", None, warn)
+    run = _ClipRun(clip, model, settings or ClipSettings(), "smoothed", None, warn)
+    tracker = run.make_tracker()
+    live: LiveTracker | NetworkTracker
+    if networks is None:
+        live = LiveTracker(tracker, detection, worker=worker)
+    else:
+        live = NetworkTracker(tracker, detection, networks)
 
     def step(frame: VideoFrame, keypoints: Sequence[Keypoints] | None) -> tuple[TrackResult, None]:
         if clip.has_keypoints:
@@ -202,7 +215,7 @@ class _ClipRun:
 
     def track_keypoints(self, progress: Progress) -> Iterator[tuple[VideoFrame, TrackResult, Any]]:
         """Track the people who come with the frames."""
-        tracker = self._make_tracker()
+        tracker = self.make_tracker()
         likelihood = PartLikelihood.load() if self.method == "thesis" else None
 
         def step(frame: VideoFrame, keypoints: Sequence[Keypoints] | None) -> tuple[TrackResult, Any]:
@@ -213,12 +226,28 @@ class _ClipRun:
 
         yield from self.step_through(progress(self.clip.frames, "track"), step)
 
+    def track_networks(
+        self, networks: KeypointSource, progress: Progress
+    ) -> Iterator[tuple[VideoFrame, TrackResult, Any]]:
+        """Track the people whom the networks find in each frame, with a close look at where the tracks lead."""
+        tracker = self.make_tracker()
+        live = NetworkTracker(tracker, EVERY_IMAGE, networks)
+        likelihood = PartLikelihood.load() if self.method == "thesis" else None
+
+        def step(frame: VideoFrame, _: Sequence[Keypoints] | None) -> tuple[TrackResult, Any]:
+            result = live.step(frame.image, frame.stamp_ns, self._flow(frame))
+            if likelihood is None:
+                return result, None
+            return result, evidence_from_keypoints(self.model, likelihood, frame.image, result, live.people)
+
+        yield from self.step_through(progress(self.clip.frames, "track"), step)
+
     def track_detections(
         self, worker: DetectionWorker | None, progress: Progress
     ) -> Iterator[tuple[VideoFrame, TrackResult, Any]]:
         """Detect the people of the whole clip, then track them where their tracklets lead."""
         worker = worker or DetectionWorker(PartDetector.load(), ArmEvidenceModel.load(self.model.gender))
-        tracker = self._make_tracker()
+        tracker = self.make_tracker()
         tracklets = find_people(self.clip, worker, self.settings.detection, self.settings.tracker.max_people, progress)
 
         numbers = count()
@@ -260,7 +289,8 @@ class _ClipRun:
                 last = warning
             yield frame, result, evidence
 
-    def _make_tracker(self) -> FlowingPuppetTracker:
+    def make_tracker(self) -> FlowingPuppetTracker:
+        """Return a tracker that has seen nothing."""
         return FlowingPuppetTracker(self.model, self.settings.tracker, self.settings.flow)
 
     def _flow(self, frame: VideoFrame) -> FlowPair | None:

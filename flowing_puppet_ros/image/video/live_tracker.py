@@ -10,14 +10,14 @@ alone: a replay, where each run finishes at once, gives the same puppets as the 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
-from concurrent.futures import Executor, Future
+from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, Flow, Image
+from flowing_puppet_ros.arrays import F64, Image
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arms.evidence import ArmEvidenceModel
 from flowing_puppet_ros.image.arms.hypotheses import ArmFilter
@@ -25,19 +25,23 @@ from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
 from flowing_puppet_ros.image.detector.detection import PersonCandidate, PersonDetection
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.networks.choice import load_networks
 from flowing_puppet_ros.image.tracking.track import Track
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.video.detection_worker import DetectedPerson, DetectionWorker, match_to_tracks
-from flowing_puppet_ros.image.video.flow_history import propagate_points, reduce_flow
 from flowing_puppet_ros.image.video.known_people import KnownPeople
+from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
+from flowing_puppet_ros.image.video.pending_detection import (
+    PendingDetection,
+    StreamClock,
+    propagate_points,
+    reduce_flow,
+    submit,
+    to_ns,
+)
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.image.video.tracklets import TrackletLinker
-from flowing_puppet_ros.units import NANOSECONDS
 
-FRAME_NS = NANOSECONDS // 30
-"""Assumed time between images whose stamps do not increase (drivers that stamp nothing)."""
-MAX_GAP_NS = 10 * NANOSECONDS
-"""Maximum time that is counted between two images."""
 BUSY_FACTOR = 3.0
 """How much longer a full-frame detection may take while people are tracked and re-detected beside it."""
 MAX_PEOPLE = 80
@@ -45,25 +49,24 @@ MAX_PEOPLE = 80
 
 
 @dataclass(slots=True, eq=False)
-class _PendingDetection:
-    """A detector run, the image it is on, when its result is due, and the flow since then (None: interrupted).
+class _RoiDetection(PendingDetection[DetectedPerson]):
+    """A re-detection; `rois` are the candidates by the ids of the people, and of new ones."""
 
-    `rois` are the candidates of an ROI re-detection by the ids of the people, and of new ones; empty for a full frame.
-    """
-
-    image: Image
-    stamp_ns: int
-    due_ns: int
-    people: Future[list[DetectedPerson]]
     rois: dict[str, PersonCandidate] = field(default_factory=dict)
-    flows: list[Flow] | None = field(default_factory=list)
 
-    def record(self, flow: FlowPair | None) -> None:
-        """Append the flow to the next image."""
-        if flow is None:
-            self.flows = None
-        elif self.flows is not None:
-            self.flows.append(reduce_flow(flow[0]))
+
+def make_live_tracker(
+    tracker: FlowingPuppetTracker, settings: LiveDetectionSettings, counters: Counter[str] | None = None
+) -> LiveTracker | NetworkTracker:
+    """Return what tracks a live stream with the source of people that the settings name.
+
+    Raises:
+        InputError: when the source is `neural` and the networks are not installed.
+    """
+    networks = None if settings.source == "none" else load_networks(settings.source, description=settings.network)
+    if networks is not None:
+        return NetworkTracker(tracker, settings, networks, counters)
+    return LiveTracker(tracker, settings, counters)
 
 
 class LiveTracker:
@@ -101,7 +104,7 @@ class LiveTracker:
 
     def reset(self) -> None:
         """Forget the images; the detector runs on the next one."""
-        self._now_ns = 0
+        self._clock = StreamClock()
         self._full_frames = 0
         self._previous: tuple[int, Image] | None = None
         self._forget_people()
@@ -110,8 +113,8 @@ class LiveTracker:
         self._known = self._know_nobody()
         self._arms: dict[str, ArmFilter] = {}
         self._new: list[PersonCandidate] = []
-        self._full_frame: _PendingDetection | None = None
-        self._roi: _PendingDetection | None = None
+        self._full_frame: PendingDetection[DetectedPerson] | None = None
+        self._roi: _RoiDetection | None = None
         self._full_frame_ns: int | None = None
         self._roi_ns: int | None = None
 
@@ -133,7 +136,9 @@ class LiveTracker:
             yes            | yes            | track; update the known people, re-detect the new ones next
             no             |                | track, with the ROI re-detection that is due, if any
         """
-        self._advance_clock(image, stamp_ns)
+        if not self._clock.advance(image, stamp_ns):
+            self.reset()
+            self._clock.advance(image, stamp_ns)
         full_frame, roi = self._take_due_full_frame(), self._roi if self._is_due(self._roi) else None
         if full_frame is not None and not self._tracker.tracks:
             result = self._start_tracks(full_frame, image, stamp_ns)
@@ -150,18 +155,10 @@ class LiveTracker:
             self._roi = self._run_roi(image, stamp_ns, result, executor)
         return result
 
-    def _advance_clock(self, image: Image, stamp_ns: int) -> None:
-        previous = self._previous
-        if previous is not None and (stamp_ns < previous[0] or image.shape != previous[1].shape):
-            self.reset()
-        elif previous is not None:
-            passed = stamp_ns - previous[0]
-            self._now_ns += min(passed, MAX_GAP_NS) if passed > 0 else FRAME_NS
+    def _is_due(self, run: PendingDetection[DetectedPerson] | None) -> bool:
+        return run is not None and self._clock.now_ns >= run.due_ns
 
-    def _is_due(self, run: _PendingDetection | None) -> bool:
-        return run is not None and self._now_ns >= run.due_ns
-
-    def _take_due_full_frame(self) -> _PendingDetection | None:
+    def _take_due_full_frame(self) -> PendingDetection[DetectedPerson] | None:
         if not self._is_due(self._full_frame):
             return None
         run, self._full_frame = self._full_frame, None
@@ -170,7 +167,7 @@ class LiveTracker:
         return run
 
     def _start_tracks(
-        self, run: _PendingDetection, image: Image, stamp_ns: int, result: TrackResult | None = None
+        self, run: PendingDetection[DetectedPerson], image: Image, stamp_ns: int, result: TrackResult | None = None
     ) -> TrackResult:
         """Start tracks in the image of a full-frame detection; one long flow leads from there to `image`.
 
@@ -195,7 +192,7 @@ class LiveTracker:
         result = self._record_flow(self._tracker.step(image, stamp_ns))
         return replace(result, warnings=[*warnings, *result.warnings])
 
-    def _track(self, run: _PendingDetection | None, image: Image, stamp_ns: int, flow: FlowPair | None) -> TrackResult:
+    def _track(self, run: _RoiDetection | None, image: Image, stamp_ns: int, flow: FlowPair | None) -> TrackResult:
         """Track an image, with the result of an ROI re-detection where one is due."""
         if run is None and self._settings.roi_delay == 0:
             return self._track_and_detect(image, stamp_ns, flow)
@@ -228,7 +225,9 @@ class LiveTracker:
         """Track an image, with an ROI re-detection in it where the tracks lead."""
         seen: list[DetectedPerson] = []
 
-        def detect(tracks: Sequence[Track]) -> tuple[list[Keypoints] | None, Collection[str] | None]:
+        def detect(
+            tracks: Sequence[Track], _: FlowPair | None
+        ) -> tuple[list[Keypoints] | None, Collection[str] | None]:
             rois = self._take_rois({track.id: track.mean for track in tracks}) if tracks else {}
             if not rois:
                 return None, None
@@ -271,7 +270,7 @@ class LiveTracker:
                 arms.propagate(result.flow, result.grid)
         return result
 
-    def _update_known_people(self, run: _PendingDetection, result: TrackResult) -> None:
+    def _update_known_people(self, run: PendingDetection[DetectedPerson], result: TrackResult) -> None:
         """Take the places of a full-frame detection; those without a track are re-detected next."""
         self._new = []
         if run.flows is None or result.flow is None:
@@ -289,22 +288,22 @@ class LiveTracker:
 
     def _run_full_frame(
         self, image: Image, stamp_ns: int, result: TrackResult, executor: Executor | None
-    ) -> _PendingDetection | None:
+    ) -> PendingDetection[DetectedPerson] | None:
         """Start a full-frame detection on the image that was just tracked, if it is time for one."""
         settings, people = self._settings, [puppet.id for puppet in result.puppets]
         confirmed = self._known.are_confirmed(people, settings.confirming_full_frames)
         interval = settings.full_frame_interval if confirmed else settings.search_interval
-        if self._full_frame_ns is not None and self._now_ns - self._full_frame_ns < _to_ns(interval):
+        if self._full_frame_ns is not None and self._clock.now_ns - self._full_frame_ns < to_ns(interval):
             return None
-        self._full_frame_ns = self._now_ns
+        self._full_frame_ns = self._clock.now_ns
         self._full_frames += 1
         run = partial(self._detect_full_frame, image, self._known, self._full_frames)
         delay = settings.full_frame_delay * (BUSY_FACTOR if people else 1.0)
-        return _PendingDetection(image, stamp_ns, self._now_ns + _to_ns(delay), _submit(run, executor))
+        return PendingDetection(image, stamp_ns, self._clock.now_ns + to_ns(delay), submit(run, executor))
 
     def _run_roi(
         self, image: Image, stamp_ns: int, result: TrackResult, executor: Executor | None
-    ) -> _PendingDetection | None:
+    ) -> _RoiDetection | None:
         """Start a re-detection of the known people in the image that was just tracked, if it is time for one."""
         if self._settings.roi_delay == 0:
             return None
@@ -314,17 +313,17 @@ class LiveTracker:
             return None
         self._keep_arms(result.puppets)
         run = partial(self._detect_in_rois, image, list(rois.values()), result.puppets, self._arms)
-        due_ns = self._now_ns + _to_ns(self._settings.roi_delay * len(rois))
-        return _PendingDetection(image, stamp_ns, due_ns, _submit(run, executor), rois)
+        due_ns = self._clock.now_ns + to_ns(self._settings.roi_delay * len(rois))
+        return _RoiDetection(image, stamp_ns, due_ns, submit(run, executor), rois=rois)
 
     def _take_rois(self, joints: Mapping[str, F64]) -> dict[str, PersonCandidate]:
         """Return where to re-detect people whose joints (J, 2) px are given by id, if it is time for that."""
         rois = self._known.candidates(self._tracker.model.joint_names, joints)
         rois |= {f"new {number}": place for number, place in enumerate(self._new)}
-        since = None if self._roi_ns is None else self._now_ns - self._roi_ns
-        if not rois or (since is not None and since < _to_ns(self._settings.roi_interval * len(rois))):
+        since = None if self._roi_ns is None else self._clock.now_ns - self._roi_ns
+        if not rois or (since is not None and since < to_ns(self._settings.roi_interval * len(rois))):
             return {}
-        self._new, self._roi_ns = [], self._now_ns
+        self._new, self._roi_ns = [], self._clock.now_ns
         return rois
 
     # The detector is loaded where it runs: not in the thread that tracks.
@@ -344,15 +343,3 @@ class LiveTracker:
         if self._worker is None:
             self._worker = DetectionWorker(PartDetector.load(), ArmEvidenceModel.load(self._tracker.model.gender))
         return self._worker
-
-
-def _to_ns(seconds: float) -> int:
-    return round(seconds * NANOSECONDS)
-
-
-def _submit(run: Callable[[], list[DetectedPerson]], executor: Executor | None) -> Future[list[DetectedPerson]]:
-    if executor is not None:
-        return executor.submit(run)
-    done: Future[list[DetectedPerson]] = Future()
-    done.set_result(run())
-    return done

@@ -5,19 +5,50 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.settings import Settings, nested, setting
+
+
+@dataclass(frozen=True)
+class NetworkTimingSettings(Settings):
+    """When keypoint networks run on the images of a stream."""
+
+    looks: float = setting(
+        30.0, "close looks at tracked people, one person each, that the machine has time for", unit="1/s", low=0.1,
+        high=1e6,
+    )  # fmt: skip
+    min_wait: float = setting(
+        0.05,
+        "time between images from which on each waits for the look at itself; in faster streams the next one uses it",
+        unit="s",
+        low=0.0,
+        high=10.0,
+        advanced=True,
+    )
+    everybody_interval: float = setting(
+        0.5, "time between searches for everybody while people are tracked", unit="s", low=0.0, high=3600.0
+    )
+    search_interval: float = setting(
+        0.1, "time between searches while nobody is tracked", unit="s", low=0.0, high=3600.0, advanced=True
+    )
 
 
 @dataclass(frozen=True)
 class LiveDetectionSettings(Settings):
-    """When the detector runs on the images of a stream."""
+    """When people are looked for in the images of a stream, and by whom."""
 
     source: str = setting(
         "auto",
-        "who finds people: auto: the detections topic where somebody publishes on it, else the package's own detector;"
-        " none: the detections topic alone",
-        choices=("auto", "none"),
+        "who finds people: auto: the detections topic where somebody publishes on it, else the keypoint networks where"
+        " they are installed, else the package's own detector; neural: the networks; own: that detector; none: the"
+        " detections topic alone",
+        choices=("auto", "neural", "own", "none"),
     )
+    network: str = setting(
+        "",
+        "description file (YAML) of a keypoint network of your own, ONNX or TFLite, in place of the package's",
+        advanced=True,
+    )
+    networks: NetworkTimingSettings = nested(NetworkTimingSettings)
     min_probability: float = setting(0.3, "minimum probability of a detected person to be tracked", low=0.0, high=1.0)
     full_frame_interval: float = setting(
         2.0, "time between full-frame detections while all tracked people are confirmed", unit="s", low=0.0, high=3600.0
@@ -61,6 +92,7 @@ EVERY_IMAGE = LiveDetectionSettings(
     full_frame_delay=0.0,
     roi_interval=0.0,
     roi_delay=0.0,
+    networks=NetworkTimingSettings(looks=1e6, min_wait=0.0, everybody_interval=0.0, search_interval=0.0),
 )
 """For recordings, where the detector takes the time it needs: people are re-detected in every image."""
 

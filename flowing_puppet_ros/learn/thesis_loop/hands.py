@@ -7,7 +7,7 @@ and, in a second round, false positives of the first round's filters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from zlib import crc32
 
@@ -20,7 +20,6 @@ from flowing_puppet_ros.arrays import F32, Array, Bools
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.hands import (
     CELL_METRES,
-    EXTRAS,
     LENGTH,
     MAP_PITCH_M,
     HandDetectors,
@@ -32,16 +31,18 @@ from flowing_puppet_ros.evidence.image.likelihood import MAX_HAND_DISTANCE_M, Pa
 from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.image.formats.annotations import source_video
 from flowing_puppet_ros.learn.likelihood.samples import PosedPerson
+from flowing_puppet_ros.learn.thesis_loop.hand_samples import (
+    KINDS,
+    MIN_WRONG_DISTANCE_M,
+    find_wrists,
+    is_far_from_wrists,
+    make_maps,
+    sample_wrong_places,
+)
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, setting
 
-KINDS = tuple(EXTRAS)
-SIDES = ("right", "left")
-MIN_CONFIDENCE = 0.5  # of wrists and elbows to learn from
-MIN_WRONG_DISTANCE_M = 0.12  # of a wrong place from any wrist
 MIN_HANDS = 40  # in each half of the videos
-NO_FILTER = HandFilter(np.zeros(0, np.float32), 0.0, (1.0, 0.0))
-BLANK = HandDetectors(dict.fromkeys(KINDS, NO_FILTER), np.zeros(3))
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,42 +70,6 @@ class HandBoxes:
         found = {kind: np.concatenate([group.descriptors[kind] for group in groups]) for kind in KINDS}
         right, flow, half = (np.concatenate([getattr(g, name) for g in groups]) for name in ("right", "flow", "half"))
         return cls(found, right, flow, half)
-
-
-def make_maps(
-    posed: PosedPerson, likelihood: PartLikelihood, optical_flow: OpticalFlow, detectors: HandDetectors = BLANK
-) -> HandMaps:
-    """Make the hand maps of an image, with the colours of the posed person and the flow back in time."""
-    scene = likelihood.prepare(posed.image).with_torso(*posed.puppet.contours[:2])
-    flows = [] if posed.previous_image is None else [optical_flow(posed.previous_image, posed.image)[1]]
-    return HandMaps.of(detectors, scene, flows, posed.puppet.scale)
-
-
-def find_wrists(model: DeformableStructures, posed: PosedPerson) -> Iterator[tuple[Array, Array]]:
-    """Yield wrist (2,) and elbow (2,) px of each arm with reliable joints and the wrist in the image."""
-    for side in SIDES:
-        wrist, elbow = (model.joint_names.index(f"{side}_{name}") for name in ("wrist", "elbow"))
-        place = posed.puppet.joints[wrist]
-        inside = (place >= 0).all() and (place < posed.image.shape[1::-1]).all()
-        if min(posed.confidence[wrist], posed.confidence[elbow]) >= MIN_CONFIDENCE and inside:
-            yield place, posed.puppet.joints[elbow]
-
-
-def sample_wrong_places(model: DeformableStructures, posed: PosedPerson, count: int, rng: np.random.Generator) -> Array:
-    """Draw up to `count` places (N, 2) px in the image that a hand could reach and where none is."""
-    scale = posed.puppet.scale
-    distance, turn = MAX_HAND_DISTANCE_M * scale * np.sqrt(rng.random(4 * count)), rng.uniform(0, 2 * np.pi, 4 * count)
-    middle = posed.puppet.contours[1].mean(axis=0) + np.array([0.0, 0.2 * scale])
-    places = middle + distance[:, None] * np.column_stack([np.cos(turn), np.sin(turn)])
-    return places[is_far_from_wrists(model, posed, places)][:count]
-
-
-def is_far_from_wrists(model: DeformableStructures, posed: PosedPerson, places: Array) -> Bools:
-    """Return which of `places` (N, 2) px are in the image and not near either wrist."""
-    wrists = posed.puppet.joints[[model.joint_names.index(f"{side}_wrist") for side in SIDES]]
-    near = np.linalg.norm(places[:, None] - wrists, axis=2).min(axis=1) < MIN_WRONG_DISTANCE_M * posed.puppet.scale
-    inside = ((places >= 0) & (places < np.array(posed.image.shape[1::-1]))).all(axis=1)
-    return np.asarray(inside & ~near)
 
 
 def learn_hands(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Self
 
 import numpy as np
@@ -126,9 +127,7 @@ class DeformableStructures:
 
     def mean_joints(self) -> Array:
         """Return the joints (J, 2) m in model space of the puppet of mean part shapes and mean relative poses."""
-        layout = PairLayout(self.shapes[0].basis.shape[2])
-        poses = [pair.mean[layout.angle + layout.gap] for pair in self.pairwise]
-        return self._assemble([np.zeros(layout.size)] * len(self.tree), poses).joints
+        return _mean_joints(self).copy()
 
     def _assemble(self, coefficients: list[Array], poses: list[Array]) -> PuppetShape:
         """Place the parts (Eq. 7): `poses` holds (sin, cos, q_x, q_y) of every edge; angles are those of the bones."""
@@ -299,3 +298,10 @@ class DeformableStructures:
         if not (np.isfinite(scale) and scale > 0):
             raise InputError(f"the scale of a puppet is {scale} px/m; it must be positive")
         return np.array([scale if view == "front" else -scale, scale])
+
+
+@cache
+def _mean_joints(model: DeformableStructures) -> Array:
+    layout = PairLayout(model.shapes[0].basis.shape[2])
+    poses = [pair.mean[layout.angle + layout.gap] for pair in model.pairwise]
+    return model._assemble([np.zeros(layout.size)] * len(model.tree), poses).joints

@@ -16,18 +16,18 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import Output, Port
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, to_name_component
-from flowing_puppet_ros.stream.messages.clouds import make_cloud
-from flowing_puppet_ros.stream.messages.geometry import header_ns, make_transform
-from flowing_puppet_ros.stream.messages.message_types import BODIES, MESH, POINT_CLOUD, TRANSFORMS, MessageFactory
-from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_body
-from flowing_puppet_ros.stream.messages.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames, make_urdf
-from flowing_puppet_ros.stream.messages.shapes import (
+from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames, make_urdf
+from flowing_puppet_ros.stream.messages.bodies.shapes import (
     make_deletions,
     make_mesh_marker,
     make_part_poses,
     make_topology,
     preview_faces,
 )
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.geometry import header_ns, make_transform
+from flowing_puppet_ros.stream.messages.message_types import BODIES, MESH, POINT_CLOUD, TRANSFORMS, MessageFactory
+from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_body
 
 BodyFits = Sequence[tuple[str, BodyFit]]
 """(id, fit in the cloud's frame) for each body."""

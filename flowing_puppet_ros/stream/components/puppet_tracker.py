@@ -14,9 +14,10 @@ from flowing_puppet_ros.draw.overlay import DrawnPuppet, draw_puppets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, OpticalFlow
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED
 from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
-from flowing_puppet_ros.image.video.live_tracker import LiveTracker
+from flowing_puppet_ros.image.video.live_tracker import LiveTracker, make_live_tracker
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, nested, setting
@@ -24,10 +25,17 @@ from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, P
 from flowing_puppet_ros.stream.components import warm_up
 from flowing_puppet_ros.stream.components.optical_flow import make_flow_preview
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, make_image_messages
+from flowing_puppet_ros.stream.messages.detections import (
+    OTHER_DETECTIONS,
+    collect_detections,
+    decode_detections,
+    is_complete,
+)
 from flowing_puppet_ros.stream.messages.geometry import header_ns, stamp_ns
+from flowing_puppet_ros.stream.messages.image_annotations import make_annotations, make_detections_2d
 from flowing_puppet_ros.stream.messages.images import decode_flow, decode_image, make_image
-from flowing_puppet_ros.stream.messages.message_types import IMAGE, PUPPETS, MessageFactory
-from flowing_puppet_ros.stream.messages.puppets import decode_keypoints, make_puppets
+from flowing_puppet_ros.stream.messages.message_types import ANNOTATIONS, DETECTIONS_2D, IMAGE, PUPPETS, MessageFactory
+from flowing_puppet_ros.stream.messages.puppets import make_puppets
 from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 
@@ -55,7 +63,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
 
     An image waits for the detection and the flow of its stamp when somebody publishes them, but not longer than
     `wait` newer images. Flow that is not published is computed here, and then shown on `flow/preview`. While nobody
-    publishes detections the package's own detector looks for people.
+    publishes detections, keypoint networks look for people, or the package's own detector where there are none.
     """
 
     settings_type = PuppetTrackerSettings
@@ -64,7 +72,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         Port("image", IMAGE, "sensor", transport=COMPRESSED),
         Port("flow/forward", IMAGE, optional=True),
         Port("flow/backward", IMAGE, optional=True),
-        Port("detections", PUPPETS, "sensor", optional=True),
+        Port("detections", PUPPETS, "sensor", optional=True, alternatives=OTHER_DETECTIONS),
     )
     outputs: tuple[Port, ...] = (
         Port("puppets", PUPPETS),
@@ -72,6 +80,8 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         Port("overlay", IMAGE, lazy=True, transport=COMPRESSED),
         Port("flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
         Port("puppet_flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
+        Port("detections_2d", DETECTIONS_2D, lazy=True, optional=True),
+        Port("annotations", ANNOTATIONS, lazy=True, optional=True),
     )
 
     def __init__(self, settings: PuppetTrackerSettings, factory: MessageFactory) -> None:
@@ -79,7 +89,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         super().__init__(settings, factory)
         self._model = DeformableStructures.load(settings.model, settings.parts)
         self._tracker = FlowingPuppetTracker(self._model, settings.tracker, settings.flow)
-        self._live = LiveTracker(self._tracker, settings.detection, self.counters)
+        self._live = make_live_tracker(self._tracker, settings.detection, self.counters)
         self._line = PendingQueue()
         self._shelves = {port.name: StampBuffer() for port in self.inputs if port.optional}
         self._header: Any = None
@@ -91,7 +101,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         other = type(self)(self.settings, self.factory)
         other.set_expected("detections", True)
         for port in other.outputs:
-            if port.lazy:
+            if port.lazy and not port.optional:
                 other.set_subscribed(port.name, True)
         messages = warm_up.make_tracker_input(self.factory, self._model)
         for port_name, message in messages:
@@ -111,6 +121,9 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         """Go on tracking the same people with other settings."""
         if settings.flow.preset != self.settings.flow.preset:
             self._tracker.optical_flow = OpticalFlow(settings.flow)
+        before = self.settings.detection
+        if (settings.detection.source, settings.detection.network) != (before.source, before.network):
+            self._live = make_live_tracker(self._tracker, settings.detection, self.counters)
         self.settings, self._tracker.settings = settings, settings.tracker
         self._live.reconfigure(settings.detection)
 
@@ -124,6 +137,9 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
             self._take(stamp, message)
         elif port != "flow/forward" and self._line.is_late(stamp):
             self.counters[f"late {port}"] += 1
+        elif port == "detections":
+            shelf = self._shelves[port]
+            shelf.put(stamp, collect_detections(shelf.get(stamp), message))
         else:
             self._shelves[port].put(stamp, message)
         return self._release(final=False)
@@ -153,15 +169,19 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
 
     def _is_ready(self, stamp: int) -> bool:
         """Return whether everything that is expected for the image of `stamp` is there."""
-        needs = [("detections", stamp)]
+        if "detections" in self._expected and not is_complete(self._shelves["detections"].get(stamp)):
+            return False
+        needs = []
         if self._header is not None:
-            needs += [("flow/backward", stamp), ("flow/forward", header_ns(self._header))]
+            needs = [("flow/backward", stamp), ("flow/forward", header_ns(self._header))]
         return all(self._shelves[port].get(at) is not None for port, at in needs if port in self._expected)
 
     def _step(self, stamp: int, message: Any) -> Output:
         image, flow = decode_image(message), self._flow(stamp)
-        people = self._decode_detections(stamp)
+        people = self._decode_detections(stamp, (image.shape[1], image.shape[0]))
         if people is None and "detections" not in self._expected and self.settings.detection.source != "none":
+            if self.settings.detection.source == "auto" and isinstance(self._live, LiveTracker):
+                self.report.warn(NOT_INSTALLED)
             result = self._live.step(image, stamp, flow, self.background)
         else:
             self._live.reset()
@@ -174,15 +194,19 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         self.counters["puppets"] += len(result.puppets)
         return self._publish(message.header, earlier, image, result)
 
-    def _decode_detections(self, stamp: int) -> list[Keypoints] | None:
-        """Return the people whom a published detection found in the image of this stamp, None without one."""
+    def _decode_detections(self, stamp: int, size: tuple[int, int]) -> list[Keypoints] | None:
+        """Return the people whom a published detection found in the image of this stamp and size, None without one."""
         detections = self._shelves["detections"].get(stamp)
         if detections is None:
             if "detections" in self._expected:
                 self.counters["images without detection"] += 1
             return None
         self.counters["paired detections"] += 1
-        return decode_keypoints(detections)
+        try:
+            return decode_detections(detections, size, self.report)
+        except InputError as error:  # the image is good
+            self.report.count_unusable(error)
+            return None
 
     def _forget(self, stamp: int) -> None:
         """Drop what was for images up to this one; what no image has used is counted."""
@@ -214,6 +238,9 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         if self._humans.enabled:
             made = make_image_messages(self.factory, header, image, puppets.puppets)
             outputs += self._humans.make(header, list(made), made)
+        for name, make in (("detections_2d", make_detections_2d), ("annotations", make_annotations)):
+            if name in self._subscribed:
+                outputs.append((name, make(self.factory, header, puppets.puppets, image.shape[1::-1])))
         if "part_labels" in self._subscribed:
             labels = result.render_part_labels(image.shape[:2])
             outputs.append(("part_labels", make_image(self.factory, header, labels, "mono8")))

@@ -33,6 +33,11 @@ class NodeSettings(Settings):
     """Settings that every node has beside those of its component."""
 
     queue: int = setting(1, QUEUE_HELP, low=1, high=1000)
+    image_transport: str = setting(
+        "auto",
+        "images to subscribe to, never both: auto: those that are published, raw ones first",
+        choices=("auto", "raw", "compressed"),
+    )
     autostart: bool = setting(True, "configure and activate on start-up; off: a lifecycle manager does it")
 
 
@@ -61,15 +66,20 @@ def parameter_yaml(name: str) -> str:
         f"/**/{name}:",
         "  ros__parameters:",
     ]
-    part = ""
+    parts: list[str] = []
     for info in published(name):
-        above, dot, leaf = info.name.rpartition(".")
-        if above != part:
-            lines += [f"    {above}:"] if dot else []
-            part = above
-        indent = " " * (6 if dot else 4)
+        *above, leaf = info.name.split(".")
+        for depth, part in enumerate(above):
+            if above[: depth + 1] != parts[: depth + 1]:
+                lines.append(f"{_indent(depth)}{part}:")
+        parts, indent = above, _indent(len(above))
         lines += [f"{indent}# {info.description}", f"{indent}{leaf}: {_to_yaml(info.default)}"]
     return "\n".join(lines) + "\n"
+
+
+def _indent(depth: int) -> str:
+    """Return the spaces before a parameter of a part at some depth."""
+    return " " * (4 + 2 * depth)
 
 
 def published(name: str) -> list[SettingInfo]:

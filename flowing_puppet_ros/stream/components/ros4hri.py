@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import U8, Array
+from flowing_puppet_ros.image.formats.skeletons import HRI_18
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import Output, Port
 from flowing_puppet_ros.stream.messages.images import make_image
@@ -25,12 +26,6 @@ PERSON_TOPICS = {
     "urdf": ("std_msgs/msg/String", "latched"),
 }
 """Topics of a person below `bodies/<id>`: type and QoS."""
-SKELETON2D_JOINTS = (
-    *("nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist"),
-    *("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle"),
-    *("left_eye", "right_eye", "left_ear", "right_ear"),
-)
-"""Our joint for each constant of hri_msgs/Skeleton2D: left comes first for eyes and ears."""
 CLIPPED_CONFIDENCE = 0.1
 """Factor on the confidence of a joint outside the image, whose position is clipped."""
 
@@ -90,8 +85,8 @@ def make_skeleton2d(
     """
     width, height = size
     point = _HRI + "NormalizedPointOfInterest2D"
-    skeleton = [factory.make(point, x=0.0, y=0.0, c=0.0) for _ in SKELETON2D_JOINTS]
-    for index, name in enumerate(SKELETON2D_JOINTS):
+    skeleton = [factory.make(point, x=0.0, y=0.0, c=0.0) for _ in HRI_18]
+    for index, name in enumerate(HRI_18):
         x, y, confidence = joints.get(name, (np.nan, np.nan, 0.0))
         if not (np.isfinite([x, y]).all() and confidence > 0):
             continue

@@ -8,9 +8,9 @@ from typing import Any
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitter, SilhouetteFitterSettings
+from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_silhouettes
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
-from flowing_puppet_ros.stream.messages.silhouettes import decode_silhouettes
 
 _MAX_AGE_NS = 1_000_000_000
 """Maximum age of a person's last body as the start of the next fit, nanoseconds."""

@@ -14,6 +14,7 @@ from flowing_puppet_ros.settings import setting
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
 from flowing_puppet_ros.stream.components import warm_up
 from flowing_puppet_ros.stream.components.person_views import PersonView, match_person, observe_person
+from flowing_puppet_ros.stream.messages.bodies.silhouettes import make_silhouettes
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image, decode_labels
@@ -28,7 +29,6 @@ from flowing_puppet_ros.stream.messages.message_types import (
     MessageFactory,
 )
 from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_joints
-from flowing_puppet_ros.stream.messages.silhouettes import make_silhouettes
 from flowing_puppet_ros.stream.time_synchronizer import TimeSynchronizer
 
 _CAMERA_TOPICS = ("image", "part_labels", "puppets")  # synchronised for each camera, the first leads

@@ -17,7 +17,11 @@ MESH = "shape_msgs/msg/Mesh"
 TRANSFORMS = "tf2_msgs/msg/TFMessage"
 PUPPETS = "flowing_puppet_msgs/msg/PuppetArray"
 BODIES = "flowing_puppet_msgs/msg/BodyArray"
+IDS_LIST = "hri_msgs/msg/IdsList"
+SKELETON_2D = "hri_msgs/msg/Skeleton2D"
 SILHOUETTES = "flowing_puppet_msgs/msg/SilhouetteSet"
+DETECTIONS_2D = "vision_msgs/msg/Detection2DArray"
+ANNOTATIONS = "foxglove_msgs/msg/ImageAnnotations"
 
 
 class MessageFactory(Protocol):

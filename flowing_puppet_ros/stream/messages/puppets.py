@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keypoints, tracked puppets and bodies to and from the messages of flowing_puppet_msgs."""
+"""Tracked puppets and bodies to and from the messages of flowing_puppet_msgs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Array
-from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
 from flowing_puppet_ros.stream.messages.message_types import BODIES, PUPPETS, MessageFactory
 
@@ -29,14 +28,6 @@ def decode_puppet_joints(puppet: Any) -> tuple[F64, F64]:
     """Return the joints (J, 2) in pixels and their confidences (J,) of a Puppet message; NaN where unknown."""
     joints = np.array([(joint.x, joint.y) for joint in puppet.joints], float).reshape(-1, 2)
     return joints, np.array([joint.confidence for joint in puppet.joints], float)
-
-
-def decode_keypoints(message: Any) -> list[Keypoints]:
-    """Return the people of a PuppetArray as keypoints (pixels; NaN where unknown)."""
-    return [
-        Keypoints(tuple(joint.name for joint in puppet.joints), *decode_puppet_joints(puppet))
-        for puppet in message.puppets
-    ]
 
 
 def make_puppets(

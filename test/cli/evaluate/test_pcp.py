@@ -30,7 +30,7 @@ def poses_file(path: Path, shift: float) -> Path:
     return path
 
 
-@pytest.mark.parametrize("form", ["sticks.txt", "keypoints.json", "annotations.json"])
+@pytest.mark.parametrize("form", ["sticks.txt", "keypoints.json", "names.json", "annotations.json"])
 def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str) -> None:
     poses, truth = poses_file(tmp_path / "poses.json", 14.0), tmp_path / form
     people = [np.column_stack([JOINTS, np.ones(len(JOINTS))]).tolist()]
@@ -38,6 +38,10 @@ def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.Captur
         write_sticks(truth, {k: [sticks_from_joints(MODEL.joint_names, JOINTS)] for k in (0, 1)})
     elif form == "keypoints.json":
         truth.write_text(json.dumps({"joint_names": MODEL.joint_names, "frames": {"0": people, "1": people}}))
+    elif form == "names.json":
+        truth.write_text(
+            json.dumps({"joint_names": MODEL.joint_names, "frames": {"im0.png": people, "im1.png": people}})
+        )
     else:
         images = {f"im{k}.png": [{"joints": people[0]}] for k in (0, 1)}
         truth.write_text(json.dumps({"joint_names": MODEL.joint_names, "images": images}))
@@ -46,6 +50,39 @@ def test_poses_against_every_form_of_truth(tmp_path: Path, capsys: pytest.Captur
     assert figures["people"] == 2 and figures["found"] == 100
     assert figures["strict lower arms"] == 50 and figures["strict torso"] == 100
     assert figures["wrists within 10 px"] == 50 and figures["wrists of the best solution"] == 100
+    # 14 px are more than a fifth of a torso of 35 px and than half a head of 18 px.
+    assert figures["PCK@0.2, %"] == figures["PCKh@0.5, %"] == 50
+    # The first of two is right at every threshold, up to a recall of 1/2: at 51 of 101 places.
+    assert figures["OKS AP75, %"] == pytest.approx(100 * 51 / 101, abs=0.01)
+
+
+def number_points(count: int, pairs_from: int | None = None) -> list[float]:
+    """Return shoulders, elbows, wrists and hips in the order of COCO, where pairs begin at a number, or OpenPose's."""
+    numbers = {
+        "left_shoulder": 5, "right_shoulder": 2, "left_elbow": 6, "right_elbow": 3, "left_wrist": 7, "right_wrist": 4,
+        "left_hip": 11, "right_hip": 8,
+    }  # fmt: skip
+    if pairs_from is not None:
+        numbers = {name: pairs_from + k for k, name in enumerate(numbers)}
+    values = [0.0] * (3 * count)
+    for name, number in numbers.items():
+        values[3 * number : 3 * number + 3] = [*JOINTS[MODEL.joint_names.index(name)], 1.0]
+    return values
+
+
+def test_poses_against_the_keypoints_of_other_detectors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    poses, results, folder = poses_file(tmp_path / "poses.json", 14.0), tmp_path / "results.json", tmp_path / "openpose"
+    results.write_text(json.dumps([{"image_id": f"im{k}.jpg", "keypoints": number_points(17, 5)} for k in (0, 1)]))
+    folder.mkdir()
+    for k in (0, 1):
+        frame = {"people": [{"pose_keypoints_2d": number_points(18)}]}
+        (folder / f"im{k}_keypoints.json").write_text(json.dumps(frame))
+    for truth in (results, folder):
+        assert main(["evaluate", "pcp", str(poses), "--truth", str(truth), "--json", "--pixels", "10"]) == 0
+        figures = json.loads(capsys.readouterr().out)["poses"]
+        assert figures["people"] == 2 and figures["found"] == 100
+        assert figures["strict lower arms"] == 50 and figures["strict torso"] == 100
+        assert figures["wrists within 10 px"] == 50
 
 
 @pytest.mark.slow

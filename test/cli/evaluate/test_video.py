@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.cli import main
+from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.video.errors import (
     TrackedPerson,
     calibration_error,
@@ -69,11 +70,16 @@ def test_rows_from_given_keypoints_are_measured_and_kept(
     command = ["evaluate", "video", str(folder), "--truth", str(truth), "--init", str(init), "--processes", "1"]
     command += ["--methods", "init-detector,init-default,init-detector-median", "--out", str(tmp_path / "out")]
     assert main(command) == 0
-    assert "init-default over init-detector: elbows within 10 px" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "init-default over init-detector: elbows within 10 px" in printed
+    assert "method                hota" in printed
     rows = json.loads((tmp_path / "out" / "video.json").read_text())["methods"]
     assert rows["init-default"]["wrists_median_px"] < rows["init-detector"]["wrists_median_px"]
     assert rows["init-default"]["wrists_shake_px"] < 0.5 * rows["init-detector"]["wrists_shake_px"]
     assert rows["init-detector-median"]["wrists_shake_px"] < rows["init-detector"]["wrists_shake_px"]
+    # One person a clip, whom both keep under one id; 6 px of noise cost places, not identities.
+    assert rows["init-default"]["idf1"] == rows["init-default"]["mota"] == 100.0
+    assert rows["init-default"]["id_switches"] == 0 and rows["init-detector"]["hota"] < rows["init-default"]["hota"]
     assert "Calibration" in (tmp_path / "out" / "video.html").read_text()
     kept = tmp_path / "out" / "init-default" / "a.json"
     data = json.loads(kept.read_text())
@@ -83,6 +89,7 @@ def test_rows_from_given_keypoints_are_measured_and_kept(
     assert main([*command, "--clips", "a", "--json"]) == 0
     again = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert again["init-default"]["wrists_20_px"] == 0.0, "the tracks that are there are measured"
+    assert again["init-default"]["hota"] == again["init-default"]["mota"] == 0.0
     assert main([*command, "--clips", "a", "--json", "--again"]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1])["init-default"]["wrists_20_px"] > 50.0
 
@@ -157,6 +164,38 @@ def test_truths_in_every_form(clips: tuple[Path, Path, Path], tmp_path: Path) ->
     (own / "b.json").write_text(json.dumps({"joint_names": list(MODEL.joint_names), "frames": {"2": [row]}}))
     assert {name: list(frames) for name, frames in read_people(own, found).items()} == {"b": [2]}
     assert list(read_people(own / "b.json", find_clips(folder / "b"))["b"]) == [2]
+
+
+def test_other_detectors_people_go_to_the_clips_that_their_frames_are_named_after(
+    clips: tuple[Path, Path, Path], tmp_path: Path
+) -> None:
+    found = find_clips(clips[0])
+    values = [0.0] * 51
+    values[27:30] = [11.0, 22.0, 0.5]  # the left wrist is COCO's ninth, counted from 0
+    results = tmp_path / "results.json"
+    results.write_text(
+        json.dumps([{"image_id": f"{name}/{k}.jpg", "keypoints": values} for name, k in (("a", 1), ("b", 3))])
+    )
+    assert {name: list(frames) for name, frames in read_people(results, found).items()} == {"a": [1], "b": [3]}
+    folder = tmp_path / "json"
+    for name, k in (("a", 2), ("b", 0), ("c", 1)):
+        (folder / name).mkdir(parents=True)
+        text = json.dumps({"people": [{"pose_keypoints_2d": values}]})
+        (folder / name / f"{name}_{k:012d}_keypoints.json").write_text(text)
+        (folder / f"{name}_{k:012d}_keypoints.json").write_text(text)
+    assert {name: list(frames) for name, frames in read_people(folder, found).items()} == {"a": [2], "b": [0]}
+    for name in "abc":
+        for file in (folder / name).iterdir():
+            file.unlink()
+    people = read_people(folder, found)
+    assert {name: list(frames) for name, frames in people.items()} == {"a": [2], "b": [0]}, "all in one folder"
+    assert people["a"][2][0].select_usable() == {"left_wrist": (11.0, 22.0, 0.5)}
+    results.write_text(json.dumps([{"people": [{"pose_keypoints_2d": values}]}]))
+    with pytest.raises(InputError, match="has the frames of one clip, but there are 2"):
+        read_people(results, found)
+    results.write_text(json.dumps([{"image_id": "z/1.jpg", "keypoints": values}]))
+    with pytest.raises(InputError, match="no person in any of the clips a, b"):
+        read_people(results, found)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.evaluate.output import name_runs
 from flowing_puppet_ros.evaluate.video.tracks import measure_misses, read_tracks
-from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
+from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
 
 NAMES = ["left_wrist", "right_wrist", "neck"]
 

@@ -72,6 +72,10 @@ class Guess:
     def modes(self, count: int) -> list[tuple[Keypoints, float]]:
         return [(self.keypoints, 0.0)]
 
+    @property
+    def joints_are_independent(self) -> bool:
+        return False
+
     def joint_score(self, joint: str, xy: np.ndarray) -> np.ndarray:
         if joint in ("right_elbow", "right_wrist"):
             return np.zeros(len(xy))

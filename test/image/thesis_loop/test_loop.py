@@ -124,6 +124,10 @@ class GivenDetection:
     def modes(self, count: int) -> list[tuple[Keypoints, float]]:
         return [(Keypoints(NAMES, joints, np.ones(len(NAMES))), 0.0) for joints in self._modes][:count]
 
+    @property
+    def joints_are_independent(self) -> bool:
+        return False
+
     def joint_score(self, joint: str, xy: np.ndarray) -> np.ndarray:
         return self._given.joint_score(joint, xy)
 

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from drawn_people import NAMES, CapsuleModel, detection, draw, pose, tracker  # type: ignore[import-not-found]
@@ -32,6 +34,25 @@ def test_people_who_cross_keep_their_ids() -> None:
     for time in range(21):
         left, right = pose(0, (60 + 10 * time, 118)), pose(0, (260 - 10 * time, 122))
         result = follower.step(draw(left, right), time, [detection(left), detection(right)])
+        if time == 0:
+            ids = match_ids(result, {"left": left, "right": right})
+    assert len(set(ids.values())) == 2
+    assert match_ids(result, {"left": left, "right": right}) == ids
+
+
+@pytest.mark.parametrize(("apart", "exchange"), [(0, 99), (20, 10)])
+def test_a_detectors_ids_help_where_people_meet_but_not_where_they_are_apart(apart: int, exchange: int) -> None:
+    """In equal clothes at one place only the ids tell; 12 cm apart, ids that are exchanged do not matter."""
+    follower, chance = tracker(), np.random.default_rng(1)
+    ids = {}
+    for time in range(21):
+        left, right = pose(0, (60 + 10 * time, 120 - apart / 2)), pose(0, (260 - 10 * time, 120 + apart / 2))
+        names = ("7", "8") if time < exchange else ("8", "7")
+        seen = [
+            replace(detection(joints + chance.normal(0, 4, joints.shape)), track_id=name)
+            for joints, name in zip((left, right), names, strict=True)
+        ]
+        result = follower.step(draw(left, right), time, seen)
         if time == 0:
             ids = match_ids(result, {"left": left, "right": right})
     assert len(set(ids.values())) == 2

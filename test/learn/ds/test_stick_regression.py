@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
 from flowing_puppet_ros.image.formats.keypoints import SHOULDER_SPREAD, TRUNK_DROP, joints_from_keypoints
 from flowing_puppet_ros.image.formats.stick_regression import TORSO, UPPER_ARMS, StickRegression
 from flowing_puppet_ros.image.formats.stickmen import sticks_from_joints, write_sticks
-from flowing_puppet_ros.image.formats.tracks_json import read_keypoints
 from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.learn.anny.poses import PoseSampler
 from flowing_puppet_ros.learn.ds.samples import CameraView, RandomCamera

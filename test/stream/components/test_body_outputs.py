@@ -14,9 +14,9 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyOutputSettings
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriSettings
+from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import MOVING_JOINTS
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header, rotation_matrix
-from flowing_puppet_ros.stream.messages.ros4hri_skeleton import MOVING_JOINTS
 
 FACTORY = BagMessageFactory()
 ALL = {"body_meshes", "body_vertices"}

@@ -100,7 +100,7 @@ def test_an_image_waits_for_its_detection_but_not_for_ever(images: list[Any], de
 
 
 def test_nothing_waits_when_nobody_detects(images: list[Any]) -> None:
-    component = tracker()
+    component = tracker(**{"detection.source": "own"})
     for image in images[:3]:
         ((port, message),) = component.handle("image", image)
         assert (port, message.header) == ("puppets", image.header)

@@ -19,9 +19,9 @@ from flowing_puppet_ros.image.detector.detection import PersonCandidate
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.video.detection_worker import DetectedPerson
-from flowing_puppet_ros.image.video.flow_history import propagate_points
 from flowing_puppet_ros.image.video.known_people import KnownPeople
-from flowing_puppet_ros.image.video.live_tracker import FRAME_NS, LiveTracker
+from flowing_puppet_ros.image.video.live_tracker import LiveTracker
+from flowing_puppet_ros.image.video.pending_detection import FRAME_NS, propagate_points
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
@@ -220,7 +220,7 @@ class LastMoment(Executor):
 def puppets(threads: Executor | None) -> tuple[list[bytes], list[Any]]:
     """Return what the tracker says of a drawn person, as bytes and as messages."""
     settings = PuppetTrackerSettings.from_mapping(
-        {"flow.preset": "fast"}
+        {"flow.preset": "fast", "detection.source": "own"}
         | {
             f"detection.{name}": value
             for name, value in (("full_frame_delay", 0.1), ("full_frame_interval", 0.4), ("search_interval", 0.4))

@@ -12,20 +12,20 @@ import pytest
 
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, definition_files
+from flowing_puppet_ros.image.formats.skeletons import HRI_18
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.component import Port
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.components.ros4hri import (
-    SKELETON2D_JOINTS,
     Ros4HriPublisher,
     Ros4HriSettings,
     bounding_box,
     make_skeleton2d,
     to_name_component,
 )
+from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import JOINTS, MOVING_JOINTS, Skeleton, make_urdf
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image
-from flowing_puppet_ros.stream.messages.ros4hri_skeleton import JOINTS, MOVING_JOINTS, Skeleton, make_urdf
 
 FACTORY = BagMessageFactory()
 HEADER = make_header(FACTORY, 1_500_000_000, "camera_optical_frame")
@@ -48,7 +48,7 @@ def test_the_skeleton_has_the_order_of_the_constants() -> None:
         words = line.split("#")[0].split()
         if len(words) == 4 and words[2] == "=":
             constants[words[1].lower()] = int(words[3])
-    assert constants == {name: index for index, name in enumerate(SKELETON2D_JOINTS)}
+    assert constants == {name: index for index, name in enumerate(HRI_18)}
 
 
 def test_joints_are_normalised_clipped_and_unknown_ones_have_no_confidence() -> None:

@@ -18,7 +18,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame
 from flowing_puppet_ros.body.scans.scan import read_scan, to_smallest_float, write_ply
 from flowing_puppet_ros.body.scans.unit import GUESS, has_size_of_person
-from flowing_puppet_ros.cli.fit_people import FitOptions, ScanPerson, find_people
+from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson, find_people
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet

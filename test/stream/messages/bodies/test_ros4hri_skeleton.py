@@ -10,7 +10,7 @@ import pytest
 
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.stream.messages.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames
+from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames
 
 LINKS = {"shoulder": "r_shoulder", "elbow": "elbow", "wrist": "wrist", "hip": "r_hip", "knee": "knee", "ankle": "ankle"}
 
