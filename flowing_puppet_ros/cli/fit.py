@@ -18,11 +18,13 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import FitterSettings
-from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
-from flowing_puppet_ros.body.scans.scan_frame import UNITS, UP_AXES
+from flowing_puppet_ros.body.scans.scan import SCAN_SUFFIXES, SUFFIXES, read_scan
+from flowing_puppet_ros.body.scans.scan_frame import UP_AXES
+from flowing_puppet_ros.body.scans.unit import UNITS
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli.batch import runner
-from flowing_puppet_ros.cli.fit_file import FitOptions, fit_file, list_files
+from flowing_puppet_ros.cli.scans.fit_file import fit_file, list_files
+from flowing_puppet_ros.cli.scans.fit_people import FitOptions
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.settings import Settings, make_out_folder, nested
 
@@ -62,7 +64,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--view",
         choices=("full", "single", "auto"),
         default="auto",
-        help="whether the input shows all sides, or one, seen from the origin of its frame [auto]",
+        help="whether the input shows all sides, or one [auto]",
+    )
+    parser.add_argument(
+        "--viewpoint",
+        type=_parse_viewpoint,
+        metavar="X,Y,Z",
+        help="where the sensor of a one-sided input stood, in the input's frame and unit; --viewpoint=-1,0,2 where x is"
+        " negative [what the file says, else the origin, else what the surface shows]",
     )
     parser.add_argument(
         "--scene",
@@ -85,6 +94,7 @@ def run(arguments: argparse.Namespace) -> int:
         upright=arguments.upright,
         unit=arguments.unit,
         view=arguments.view,
+        viewpoint=arguments.viewpoint,
         scene=arguments.scene,
         settings=settings.fitter,
         segmentation=settings.segmentation,
@@ -113,6 +123,16 @@ def run(arguments: argparse.Namespace) -> int:
     return status
 
 
+def _parse_viewpoint(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not three numbers x,y,z") from None
+    if not np.isfinite([x, y, z]).all():
+        raise argparse.ArgumentTypeError(f"{text!r} is not three finite numbers x,y,z")
+    return x, y, z
+
+
 def _one(verb: runner.Verb, source: Path, options: FitOptions) -> int:
     make_out_folder(options.out)
     try:
@@ -135,16 +155,20 @@ def _find_scans(given: Path) -> list[Path]:
     """Yield an input, or the files of a folder that may be scans, by name."""
     if not given.is_dir():
         return [given]
-    found = sorted(path for path in given.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file())
+    found = sorted(path for path in given.iterdir() if path.suffix.lower() in SCAN_SUFFIXES and path.is_file())
     if not found:
-        raise InputError(f"the folder {given} has no scan; wanted are files ending in {' '.join(SUFFIXES)}")
+        raise InputError(f"the folder {given} has no scan; wanted are files ending in {' '.join(SCAN_SUFFIXES)}")
     return found
 
 
 def _tell(summary: dict[str, Any], as_json: bool) -> None:
     for fit in summary.get("people", [summary]):
+        notes = list(fit.get("notes", []))
         if not fit.get("reliable", True):
-            text = f"{fit['output']} is not reliable: a limb may be wrong, or it is no person"
-            print(f"flowing-puppet fit: {text}", file=sys.stderr)
+            notes.insert(0, f"{fit['output']} is not reliable: a limb may be wrong, or it is no person")
+        elif notes:
+            notes[0] = f"{fit['output']}: {notes[0]}"
+        if notes:
+            print(f"flowing-puppet fit: {'; '.join(notes)}", file=sys.stderr)
     if as_json:
         print(json.dumps(summary), flush=True)

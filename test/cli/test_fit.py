@@ -3,32 +3,17 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
+from fit_verb import FAST, fitted  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.body.scans.scan import read_scan
-from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 pytestmark = pytest.mark.slow
-
-FAST = ["--particles", "4", "--iterations", "3", "--local-particles", "4", "--local-iterations", "0", "--restarts", "0"]
-FAST += ["--levenberg-steps", "2", "--gauss-newton-steps", "10", "--max-points", "1500", "--no-nonrigid"]
-FAST += ["--max-limb-repairs", "0"]
-
-
-def fitted(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, list[dict[str, Any]], list[str]]:
-    """Return the exit status, the JSON objects and the sentences on stderr."""
-    status = main(["fit", *map(str, arguments), "--json"])
-    output = capsys.readouterr()
-    sentences = [line for line in output.err.replace("\r", "\n").splitlines() if "flowing-puppet fit:" in line]
-    assert "Traceback" not in output.err
-    return status, [json.loads(line) for line in output.out.splitlines()], sentences
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.cloud.limb_crop import crop_to_limbs
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
 from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleViewCloud
-from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses, FitterSettings, Progress, sub_progress
+from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings, Progress, sub_progress
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.quality import assess_fit
 from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton
@@ -165,6 +165,20 @@ class BodyFitter:
             Cloud.of(points, unknown) if viewpoint is None else SingleViewCloud.seen_from(points, unknown, viewpoint)
         )
         return self.hypotheses.pose_bank.coarse_cost(cloud)
+
+    def find_roughly(
+        self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None, thorough: bool
+    ) -> BodyCandidate:
+        """Find a body in a cloud in a fraction of a second: enough to tell its frame and unit, not its pose.
+
+        Arguments as in `fit`; `thorough` starts from more poses and takes twice the time.
+
+        Raises:
+            InputError: when the cloud cannot be the surface of a person.
+        """
+        with one_blas_thread():
+            points, normals = downsample(points, normals, MAX_COARSE_POINTS)
+            return self.hypotheses.find_roughly(self.prepare_cloud(points, normals, viewpoint), thorough)
 
     def _fit_from_joints(
         self,

@@ -18,7 +18,7 @@ from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.initialisation import flip_heading, sample_bodies
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
 from flowing_puppet_ros.body.fit.quality import MAX_UNCOVERED, FitQuality, assess_fit
-from flowing_puppet_ros.body.fit.single_view_search import SingleViewSearch
+from flowing_puppet_ros.body.fit.single_view_search import ROUGH, SingleViewSearch
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
@@ -44,6 +44,8 @@ MAX_REPAIRABLE_COST_M = 0.06
 # Cost of the best limb hypothesis, in costs of the body that it came from, for another repair round; the second where
 # so much of the cloud is uncovered that the whole body is probably wrong.
 MAX_COST_RATIO, MAX_COST_RATIO_IF_WRONG, MIN_WRONG_UNCOVERED = 0.98, 0.9, 0.25
+# Bodies that are refined to compare frames.
+ROUGH_STARTS = 4
 # Shares of the particles and rounds in a quick search, and in one for the warm-up.
 QUICK_SHARE, WARM_UP_SHARE = 0.5, 0.1
 
@@ -155,6 +157,22 @@ class BodyHypotheses:
         self._search_both_headings(cloud, grid, np.random.default_rng(0), lambda _: None, WARM_UP_SHARE)
         state = self.pose_bank.find_best(CoarseCloud.of(view), 1)[0]
         self.refine(state, view, JointTargets.none(self._model), 1)
+
+    def find_roughly(self, cloud: Cloud, thorough: bool) -> BodyCandidate:
+        """Return the closest of a few bodies of the pose bank, of all of it if `thorough`, after some Gauss-Newton."""
+        terms = [cloud.free_space_term] if isinstance(cloud, SingleViewCloud) else []
+        none = JointTargets.none(self._model)
+
+        def improve(body: BodyState) -> BodyCandidate:
+            state = self.gauss_newton.run(body, cloud, none, ROUGH, terms)
+            return BodyCandidate(state, assess_fit(self._model, self._model.vertices(state), cloud))
+
+        bank = self.pose_bank
+        starts = (
+            bank.find_best(CoarseCloud.of(cloud), ROUGH_STARTS) if thorough else bank.find_roughly(cloud, ROUGH_STARTS)
+        )
+        found = parallel_map(improve, starts, self._threads)
+        return min(found, key=lambda candidate: candidate.cost)
 
     def search_near(
         self, body: BodyState, grid: CloudGrid, targets: JointTargets, rng: np.random.Generator, progress: Progress

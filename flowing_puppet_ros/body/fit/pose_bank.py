@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -88,15 +88,40 @@ class PoseBank:
         rows = [yaw * POSES + int(cost[yaw].argmin()) for yaw in yaws]
         return [particles_to_state(self._model, bodies, np.full(len(bodies), row)) for row in rows]
 
+    def find_roughly(self, cloud: Cloud, count: int) -> list[BodyState]:
+        """Return the best body of each of the `count` best yaws of a small bank, moved to the cloud."""
+        costs, shift = self._judge_small_bank(cloud)
+        costs = costs.reshape(YAWS, COARSE_POSES)
+        states = []
+        for yaw in np.argsort(costs.min(axis=1), kind="stable")[:count]:
+            pose = int(costs[yaw].argmin())
+            groups = [group.take(np.array([yaw * POSES + pose])) for group in make_bank(self._model)]
+            body = particles_to_state(self._model, groups, np.zeros(len(groups), dtype=np.int64))
+            states.append(replace(body, center=body.center + shift[yaw * COARSE_POSES + pose]))
+        return states
+
     def coarse_cost(self, cloud: Cloud) -> float:
         """Return the cost in metres of the best upright body of a small bank on a cloud.
 
         It tells a cloud with the head up from the same cloud upside down.
         """
+        return float(self._judge_small_bank(cloud)[0].min())
+
+    def _judge_small_bank(self, cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
+        """Return the costs (P,) m of the bodies of the small bank, and the steps (P, 3) m that move them to a cloud."""
         coarse = CoarseCloud.of(cloud, COARSE_TARGETS)
+        points, normals, prior = self._small_bank
+        shift = self._shift_to_cloud(points, normals, coarse)
+        points = points + shift[:, None]
+        misfit, able = _measure_misfit(points, normals, coarse)
+        return distances(coarse.targets, points, able).mean(axis=1) + misfit + prior, shift
+
+    @cached_property
+    def _small_bank(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Surface points and normals (P, K, 3) and joint priors (P,) of the bodies by which frames are compared."""
         rows = np.flatnonzero(np.arange(YAWS * POSES) % POSES < COARSE_POSES)
-        bodies = self._move_to_cloud([group.take(rows) for group in make_bank(self._model)], coarse)
-        return float(self.coverage_cost(bodies, coarse, range(len(bodies))).cost.min())
+        bodies = [group.take(rows) for group in make_bank(self._model)]
+        return *self._pose_surface(bodies, range(len(bodies))), self._joint_prior(bodies, range(len(bodies)))
 
     def cost(self, body: BodyState, coarse: CoarseCloud) -> float:
         """Return the cost of one body on a cloud, metres."""
@@ -116,29 +141,35 @@ class PoseBank:
         the cloud, plus the joint prior. `other_distance` (1, M) is that of the targets to the other parts, metres.
         """
         points, normals = self._pose_surface(bodies, parts)
-        if isinstance(coarse.cloud, SingleViewCloud):
-            misfit, able = coarse.cloud.view.misfit(points, normals)
-        else:
-            misfit, able = mean_distance(points, coarse.targets), np.ones(points.shape[:2], dtype=np.bool_)
+        misfit, able = _measure_misfit(points, normals, coarse)
         distance = np.minimum(distances(coarse.targets, points, able), other_distance)
-        cost = distance.mean(axis=1) + self._share[list(parts)].sum() * misfit
+        cost = distance.mean(axis=1) + self._share[list(parts)].sum() * misfit + self._joint_prior(bodies, parts)
+        return CoverageCost(cost, distance)
+
+    def _joint_prior(self, bodies: list[Particles], parts: Sequence[int]) -> np.ndarray:
+        """Return what the rotations at the joints of some parts cost each body (P,), metres."""
+        cost = np.zeros(1)
         for part in parts:
             if part:
                 mean, precision = self._joints[part - 1]
                 above = bodies[self._model.tree.parents[part]].rotation.transpose(0, 2, 1)
                 gap = so3.log(above @ bodies[part].rotation) - mean
                 cost = cost + JOINT_PRIOR_M * ((gap @ precision) * gap).sum(axis=1)
-        return CoverageCost(cost, distance)
+        return cost
 
     def _move_to_cloud(self, bodies: list[Particles], coarse: CoarseCloud) -> list[Particles]:
         """Move each body so that the mean of its surface, or of the surface that faces the sensor, is the cloud's."""
-        points, normals = self._pose_surface(bodies, range(len(bodies)))
+        shift = self._shift_to_cloud(*self._pose_surface(bodies, range(len(bodies))), coarse)
+        return [Particles(group.center + shift, group.rotation, group.pose, group.shape) for group in bodies]
+
+    @staticmethod
+    def _shift_to_cloud(points: np.ndarray, normals: np.ndarray, coarse: CoarseCloud) -> np.ndarray:
+        """Return the steps (P, 3) that move bodies with surface points and normals (P, K, 3) to the cloud."""
         middle = coarse.targets.mean(axis=0)
         seen = np.ones((*points.shape[:2], 1), dtype=bool)
         if isinstance(coarse.cloud, SingleViewCloud):
             seen = (normals @ (middle - coarse.cloud.view.viewpoint) < 0)[:, :, None]
-        shift = middle - (points * seen).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
-        return [Particles(group.center + shift, group.rotation, group.pose, group.shape) for group in bodies]
+        return np.asarray(middle - (points * seen).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
 
     def _pose_surface(self, bodies: list[Particles], parts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
         """Return the surface points (P, K, 3) of some parts in metres, and their normals (P, K, 3)."""
@@ -154,6 +185,13 @@ def make_bank(model: StitchedPuppet) -> list[Particles]:
     bank = states_to_particles(model, [model.sample(rng, shape_scale=0.0) for _ in range(POSES)])
     yaws = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
     return [Particles.join([_rotate(group, yaw) for yaw in yaws]) for group in bank]
+
+
+def _measure_misfit(points: np.ndarray, normals: np.ndarray, coarse: CoarseCloud) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far surface points (P, K, 3) contradict the cloud (P,), metres, and which (P, K) may cover it."""
+    if isinstance(coarse.cloud, SingleViewCloud):
+        return coarse.cloud.view.misfit(points, normals)
+    return mean_distance(points, coarse.targets), np.ones(points.shape[:2], dtype=np.bool_)
 
 
 def _take_first(points: PointSet, count: int) -> PointSet:

@@ -6,11 +6,13 @@ They are our own because damaged and hostile (fuzzed) files must end in an `Inpu
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import triangulate_fans
+from flowing_puppet_ros.body.scans.tables import read_text_file
 from flowing_puppet_ros.errors import InputError
 
 
@@ -67,4 +69,5 @@ def read_off(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_lines(path: Path) -> list[str]:
-    return path.read_text(encoding="utf-8", errors="replace").splitlines()
+    """Return the lines of a text; one that ends in a backslash goes on in the next."""
+    return re.sub(r"\\[ \t]*\r?\n", " ", read_text_file(path)).splitlines()

@@ -6,6 +6,7 @@ It is our own because damaged and hostile (fuzzed) files must end in an `InputEr
 
 from __future__ import annotations
 
+import codecs
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -49,7 +50,7 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     Raises:
         InputError: when it is not a .ply file, ends early, or has no vertices with x, y and z.
     """
-    data = path.read_bytes()
+    data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     end = data.find(b"end_header")
     start = data.find(b"\n", end) + 1
     if not data.startswith(b"ply") or end < 0 or not start:
@@ -97,16 +98,15 @@ def _parse_text(data: bytes, elements: list[Element]) -> dict[str, dict[str, np.
             values = np.array(list(islice(words, element.rows * width)), dtype=np.float64).reshape(element.rows, width)
             tables[element.name] = {column.name: values[:, k] for k, column in enumerate(element.properties)}
             continue
-        lists: dict[str, list[list[int]]] = {column.name: [] for column in element.properties if column.count}
+        rows: dict[str, list[list[float]]] = {column.name: [] for column in element.properties}
         for _ in range(element.rows):
             for column in element.properties:
                 length = _check_count(float(next(words, b"missing"))) if column.count else 1
                 row = [float(word) for word in islice(words, length)]
                 if len(row) < length:
                     raise ValueError(length)
-                if column.count:
-                    lists[column.name].append([int(value) for value in row])
-        tables[element.name] = {name: triangulate_fans(rows) for name, rows in lists.items()}
+                rows[column.name].append(row)
+        tables[element.name] = _gather_columns(element, rows)
     return tables
 
 
@@ -156,7 +156,7 @@ def _list_fields(column: Property, length: int, order: str) -> list[tuple[str, s
 
 def _parse_uneven(data: bytes, at: int, element: Element, order: str) -> tuple[dict[str, np.ndarray], int]:
     """Read an element whose lists differ in length, row by row; return its columns and where it ends."""
-    lists: dict[str, list[list[int]]] = {column.name: [] for column in element.properties if column.count}
+    rows: dict[str, list[list[float]]] = {column.name: [] for column in element.properties}
     for _ in range(element.rows):
         for column in element.properties:
             length = 1
@@ -165,9 +165,20 @@ def _parse_uneven(data: bytes, at: int, element: Element, order: str) -> tuple[d
                 at += np.dtype(column.count).itemsize
             row = np.frombuffer(data, order + column.kind, length, at)
             at += row.nbytes
-            if column.count:
-                lists[column.name].append(row.tolist())
-    return {name: triangulate_fans(rows) for name, rows in lists.items()}, at
+            rows[column.name].append(row.tolist())
+    return _gather_columns(element, rows), at
+
+
+def _gather_columns(element: Element, rows: dict[str, list[list[float]]]) -> dict[str, np.ndarray]:
+    """Return the plain numbers (N,) of each column, and the triangles of polygons; other lists are passed over."""
+    tables = {}
+    for column in element.properties:
+        values = rows[column.name]
+        if not column.count:
+            tables[column.name] = np.array(values, dtype=np.float64).reshape(-1)
+        elif column.name in POLYGON_NAMES:
+            tables[column.name] = triangulate_fans([[int(value) for value in row] for row in values])
+    return tables
 
 
 def _triangulate_equal_fans(polygons: np.ndarray) -> np.ndarray:

@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads meshes and clouds from .ply .obj .off .stl .pcd .xyz .npy .npz, and writes .ply."""
+"""Reads meshes and clouds from files of many kinds, and writes .ply."""
 
 from __future__ import annotations
 
-import warnings
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,11 +10,14 @@ import numpy as np
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.scans.obj_off import read_obj, read_off
+from flowing_puppet_ros.body.scans.pcd import read_viewpoint
 from flowing_puppet_ros.body.scans.ply import read_ply
+from flowing_puppet_ros.body.scans.tables import TEXT_SUFFIXES, read_lidar_scan, read_numpy, read_text_table
 from flowing_puppet_ros.errors import InputError
 
-SUFFIXES = (".ply", ".obj", ".off", ".stl", ".pcd", ".xyz", ".npy", ".npz")
-POINT_KEYS = ("vertices", "points", "xyz")  # names of the points in .npz, by precedence
+SCAN_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".pcd", ".xyz", ".npy", ".npz", ".asc", ".pts")
+SUFFIXES = (*SCAN_SUFFIXES, ".txt", ".csv", ".bin")
+"""Suffixes that are read; in a folder only `SCAN_SUFFIXES`, since the others may be anything."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,11 +28,13 @@ class Scan:
         points: (N, 3) float64 vertices in the file's order.
         faces: (F, 3) int64 outward, or None for a cloud.
         normals: (N, 3) unit normals of a cloud or None.
+        viewpoint: (3,) position of the sensor that the file names, or None.
     """
 
     points: np.ndarray
     faces: np.ndarray | None = None
     normals: np.ndarray | None = None
+    viewpoint: np.ndarray | None = None
 
     @property
     def area(self) -> float | None:
@@ -60,7 +63,7 @@ class Scan:
 
 
 def read_scan(path: Path) -> Scan:
-    """Read a mesh or cloud; points of clouds that are not finite are dropped.
+    """Read a mesh or cloud; points that are not finite and in no face are dropped.
 
     Raises:
         InputError: when the file is missing, of another kind, damaged, or holds no points.
@@ -73,7 +76,8 @@ def read_scan(path: Path) -> Scan:
             f"{path} ends in {suffix or 'nothing'}, which is none of {' '.join(SUFFIXES)}; convert it first"
         )
     if suffix in (".npy", ".npz"):
-        scan = _read_numpy(path)
+        vertices, normals, triangles = read_numpy(path)
+        scan = Scan(vertices, triangles, None if normals is None else _normalise(normals))
     elif suffix in (".obj", ".off"):
         vertices, faces = (read_obj if suffix == ".obj" else read_off)(path)
         scan = Scan(vertices, faces if len(faces) else None)
@@ -84,8 +88,9 @@ def read_scan(path: Path) -> Scan:
             if len(faces)
             else Scan(vertices, None, None if normals is None else _normalise(normals))
         )
-    elif suffix == ".xyz":
-        scan = _read_text(path)
+    elif suffix == ".bin" or suffix in TEXT_SUFFIXES:
+        vertices, normals = (read_lidar_scan if suffix == ".bin" else read_text_table)(path)
+        scan = Scan(vertices, None, None if normals is None else _normalise(normals))
     else:
         scan = _read_open3d(path)
     return _validate(scan, path)
@@ -98,16 +103,29 @@ def _validate(scan: Scan, path: Path) -> Scan:
     if scan.faces is None:
         if not finite.any():
             raise InputError(f"{path} holds {len(scan.points)} points, none of which is finite; export it again")
-        return Scan(scan.points[finite], None, None if scan.normals is None else scan.normals[finite])
-    if not finite.all():
-        raise InputError(f"{path} has a vertex {int(np.argmin(finite))} that is not finite; repair the mesh")
+        normals = None if scan.normals is None else scan.normals[finite]
+        return Scan(scan.points[finite], None, normals, scan.viewpoint)
     if scan.faces.min() < 0 or scan.faces.max() >= len(scan.points):
         raise InputError(
             f"{path} has a face that names vertex {scan.faces.max()} of {len(scan.points)}; repair the mesh"
         )
     if not scan.area:
         raise InputError(f"{path} has {len(scan.faces)} faces without any area; repair the mesh")
-    return Scan(scan.points, _orient_outward(scan.points, scan.faces))
+    points, faces = _drop_unused_vertices(scan.points, scan.faces, finite, path)
+    return Scan(points, _orient_outward(points, faces))
+
+
+def _drop_unused_vertices(
+    points: np.ndarray, faces: np.ndarray, finite: np.ndarray, path: Path
+) -> tuple[np.ndarray, np.ndarray]:
+    """Drop the vertices that are not finite; InputError when a face has one."""
+    if finite.all():
+        return points, faces
+    used = np.zeros(len(finite), dtype=bool)
+    used[faces] = True
+    if not finite[used].all():
+        raise InputError(f"{path} has a vertex {int(np.argmax(used & ~finite))} that is not finite; repair the mesh")
+    return points[finite], (np.cumsum(finite) - 1)[faces]
 
 
 def _orient_outward(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -126,47 +144,11 @@ def _read_open3d(path: Path) -> Scan:
             return Scan(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
     cloud = o3d.io.read_point_cloud(path)
     return Scan(
-        np.asarray(cloud.points).copy(), None, _normalise(np.asarray(cloud.normals)) if cloud.has_normals() else None
+        np.asarray(cloud.points).copy(),
+        None,
+        _normalise(np.asarray(cloud.normals)) if cloud.has_normals() else None,
+        read_viewpoint(path) if path.suffix.lower() == ".pcd" else None,
     )
-
-
-def _read_text(path: Path) -> Scan:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)
-            table = np.loadtxt(path, ndmin=2)
-    except (ValueError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is not a table of x y z [nx ny nz] lines: {error}") from error
-    return _from_table(table, path)
-
-
-def _read_numpy(path: Path) -> Scan:
-    try:
-        loaded = np.load(path, allow_pickle=False)
-        arrays = {key: loaded[key] for key in loaded.files} if path.suffix.lower() == ".npz" else {"points": loaded}
-    except (ValueError, OSError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} cannot be read as a NumPy file; save it again without pickled objects") from error
-    key = next((key for key in POINT_KEYS if key in arrays), None)
-    if key is None:
-        tables = [name for name, array in arrays.items() if array.ndim == 2 and array.shape[1] in (3, 4, 6)]
-        if len(tables) != 1:
-            raise InputError(f"{path} has the arrays {', '.join(arrays)}; call the (N, 3) one points")
-        key = tables[0]
-    scan = _from_table(arrays[key], path)
-    if "faces" in arrays and arrays["faces"].ndim == 2 and arrays["faces"].shape[1] == 3 and len(arrays["faces"]):
-        return Scan(scan.points, arrays["faces"].astype(np.int64))
-    normals = arrays.get("normals", np.empty(0))
-    return Scan(scan.points, None, _normalise(normals) if normals.shape == scan.points.shape else scan.normals)
-
-
-def _from_table(table: np.ndarray, path: Path) -> Scan:
-    """Take points from columns 0 to 2 and, where there are six columns, normals from the others."""
-    if not table.size:
-        return Scan(np.empty((0, 3)))
-    if table.dtype.kind not in "fiu" or table.ndim != 2 or table.shape[1] < 3:
-        raise InputError(f"{path} holds an array of {table.dtype} and shape {table.shape}, not numbers of shape (N, 3)")
-    table = table.astype(np.float64)
-    return Scan(table[:, :3].copy(), None, _normalise(table[:, 3:6]) if table.shape[1] == 6 else None)
 
 
 def _normalise(normals: np.ndarray) -> np.ndarray | None:

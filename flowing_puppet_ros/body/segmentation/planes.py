@@ -110,11 +110,19 @@ def find_floor(points: np.ndarray, clearance: float, rng: np.random.Generator) -
     return _fit_best(points, normals[level], offsets[level], count, clearance, MIN_FLOOR_SIZE_M)
 
 
-def find_wall(points: np.ndarray, thickness: float, rng: np.random.Generator) -> Plane | None:
-    """Return the plane of any direction that most points (N, 3) lie on, or None when none is larger than a person."""
+def find_wall(
+    points: np.ndarray,
+    thickness: float,
+    rng: np.random.Generator,
+    size: tuple[float, float] = MIN_WALL_SIZE_M,
+) -> Plane | None:
+    """Return the plane of any direction that most points (N, 3) lie on, or None when it is not of some size.
+
+    `size` is the minimum of its longer and shorter side, metres; without it the plane is larger than a person.
+    """
     normals, offsets = _sample_planes(points, rng)
     count = (np.abs(points @ normals.T - offsets) < thickness).sum(axis=0)
-    return _fit_best(points, normals, offsets, count, thickness, MIN_WALL_SIZE_M)
+    return _fit_best(points, normals, offsets, count, thickness, size)
 
 
 def _sample_planes(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

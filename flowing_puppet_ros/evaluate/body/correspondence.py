@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.body.scans.scan import SUFFIXES, Scan, read_scan
+from flowing_puppet_ros.body.scans.scan import SCAN_SUFFIXES, Scan, read_scan
 from flowing_puppet_ros.body.scans.scan_correspondence import correspond
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -75,7 +75,7 @@ def read_fitted_scans(
     Raises:
         InputError: if something is missing or the meshes do not correspond.
     """
-    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in SCAN_SUFFIXES) if folder.is_dir() else []
     if len(paths) < 2:
         raise InputError(f"{folder} holds {len(paths)} meshes and a pair needs two; give the folder of the scans")
     model = StitchedPuppet.load(_read_fit(fits / f"{paths[0].stem}.npz")[2])

@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit one file for `flowing-puppet fit`: determine unit, axes and view, fit the body, write the result."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame
+from flowing_puppet_ros.body.scans.scan import read_scan, to_smallest_float, write_ply
+from flowing_puppet_ros.body.scans.unit import GUESS, has_size_of_person
+from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson, find_people
+from flowing_puppet_ros.draw.palette import part_colours
+from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+WRITTEN_SHAPE_COEFFICIENTS = 4  # of each part, as in the thesis; all are in `all_shape_coefficients`
+
+
+def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str, Any]:
+    """Fit the person, or the people of a scene, in one file; write the results and return a summary for JSON.
+
+    `shown` draws a progress bar on stderr. PuppetError if the file cannot be used or shows no person.
+    """
+    started = time.perf_counter()
+    fitter = _make_fitter(options.model, options.settings)
+    _refuse_overwriting(source, options)
+    people = find_people(read_scan(source), source, fitter, options)
+    if not people[0].suffix:
+        return {"input": str(source)} | _fit_person(source, people[0], fitter, options, started, shown)
+    fits = []
+    for person in people:
+        fits.append(_fit_person(source, person, fitter, options, started, shown))
+        started = time.perf_counter()
+    return {"input": str(source), "people": fits}
+
+
+def list_files(summary: dict[str, Any]) -> list[Path]:
+    """List the files that a summary of `fit_file` names."""
+    outputs = [Path(fit["output"]) for fit in summary.get("people", [summary])]
+    return [output.with_suffix(suffix) for output in outputs for suffix in (".npz", ".ply")]
+
+
+@lru_cache(maxsize=1)
+def _make_fitter(model: str, settings: FitterSettings) -> BodyFitter:
+    """Make the fitter that all inputs of a process share."""
+    return BodyFitter(StitchedPuppet.load(model), settings)
+
+
+def _refuse_overwriting(source: Path, options: FitOptions) -> None:
+    if not options.scene and source.suffix in (".npz", ".ply") and source.parent.resolve() == options.out.resolve():
+        raise InputError(f"the fit of {source} would overwrite it; choose another folder for --out")
+
+
+def _fit_person(
+    path: Path, person: ScanPerson, fitter: BodyFitter, options: FitOptions, started: float, shown: bool
+) -> dict[str, Any]:
+    output = options.out / f"{path.stem}{person.suffix}.npz"
+    with tqdm(total=100, desc=output.stem, unit="%", file=sys.stderr, disable=not shown) as bar:
+        found = fit_in_best_frame(
+            fitter,
+            person.points,
+            person.normals,
+            units=person.units,
+            ups=person.ups,
+            sensor=person.sensor,
+            progress=_progress_on(bar),
+        )
+    _refuse_no_person(person, found)
+    seconds = time.perf_counter() - started
+    try:
+        _write_fit(output, fitter.model, found, seconds)
+    except OSError as error:
+        raise PuppetError(f"{output} cannot be written: {error.strerror}") from error
+    fit, unit = found.fit, found.unit
+    return {
+        "output": str(output),
+        "model": fitter.model.name,
+        "energy": fit.energy,
+        "confidence": fit.confidence,
+        "reliable": fit.reliable,
+        "two_way_distance_m": fit.two_way_distance * unit.metres / unit.fitted,
+        "unit": unit.name,
+        "metres_per_unit": unit.metres,
+        "unit_clear": found.unit_clear,
+        "child": found.is_child,
+        "up": np.round(found.frame.up, 6).tolist(),
+        "up_clear": found.up_clear,
+        "view": "full" if person.sensor is None else "single",
+        "notes": [*person.notes, *_describe_frame(found)],
+        "seconds": seconds,
+    }
+
+
+def _refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
+    """Raise InputError when a cloud has no person's size and, scaled to one, no person's shape."""
+    guessed = found.unit.name == GUESS and len(person.units) > 1
+    if guessed and not found.fit.reliable and not has_size_of_person(person.points):
+        longest = float(np.ptp(person.points, axis=0).max())
+        raise InputError(
+            f"the longest side is {longest:.3g} units, which is not the size of an adult in m, cm or mm, and no scaled"
+            " body fits; cut out one person, add --scene or name --unit"
+        )
+
+
+def _describe_frame(found: FrameFit) -> list[str]:
+    """Return what the user should know about the unit and the axes, a sentence each."""
+    notes = []
+    if not found.up_clear:
+        notes.append(f"which way is up is not clear, {_name_axis(found.frame.up)} was taken; name it with --up")
+    if found.unit.name == GUESS:
+        notes.append(
+            f"no unit gives an adult's size, {found.unit.metres:.4g} metres per unit was guessed from the proportions;"
+            " name --unit, also for a child"
+        )
+    elif found.is_child:
+        notes.append(
+            f"the person is {found.stature:.2f} m tall in {found.unit.name}: a child, or the scan was scaled; check"
+            " --unit"
+        )
+    elif not found.unit_clear:
+        notes.append(f"the unit is not clear, {found.unit.name} was taken; name it with --unit")
+    return notes
+
+
+def _name_axis(up: np.ndarray) -> str:
+    k = int(np.abs(up).argmax())
+    return ("-" if up[k] < 0 else "") + "xyz"[k]
+
+
+def _progress_on(bar: tqdm) -> Callable[[float], None]:
+    return lambda done: bar.update(int(100 * done) - bar.n) and None
+
+
+def _write_fit(output: Path, model: StitchedPuppet, found: FrameFit, seconds: float) -> None:
+    """Write the fit, in the scan's frame and unit, as `output` and as a mesh beside it."""
+    frame, fit = found.frame, found.fit
+    vertices = to_smallest_float(frame.to_scan(fit.vertices))
+    arrays: dict[str, Any] = {
+        "vertices": vertices,
+        "faces": model.faces,
+        "part_of_vertex": model.part_of_vertex,
+        "part_names": np.array(model.tree.names),
+        "part_rotation": (frame.rotation.T @ fit.state.rotation).astype(np.float32),
+        "part_center": frame.to_scan(fit.state.center).astype(vertices.dtype),
+        "part_confidence": fit.part_confidence.astype(np.float32),
+        "joint_names": np.array(model.joint_names),
+        "joints": frame.to_scan(fit.joints).astype(vertices.dtype),
+        "shape_coefficients": fit.state.shape[:, :WRITTEN_SHAPE_COEFFICIENTS].astype(np.float32),
+        "all_shape_coefficients": fit.state.shape.astype(np.float32),
+        "pose_coefficients": fit.state.pose.astype(np.float32),
+        "energy": fit.energy,
+        "confidence": fit.confidence,
+        "reliable": fit.reliable,
+        "two_way_distance": fit.two_way_distance / frame.scale,
+        "metres_per_unit": found.unit.metres,
+        "unit": found.unit.name,
+        "unit_clear": found.unit_clear,
+        "child": found.is_child,
+        "up": frame.up,
+        "up_clear": found.up_clear,
+        "seconds": seconds,
+        "model": model.name,
+    }
+    # Write atomically, in case two machines make the same result or one is stopped.
+    unfinished = output.with_name(f".{output.stem}.{os.getpid()}")
+    try:
+        with unfinished.open("wb") as stream:
+            np.savez_compressed(stream, **arrays)
+        unfinished.replace(output)
+        colours = part_colours(model.tree.names)[model.part_of_vertex]
+        write_ply(unfinished, vertices, model.faces, colours)
+        unfinished.replace(output.with_suffix(".ply"))
+    finally:
+        unfinished.unlink(missing_ok=True)
