@@ -162,7 +162,9 @@ class NetworkTracker:
     def _start_run(self, image: Image, stamp_ns: int, passed_ns: int, executor: Executor | None) -> _Run | None:
         """Start a run on the next image: a search for everybody, or as many looks as there is time for."""
         settings, tracks = self._settings, self._tracker.tracks
-        self._looks = min(self._looks + settings.looks * passed_ns / NANOSECONDS, max(1.0, len(tracks)))
+        # Only an image that waits for them can take all looks and a search besides.
+        most = max(1.0, len(tracks) + (passed_ns >= to_ns(settings.min_wait)))
+        self._looks = min(self._looks + settings.looks * passed_ns / NANOSECONDS, most)
         interval = settings.everybody_interval if tracks else settings.search_interval
         everybody = self._everybody_ns is None or self._clock.now_ns - self._everybody_ns >= to_ns(interval)
         chosen = self._choose(tracks, everybody)
