@@ -56,6 +56,7 @@ setup(
         "cluster": requirements("cluster"),
         "neural": requirements("neural"),
         "rerun": requirements("rerun"),
+        "video": requirements("video"),
     },
     entry_points={
         "console_scripts": [

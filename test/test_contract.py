@@ -23,16 +23,8 @@ ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_inte
 FOUNDATION = {"arrays", "errors", "ids", "images", "reporting", "settings", "threads", "units"}
 """Modules beside the rooms, which everything may import."""
 OPTIONAL_PACKAGES = {
-    "ai_edge_litert",
-    "anny",
-    "body_models",
-    "dask",
-    "distributed",
-    "flask",
-    "rerun",
-    "waitress",
-    "werkzeug",
-}
+    "ai_edge_litert", "anny", "av", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug",
+}  # fmt: skip
 ONLY_WITH_EXTRA = "flowing_puppet_ros.annotate.server"
 """Nothing but an extra's own module imports what the extra brings at its top."""
 OPTIONAL = {
@@ -42,12 +34,23 @@ OPTIONAL = {
     "cli.batch.cluster": "cluster",
     "image.networks.runtime": "neural",
     "report.rerun_file": "rerun",
+    "bag.foreign.video": "video",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10
 MAY_IMPORT: dict[str, set[str]] = {
-    "annotate": {"draw", "flow", "image.formats", "image.tracking", "model.ds"},
-    "bag": {"image.formats", "multiview", "stream", "stream.components", "stream.messages"},
+    "annotate": {"draw", "flow", "image.detector", "image.formats", "image.networks", "image.tracking", "model.ds"},
+    "bag": {
+        "bag.foreign",
+        "bag.storage",
+        "image.formats",
+        "multiview",
+        "stream",
+        "stream.components",
+        "stream.messages",
+    },
+    "bag.foreign": {"bag.storage", "stream.messages"},
+    "bag.storage": set(),
     "body": set(),
     "body.cloud": {"evidence.cloud"},
     "body.fit": {"body.cloud", "body.refine", "body.scans", "body.search", "evidence.cloud", "model"},
@@ -59,6 +62,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cli": {
         "annotate",
         "bag",
+        "bag.storage",
         "body.fit",
         "body.scans",
         "body.segmentation",
@@ -387,14 +391,8 @@ def test_limits_are_called_min_and_max() -> None:
     other = re.compile(r"(?:^|_)(least|most|fewest|farthest|longest|shortest|largest|smallest)(?:_|$)", re.IGNORECASE)
     for path in MODULES:
         for node in parsed(path).body:
-            targets = (
-                node.targets
-                if isinstance(node, ast.Assign)
-                else [node.target]
-                if isinstance(node, ast.AnnAssign)
-                else []
-            )
-            for target in (item for each in targets for item in ast.walk(each) if isinstance(item, ast.Name)):
+            sides = getattr(node, "targets", [getattr(node, "target", None)])
+            for target in (item for each in sides if each for item in ast.walk(each) if isinstance(item, ast.Name)):
                 assert not other.search(target.id), f"{module_name(path)}.{target.id}: say MIN_ or MAX_"
     for settings in (kind for name in COMPONENTS for kind in (COMPONENTS[name].settings_type, node_settings(name))):
         assert not [info.name for info in settings.describe() if other.search(info.name.replace(".", "_"))]

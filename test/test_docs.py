@@ -23,6 +23,7 @@ from flowing_puppet_ros.body.search.particles import states_to_particles
 from flowing_puppet_ros.body.search.schedule import four_stages
 from flowing_puppet_ros.cli import VERBS
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
+from flowing_puppet_ros.image.networks.files import FILES
 from flowing_puppet_ros.stream.components.registry import COMPONENTS
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -57,6 +58,14 @@ def test_every_verb_module_and_message_has_its_section(written: Path) -> None:
         assert f"## `{path.stem}`" in messages
     for path in (ROOT / "flowing_puppet_ros" / "inference").glob("[a-z]*.py"):
         assert f"automodule:: flowing_puppet_ros.inference.{path.stem}" in (written / "api/inference.md").read_text()
+
+
+def test_every_network_that_is_installed_has_a_card_that_says_where_it_is_from(written: Path) -> None:
+    cards = (written / "cards.md").read_text().split("\n## ")
+    for network in FILES:
+        (card,) = (card for card in cards if network.file in card)
+        said = (network.sha256, network.requirement, *network.members, "Apache-2.0, Google", "### Limits")
+        assert [word for word in said if word not in card] == []
 
 
 def test_pages_that_did_not_change_are_not_written_again(written: Path) -> None:

@@ -190,7 +190,8 @@ def model_cards() -> Iterator[tuple[str, str]]:
     cards = sorted((PACKAGE / "weights").glob("*.md"))
     shifted = [re.sub(r"^(#+) ", r"#\1 ", card.read_text().strip(), flags=re.MULTILINE) for card in cards]
     heading = (
-        "# Model cards\n\nThe learned models that ship in the package, `flowing_puppet_ros/weights`. "
-        "`flowing-puppet learn` reproduces all of them.\n"
+        "# Model cards\n\nThe learned models that ship in the package, `flowing_puppet_ros/weights`, which "
+        "`flowing-puppet learn` reproduces, and the two keypoint networks, BlazePose and MoveNet, which "
+        "`flowing-puppet networks --install` takes from the package index.\n"
     )
     yield "cards.md", heading + "\n" + "\n\n".join(shifted) + "\n"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Puppets for the page: a new one, the outline of a posed one, and one propagated by the flow from the image before."""
+"""Puppets for the page: a new one, those found in the image, the outline of one, and one moved by the flow."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ from flowing_puppet_ros.annotate.store import Person
 from flowing_puppet_ros.arrays import U8
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import OpticalFlow
-from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.detector.part_detector import DEFAULT_SETTINGS, PartDetector
+from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
+from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order
 from flowing_puppet_ros.model.ds.shape import View
 
+MIN_PROBABILITY = 0.3  # of a person whom the own detector finds
 START_HEIGHT_SHARE = 0.9  # of the image, covered by a new puppet's trunk, head and arms
 
 
@@ -37,6 +40,33 @@ def make_person(parts: int, gender: str, view: View, size: tuple[int, int]) -> P
     scale = START_HEIGHT_SHARE * float(min(np.array(size) / (high - low + 0.3)))
     placed = (joints - (low + high) / 2) * scale + np.array(size) / 2
     return {"joints": [[*map(float, joint), 1] for joint in placed], "gender": gender, "view": view}
+
+
+def find_people(parts: int, image: U8, networks: KeypointSource | None) -> list[Person]:
+    """Find people in an image (H, W, 3) as a first guess, by `networks` or else the package's own detector.
+
+    Joints that nobody saw are where the model puts them, marked as not visible.
+    """
+    model = load_model("neutral", parts)
+    people: list[Person] = []
+    for keypoints in _detect(image, networks):
+        joints, confidence = joints_from_keypoints(model, keypoints)
+        known = np.isfinite(joints).all(axis=1)
+        try:
+            scale, view = model.estimate_scale(joints, confidence), model.estimate_view(joints, confidence)
+            placed = model.complete_joints(joints, confidence, scale, view)
+        except InputError:
+            continue
+        rows = [[*map(float, xy), int(seen)] for xy, seen in zip(placed, known, strict=True)]
+        people.append({"joints": rows, "gender": "neutral", "view": view})
+    return people
+
+
+def _detect(image: U8, networks: KeypointSource | None) -> list[Keypoints]:
+    if networks is not None:
+        return [person.keypoints for person in networks.find(image)]
+    found = PartDetector.load().detect(image, DEFAULT_SETTINGS)
+    return [person.keypoints for person in found if person.confidence >= MIN_PROBABILITY]
 
 
 def draw_outline(parts: int, person: Person) -> dict[str, Any]:

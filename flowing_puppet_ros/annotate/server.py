@@ -19,6 +19,7 @@ from flowing_puppet_ros.annotate.folder import ImageFolder
 from flowing_puppet_ros.annotate.store import GENDERS, VIEWS, AnnotationStore, ConflictError, check_people
 from flowing_puppet_ros.draw.palette import joint_colour, part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 
 MAX_REQUEST_BYTES = 1_000_000  # of a body
 POLICY = (
@@ -34,16 +35,27 @@ HEADERS = {
 }
 
 
-def make_app(folder: ImageFolder, store: AnnotationStore, parts: int, hosts: tuple[str, ...]) -> Flask:
+def make_app(
+    folder: ImageFolder,
+    store: AnnotationStore,
+    parts: int,
+    hosts: tuple[str, ...],
+    networks: KeypointSource | None = None,
+) -> Flask:
     """Build the application for a folder and its annotations.
 
-    `parts` is the number of parts of the puppets (10 or 14), `hosts` are the names (host:port) that requests may use.
+    Args:
+        folder: the images.
+        store: their annotations.
+        parts: of the puppets, 10 or 14.
+        hosts: names (host:port) that requests may use.
+        networks: find people as a first guess; without them the package's own detector does.
     """
     app = Flask(__name__, static_folder="page", static_url_path="/page")
     app.config["MAX_CONTENT_LENGTH"] = MAX_REQUEST_BYTES
     _guard(app, hosts)
     _serve_pages(app, folder, store, parts)
-    _serve_puppets(app, folder, store, parts)
+    _serve_puppets(app, folder, store, parts, networks)
     return app
 
 
@@ -109,7 +121,9 @@ def _serve_pages(app: Flask, folder: ImageFolder, store: AnnotationStore, parts:
             return _make_download(path.read_bytes(), "sticks.txt")
 
 
-def _serve_puppets(app: Flask, folder: ImageFolder, store: AnnotationStore, parts: int) -> None:
+def _serve_puppets(
+    app: Flask, folder: ImageFolder, store: AnnotationStore, parts: int, networks: KeypointSource | None
+) -> None:
     @app.get("/api/annotation")
     def annotation() -> Response:
         key = _check_key(folder, request.args.get("key", ""))
@@ -142,6 +156,14 @@ def _serve_puppets(app: Flask, folder: ImageFolder, store: AnnotationStore, part
         if gender not in GENDERS or view not in VIEWS:
             raise InputError(f"there is no puppet {gender!r} seen from {view!r}")
         return jsonify(puppets.make_person(parts, gender, view, (width, height)))
+
+    @app.post("/api/find")
+    def find() -> Response:
+        image = folder.load_image(_check_key(folder, _request_object().get("key")))
+        people = puppets.find_people(parts, image, networks)
+        if not people:
+            raise InputError("nobody is found in this image: add a puppet by hand")
+        return jsonify(people=people)
 
     @app.post("/api/carry")
     def carry() -> Response:

@@ -5,39 +5,81 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Any
 
 from flowing_puppet_ros.bag.reader import Bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.component import base_topic, is_compressed_depth_topic
-from flowing_puppet_ros.stream.messages.compressed_depth import source_encoding
+from flowing_puppet_ros.stream.messages.compressed_depth import decode_compressed_depth, source_encoding
 from flowing_puppet_ros.stream.messages.images import is_depth_encoding
-from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, IMAGE
 
 PREFERRED_NAMES = ("depth", "image_rect", "image_rect_raw", "image_raw")
 """Names of depth images in order of preference within a namespace: the driver's rectified one comes first."""
 
 
-def read_encodings(bag: Bag) -> dict[str, str]:
-    """Return topic -> encoding of its first readable message, for raw images and compressed depth."""
-    found: dict[str, str] = {}
+@dataclass(frozen=True, slots=True)
+class ImageSample:
+    """Encoding, frame and (width, height) of the first readable image on a topic; (0, 0) if it is not decoded."""
+
+    encoding: str
+    frame: str = ""
+    size: tuple[int, int] = (0, 0)
+
+    @property
+    def description(self) -> str:
+        """Size and frame for a sentence."""
+        return f"{self.size[0]}x{self.size[1]}, frame {self.frame!r}"
+
+
+@dataclass(frozen=True, slots=True)
+class DepthTopic:
+    """The topic of depth images and that of the camera_info that belongs to them."""
+
+    image: str
+    info: str
+
+
+def read_samples(bag: Bag) -> dict[str, ImageSample]:
+    """Return topic -> its first readable image, for raw images and for compressed ones that hold depth."""
+    found: dict[str, ImageSample] = {}
     for name, topic in bag.details.items():
-        if not topic.count or not (
-            topic.type == IMAGE or (topic.type == COMPRESSED_IMAGE and is_compressed_depth_topic(name))
-        ):
+        if not topic.count or topic.type not in (IMAGE, COMPRESSED_IMAGE):
             continue
         for record in bag.messages([name]):
             with suppress(InputError):
-                found[name] = image_encoding(name, record.message)
+                if sample := _read_sample(name, record.message):
+                    found[name] = sample
                 break
     return found
+
+
+def _read_sample(topic: str, message: Any) -> ImageSample | None:
+    encoding, frame = image_encoding(topic, message), message.header.frame_id.lstrip("/")
+    if hasattr(message, "format") and not holds_depth(topic, encoding):
+        return None
+    try:
+        return ImageSample(encoding, frame, read_size(message))
+    except InputError:  # a later message may be whole
+        return ImageSample(encoding, frame)
+
+
+def read_size(message: Any) -> tuple[int, int]:
+    """Return width and height of an Image or of a compressed depth image; InputError if that cannot be decoded."""
+    if not hasattr(message, "format"):
+        return int(message.width), int(message.height)
+    height, width = decode_compressed_depth(message).shape
+    return width, height
 
 
 def image_encoding(topic: str, message: Any) -> str:
     """Return the encoding of an Image, or of the depth image in a CompressedImage; empty for other messages."""
     if not hasattr(message, "format"):
         return str(message.encoding)
-    return source_encoding(message.format) if is_compressed_depth_topic(topic) else ""
+    encoding = source_encoding(message.format)
+    as_picture = "depth" in topic.lower() and is_depth_encoding(encoding)
+    return encoding if is_compressed_depth_topic(topic) or as_picture else ""
 
 
 def holds_depth(topic: str, encoding: str) -> bool:
@@ -46,39 +88,93 @@ def holds_depth(topic: str, encoding: str) -> bool:
 
 
 def select_depth_topics(
-    topics: Mapping[str, str], encoded: Mapping[str, str], clouds: Collection[str]
-) -> tuple[list[str], list[str]]:
+    samples: Mapping[str, ImageSample], infos: Mapping[str, Any], clouds: Collection[str]
+) -> tuple[list[DepthTopic], list[str]]:
     """Return the topics of depth images to fit bodies to, and notes on those that are left out.
 
-    `topics` is name -> type, `encoded` image topic -> encoding, and `clouds` are the cloud topics that bodies are
-    fitted to already. The encoding alone does not distinguish depth from heat or confidence, so the name has to
-    contain "depth". At most one topic per namespace is selected, which needs a camera_info beside it, and none if the
-    camera's points were recorded too. The name is that of the raw image even if only `compressedDepth` was recorded.
+    `samples` is image topic -> first image, `infos` topic -> first CameraInfo, and `clouds` are the cloud topics that
+    bodies are fitted to already. The encoding alone does not distinguish depth from heat or confidence, so the name has
+    to contain "depth". At most one topic per namespace is selected, and none if the camera's points were recorded too.
+    The name is that of the raw image even if only `compressedDepth` was recorded.
     """
-    chosen: dict[str, str] = {}
+    chosen: dict[str, DepthTopic] = {}
     notes = []
-    for recorded in sorted(encoded, key=_preference):
+    for recorded in sorted(samples, key=_preference):
+        sample = samples[recorded]
         topic = base_topic(recorded)
         namespace = topic.rpartition("/")[0]
-        info = f"{namespace}/camera_info"
-        if not holds_depth(recorded, encoded[recorded]) or namespace in chosen:
+        if not holds_depth(recorded, sample.encoding) or namespace in chosen:
             continue
         points = [cloud for cloud in clouds if _is_same_camera(namespace, cloud)]
         if "depth" not in topic.lower():
-            if topics.get(info) == CAMERA_INFO:
+            if f"{namespace}/camera_info" in infos:
                 notes.append(
-                    f"{topic} holds {encoded[recorded]} images and may be depth: --topic-map "
+                    f"{topic} holds {sample.encoding} images and may be depth: --topic-map "
                     f"{topic}:={namespace}/depth fits bodies to it"
                 )
-        elif topics.get(info) != CAMERA_INFO:
-            notes.append(
-                f"no body is fitted to the depth images on {topic}: there is no {info}; --topic-map renames one"
-            )
         elif points:
             notes.append(f"bodies are fitted to the points on {points[0]}, not to the depth images on {topic} too")
         else:
-            chosen[namespace] = topic
-    return sorted(chosen.values()), notes
+            info, note = _choose_info(topic, sample, infos)
+            notes += [note] if note else []
+            if info:
+                # An image that was compressed as a picture keeps the name of its own topic.
+                whole = recorded if recorded.endswith("/compressed") else topic
+                chosen[namespace] = DepthTopic(whole, info)
+    return sorted(chosen.values(), key=lambda depth: depth.image), notes
+
+
+def find_info(topic: str, frame: str, size: tuple[int, int], infos: Mapping[str, Any]) -> str:
+    """Return the topic of the camera_info (of `infos`) of images: beside them, or of the same frame and size; or "".
+
+    Depth that is registered to colour has the frame of the colour camera, whose namespace often has the only
+    camera_info. Of several, the one whose name has most in common with the images' is taken. The one beside the images
+    is taken too if no other fits better, whatever its size.
+    """
+    beside = f"{topic.rpartition('/')[0]}/camera_info"
+    if beside in infos and _info_size(infos[beside]) in (size, (0, 0)):
+        return beside
+    fitting = [
+        name
+        for name, info in infos.items()
+        if _info_size(info) == size and info.header.frame_id.lstrip("/") == frame.lstrip("/") != ""
+    ]
+    return max(fitting, key=lambda name: (_count_common(name, topic), name), default=beside if beside in infos else "")
+
+
+def _choose_info(topic: str, sample: ImageSample, infos: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the camera_info topic of depth images, or "", and what is to be said about it, or ""."""
+    beside = f"{topic.rpartition('/')[0]}/camera_info"
+    found = find_info(topic, sample.frame, sample.size, infos)
+    if found == beside:
+        return found, ""
+    if found:
+        return found, f"the camera_info of the depth images on {topic} is taken from {found} ({sample.description})"
+    note = f"no body is fitted to the depth images on {topic} ({sample.description}): there is no {beside}"
+    if not infos:
+        return "", f"{note}, nor any other camera_info; record it with the images"
+    listed = ", ".join(
+        f"{name} ({info.width}x{info.height}, frame {info.header.frame_id!r})" for name, info in sorted(infos.items())
+    )
+    first = min(infos, key=lambda name: (-_count_common(name, topic), name))
+    return (
+        "",
+        f"{note}, and no camera_info of that size and frame but {listed}; --topic-map {first}:={beside} takes one",
+    )
+
+
+def _info_size(info: Any) -> tuple[int, int]:
+    return int(info.width), int(info.height)
+
+
+def _count_common(first: str, second: str) -> int:
+    """Return how many words two topics have in common from the start."""
+    count = 0
+    for left, right in zip(first.split("/"), second.split("/"), strict=False):
+        if left != right:
+            break
+        count += 1
+    return count
 
 
 def _preference(topic: str) -> tuple[int, str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from flowing_puppet_ros.bag.depth_topics import holds_depth, read_samples
 from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
@@ -73,7 +74,7 @@ class BagFrames:
 def open_bag_frames(
     path: Path, topic: str = "", salvage: bool = False, warn: Callable[[str], None] = lambda sentence: None
 ) -> BagFrames:
-    """Open the images on `topic`, or on the first image topic whose namespace has detections.
+    """Open the images on `topic`, or on the first image topic whose namespace has detections, or on the first at all.
 
     `salvage` reads what is whole of a truncated file; `warn` is called for every unusable message. InputError if there
     is no such topic (it lists the image topics) or the topic has no messages.
@@ -92,7 +93,7 @@ def open_bag_frames(
         ]
         detected = {name.removesuffix("/detections"): name for name in people_topics}
         chosen = [topic] if topic else [name for name in images if _camera_namespace(name) in detected]
-        chosen = chosen or images
+        chosen = chosen or _leave_out_depth(bag, images)
         if not chosen or chosen[0] not in images:
             listed = ", ".join(images) or "none"
             raise InputError(f"{path} has no images on {topic or 'any topic'}; its image topics are: {listed}")
@@ -108,6 +109,13 @@ def open_bag_frames(
     span = (max(stamps) - min(stamps)) * 1e-9
     fps = (len(stamps) - 1) / span if span > 0 else 0.0
     return BagFrames(path, chosen[0], people, fps, bag.details[chosen[0]].count, salvage, warn)
+
+
+def _leave_out_depth(bag: Bag, images: list[str]) -> list[str]:
+    """Return the image topics that have messages and hold no depth, or all if there are none."""
+    samples = read_samples(bag)
+    depth = {name for name, sample in samples.items() if holds_depth(name, sample.encoding)}
+    return [name for name in images if bag.details[name].count and name not in depth] or images
 
 
 def _read_usable(bag: Bag, topics: list[str], warn: Callable[[str], None]) -> Iterator[tuple[str, Any]]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from flowing_puppet_ros.bag.depth_topics import holds_depth, select_depth_topics
+from flowing_puppet_ros.bag.depth_topics import DepthTopic, ImageSample, holds_depth, select_depth_topics
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.settings import Settings
@@ -105,7 +105,7 @@ class CameraTopics:
 
 def build_graph(
     topics: Mapping[str, str],
-    encoded: Mapping[str, str],
+    samples: Mapping[str, ImageSample],
     frames: FrameTree,
     infos: Mapping[str, Any],
     settings: Mapping[str, Mapping[str, Any]],
@@ -116,16 +116,15 @@ def build_graph(
     - One tracker per camera.
     - One visual hull of two or more cameras that `frames` connects (`infos`: topic -> its first CameraInfo), and one
       body fitter for its silhouettes.
-    - One body fitter for every topic of clouds or depth images (`encoded`: image topic -> encoding).
+    - One body fitter for every topic of clouds or depth images (`samples`: image topic -> its first image).
 
     `settings` is component name -> setting -> value. Outputs of these components in the recording are not used but
     made again. InputError lists the topics if nothing can be used.
     """
-    cameras = _find_cameras(
-        {name: kind for name, kind in topics.items() if not holds_depth(name, encoded.get(name, ""))}
-    )
+    of_depth = {name for name, sample in samples.items() if holds_depth(name, sample.encoding)}
+    cameras = _find_cameras({name: kind for name, kind in topics.items() if name not in of_depth})
     clouds = [topic for topic, kind in topics.items() if kind == POINT_CLOUD and not topic.endswith("/body_vertices")]
-    depths, depth_notes = select_depth_topics(topics, encoded, clouds)
+    depths, depth_notes = select_depth_topics(samples, infos, clouds)
     if not cameras and not clouds and not depths:
         raise InputError("; ".join([_describe_unusable(topics), *depth_notes]))
     graph = Graph([_make_tracker(camera, topics, settings, factory) for camera in cameras])
@@ -136,11 +135,11 @@ def build_graph(
         if len(calibrated) >= MIN_CAMERAS:
             graph.instances += _make_hull_and_fitter(calibrated, settings, factory)
     made = graph.find_outputs()
-    for topic in (*(cloud for cloud in clouds if cloud not in made), *depths):
-        port = "depth" if topic in depths else "points"
-        fitter = _make_scene_fitter(port, topic, topics, settings, factory)
+    sources: list[str | DepthTopic] = [*(cloud for cloud in clouds if cloud not in made), *depths]
+    for source in sources:
+        fitter = _make_scene_fitter(source, topics, settings, factory)
         if fitter.resolve("bodies") in graph.find_outputs():  # by another cloud in the same namespace
-            fitter.namespace = topic
+            fitter.namespace = f"/{fitter.name.removesuffix('/body_fitter')}"
         graph.instances.append(fitter)
     return graph
 
@@ -262,19 +261,21 @@ def _make_hull_and_fitter(
 
 
 def _make_scene_fitter(
-    port: str,
-    topic: str,
+    source: str | DepthTopic,
     topics: Mapping[str, str],
     settings: Mapping[str, Mapping[str, Any]],
     factory: MessageFactory,
 ) -> Instance:
-    """Return a body fitter whose `port` (points, or depth with the camera_info beside it) is `topic`."""
-    namespace = topic.rpartition("/")[0]
+    """Return a body fitter for a topic of clouds, or for depth images with their camera_info."""
+    remapped = {"points": "", "depth": "", "camera_info": "", "silhouettes": ""}
+    if isinstance(source, DepthTopic):
+        topic = base_topic(source.image)
+        remapped |= {"depth": source.image, "camera_info": source.info}
+    else:
+        topic = source
+        remapped["points"] = source
     fitter = BodyFitterComponent(_make_settings(BodyFitterSettings, "body_fitter", settings), factory)
-    remapped = {"points": "", "depth": "", "camera_info": "", "silhouettes": "", port: topic}
-    if port == "depth":
-        remapped["camera_info"] = f"{namespace}/camera_info"
-    instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, namespace, remapped)
+    instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, topic.rpartition("/")[0], remapped)
     fitter.set_expected("initial", topics.get(instance.resolve("initial")) == BODIES)
     return instance
 

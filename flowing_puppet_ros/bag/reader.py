@@ -1,25 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read rosbag2 bags in log order: folders, single files, files of other writers, and the rest of broken ones."""
+"""Read bags in log order as ROS 2 messages: folders, single files, of other writers, and the rest of broken ones."""
 
 from __future__ import annotations
 
 import heapq
-import re
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 from mcap.reader import make_reader
-from rosbags.interfaces import MessageDefinitionFormat, Qos
-from rosbags.rosbag2 import Reader
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
-from flowing_puppet_ros.bag.mcap_file import McapFile, is_mcap, is_truncated
-from flowing_puppet_ros.bag.typestore import typestore_with
+from flowing_puppet_ros.bag.foreign.convert import Converter
+from flowing_puppet_ros.bag.foreign.ros_types import normalise_type
+from flowing_puppet_ros.bag.foreign.video import VideoImages
+from flowing_puppet_ros.bag.storage.folder import METADATA, RecordingFiles, find_recording
+from flowing_puppet_ros.bag.storage.open_file import open_file
+from flowing_puppet_ros.bag.storage.paths import is_bag as is_bag  # for those who open what it recognises
+from flowing_puppet_ros.bag.storage.stored_file import StoredFile
+from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore, typestore_with
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,135 +56,35 @@ class Topic:
     qos: tuple[dict[str, Any], ...]
 
 
-class _Part(Protocol):
-    """One file of a bag, or a folder with metadata."""
-
-    details: dict[str, Topic]
-
-    def messages(self, topics: set[str]) -> Iterator[Record]:
-        """Yield the messages of some topics in log order."""
-
-    def close(self) -> None:
-        """Close the files."""
-
-
-class _NoIndex(Exception):
-    """Raised when the index does not cover every message."""
-
-
-class _IndexedPart:
-    """A file, or a folder with metadata, that is read by its index."""
-
-    def __init__(self, path: Path) -> None:
-        """Open it; InputError if it is not a bag, _NoIndex if only a scan finds every message in order."""
-        self.path = path
-        try:
-            self._reader = Reader(path)
-            self._reader.open()
-        except Exception as error:  # a damaged file makes the libraries raise anything
-            raise InputError(_describe_unreadable(path)) from error
-        storages = getattr(self._reader.storage, "storages", [self._reader.storage])
-        # Only this reader can read files or messages that are compressed by rosbag2.
-        self.compressed = bool(self._reader.compression_mode)
-        if not self.compressed and not all(map(_is_indexed, storages)):
-            self._reader.close()
-            raise _NoIndex
-        self.details = {
-            c.topic: Topic(
-                c.msgtype, c.msgcount, tuple(_qos_values(q) for q in getattr(c.ext, "offered_qos_profiles", ()))
-            )
-            for c in self._reader.connections
-        }
-
-    def messages(self, topics: set[str]) -> Iterator[Record]:
-        connections = [c for c in self._reader.connections if c.topic in topics]
-        if not connections:
-            return
-        try:
-            for connection, log_time, raw in self._reader.messages(connections):
-                text = connection.msgdef.data if connection.msgdef.format == MessageDefinitionFormat.MSG else ""
-                yield Record(connection.topic, connection.msgtype, log_time, bytes(raw), text)
-        except Exception as error:  # as above; errors of the caller between two messages do not arrive here
-            reason = str(error).rstrip(".") or type(error).__name__
-            raise InputError(f"{self.path} is damaged: {reason}; add --salvage to read the rest") from error
-
-    def close(self) -> None:
-        self._reader.close()
-
-
-class _ScannedPart:
-    """An MCAP file that is read without an index."""
-
-    def __init__(self, path: Path, salvage: bool) -> None:
-        self._file = McapFile(path, salvage)
-        self.details: dict[str, Topic] = {}
-        for number, channel in self._file.channels.items():
-            known = self.details.get(channel.topic)
-            count = self._file.counts[number] + (known.count if known else 0)
-            qos = _parse_qos(channel.metadata.get("offered_qos_profiles", ""))
-            self.details[channel.topic] = Topic(self._file.types[number], count, qos)
-        self.note = ""
-        if salvage:
-            skipped = (
-                f", {self._file.damaged} damaged places ({self._file.skipped_bytes} bytes) passed over"
-                if self._file.damaged
-                else ""
-            )
-            count = sum(topic.count for topic in self.details.values())
-            self.note = f"{path}: {count} messages salvaged{skipped}"
-
-    def messages(self, topics: set[str]) -> Iterator[Record]:
-        numbers = [number for number, channel in self._file.channels.items() if channel.topic in topics]
-        for number, log_time, raw in self._file.messages(numbers):
-            file = self._file
-            yield Record(
-                file.channels[number].topic, file.types[number], log_time, raw, file.definitions.get(number, "")
-            )
-
-    def close(self) -> None:
-        pass
-
-
 class Bag:
     """An open bag, used as a context manager; messages are streamed, not kept.
 
-    `notes` says what was salvaged; `compressed` is True if rosbag2 compressed the files or the messages.
+    `details` are the topics by name. `notes` say what was salvaged, and where files and metadata.yaml disagree.
     """
 
-    def __init__(self, path: Path, files: Collection[Path], salvage: bool = False) -> None:
-        """Open the `files` (or the folder with metadata) of the bag `path`."""
+    def __init__(self, path: Path, recording: RecordingFiles, salvage: bool = False) -> None:
+        """Open the files of the `recording`, which are those of the bag `path`."""
         self.path = path
-        self.notes: list[str] = []
-        self._parts: list[_Part] = []
+        self.notes: list[str] = list(recording.notes)
+        self._files: list[StoredFile] = []
+        self._converters: list[list[Converter]] = []
+        self.details: dict[str, Topic] = {}
         try:
-            for file in files:
-                self._parts.append(self._open_part(file, salvage))
+            for part in recording.files:
+                self._files.append(open_file(part, salvage))
         except BaseException:
             self.close()
             raise
-        self.compressed = any(getattr(part, "compressed", False) for part in self._parts)
-        self.details: dict[str, Topic] = {}
-        for part in self._parts:
-            for name, topic in part.details.items():
-                known = self.details.get(name)
-                self.details[name] = Topic(topic.type, topic.count + (known.count if known else 0), topic.qos)
-
-    def _open_part(self, path: Path, salvage: bool) -> _Part:
-        lone = path.is_file() and path.suffix != ".db3" and is_mcap(path)
-        if lone and is_truncated(path) and not salvage:
-            raise InputError(f"{path} is cut off before its end: add --salvage to read what is whole")
-        if lone and salvage:
-            scanned = _ScannedPart(path, salvage)
-            if not sum(topic.count for topic in scanned.details.values()) and is_truncated(path):
-                raise InputError(f"{path} is cut off so early that it has no whole message")
-            self.notes.append(scanned.note)
-            return scanned
-        try:
-            return _IndexedPart(path)
-        except (InputError, _NoIndex):
-            if not lone:
-                raise
-            return _ScannedPart(path, salvage=False)
+        store, factory = typestore(), BagMessageFactory()
+        for file in self._files:
+            self.notes += file.notes
+            self._converters.append([Converter(topic, store, factory) for topic in file.topics])
+            for topic, converter in zip(file.topics, self._converters[-1], strict=True):
+                known = self.details.get(topic.topic)
+                count = topic.count + (known.count if known else 0)
+                self.details[topic.topic] = Topic(converter.type, count, topic.qos)
+        for topic in recording.listed_topics:
+            self.details.setdefault(topic.topic, Topic(normalise_type(topic.type), 0, topic.qos))
 
     @property
     def topics(self) -> dict[str, str]:
@@ -190,9 +92,23 @@ class Bag:
         return {name: topic.type for name, topic in self.details.items()}
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[Record]:
-        """Yield the messages of `topics` (all by default) in the order of their log times."""
+        """Yield the messages of `topics` (all by default) in the order of their log times.
+
+        An image of a video whose decoder waits for later ones comes with the time of the packet that completes it.
+        """
         chosen = set(self.details if topics is None else topics)
-        yield from heapq.merge(*(part.messages(chosen) for part in self._parts), key=lambda record: record.log_time)
+        files = zip(self._files, self._converters, strict=True)
+        merged = heapq.merge(*(_read(*one, chosen) for one in files), key=lambda record: record.log_time)
+        video, last = VideoImages(typestore(), BagMessageFactory()), 0
+        for record in merged:
+            if record.type != COMPRESSED_IMAGE:
+                yield record
+                continue
+            last = record.log_time
+            for raw in video.decode(record.topic, record.raw):
+                yield record if raw is record.raw else replace(record, raw=raw)
+        for topic, raw in video.flush():
+            yield Record(topic, COMPRESSED_IMAGE, last, raw)
 
     def read_metadata(self, name: str) -> dict[str, str]:
         """Return the texts that `BagWriter.add_metadata` stored under this name; empty if there are none."""
@@ -212,8 +128,8 @@ class Bag:
 
     def close(self) -> None:
         """Close the files."""
-        while self._parts:
-            self._parts.pop().close()
+        while self._files:
+            self._files.pop().close()
 
     def __enter__(self) -> Self:
         return self
@@ -224,60 +140,23 @@ class Bag:
         self.close()
 
 
+def _read(file: StoredFile, converters: Sequence[Converter], topics: Collection[str]) -> Iterator[Record]:
+    """Yield the messages of some topics of a file in log order, as ROS 2 messages."""
+    chosen = [index for index, topic in enumerate(file.topics) if topic.topic in topics]
+    for index, log_time, raw in file.messages(chosen) if chosen else ():
+        converter = converters[index]
+        yield Record(file.topics[index].topic, converter.type, log_time, converter.convert(raw), converter.definition)
+
+
 def open_bag(path: Path | str, salvage: bool = False) -> Bag:
     """Open a bag for reading; InputError if it is missing, not a bag, cut off or damaged.
 
-    With `salvage`, the MCAP files of a broken bag are read as far as possible.
+    A bag is a file (MCAP, database of rosbag2, ROS 1 bag, any of them compressed) or the folder of one recording. With
+    `salvage`, a broken one is read as far as possible.
     """
     path = Path(path)
     if not path.exists():
         raise InputError(f"there is no bag {path}")
-    if not path.is_dir():
-        return Bag(path, [path], salvage)
-    files = sorted(path.glob("*.mcap"), key=_natural_order) or sorted(path.glob("*.db3"), key=_natural_order)
-    complete = (path / "metadata.yaml").exists()
-    if not complete and not files:
-        raise InputError(f"the folder {path} is not a bag: it has no metadata.yaml and 0 bag files")
-    # A recorder that was killed leaves no metadata, or metadata of a file that is cut off.
-    if files and (not complete or any(is_truncated(file) for file in files)):
-        return Bag(path, files, salvage)
-    try:
-        bag = Bag(path, [path])
-    except _NoIndex:
-        return Bag(path, files, salvage)
-    if salvage and files and not bag.compressed:
-        bag.close()
-        return Bag(path, files, salvage)
-    return bag
-
-
-def _natural_order(path: Path) -> list[Any]:
-    """Return the key that sorts the second file of a split bag before the tenth."""
-    return [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", path.name)]
-
-
-def _is_indexed(storage: Any) -> bool:
-    """Return whether a file is a database, or an MCAP file whose chunks are all indexed."""
-    chunks = getattr(storage, "chunks", None)
-    return chunks is None or (bool(chunks) and all(chunk.channel_count for chunk in chunks))
-
-
-def _describe_unreadable(path: Path) -> str:
-    return f"{path} is not a readable ROS 2 bag (.mcap, .db3, or a folder with metadata.yaml)"
-
-
-def _qos_values(profile: Qos) -> dict[str, Any]:
-    values: dict[str, Any] = {}
-    for name, value in profile._asdict().items():
-        if hasattr(value, "sec"):
-            values[name] = {"sec": value.sec, "nsec": value.nsec}
-        else:
-            values[name] = value.name.lower() if hasattr(value, "name") else value
-    return values
-
-
-def _parse_qos(text: str) -> tuple[dict[str, Any], ...]:
-    try:
-        return tuple(dict(item) for item in YAML(typ="safe").load(text) or ())
-    except (YAMLError, TypeError, ValueError):
-        return ()
+    if path.name == METADATA:
+        path = path.parent
+    return Bag(path, find_recording(path) if path.is_dir() else RecordingFiles([path]), salvage)

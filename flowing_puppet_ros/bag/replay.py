@@ -17,10 +17,13 @@ from typing import Any
 from tqdm import tqdm
 
 from flowing_puppet_ros import __version__
-from flowing_puppet_ros.bag.depth_topics import read_encodings
-from flowing_puppet_ros.bag.graph import Instance, build_graph, find_info_topics
+from flowing_puppet_ros.bag.depth_topics import read_samples
+from flowing_puppet_ros.bag.foreign.static_frames import find_static_transforms
+from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Instance, build_graph, find_info_topics
 from flowing_puppet_ros.bag.reader import Bag, Record, open_bag
-from flowing_puppet_ros.bag.typestore import BagMessageFactory
+from flowing_puppet_ros.bag.stuck_stamps import StuckStamps
+from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
+from flowing_puppet_ros.bag.unused import count_used, explain_unused
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.component import Output, Port
@@ -73,7 +76,8 @@ def replay(source: Path, target: Path, options: ReplayOptions | None = None) -> 
     """Replay the bag `source` into the bag `target` and return a summary that JSON can hold.
 
     `target` is one file if its name ends in .mcap, otherwise a folder. InputError if the source cannot be read or has
-    no usable topic. What a component cannot use is counted, and each reason is one of the summary's `warnings`.
+    no usable topic. What a component cannot use is counted, and each reason is one of the summary's `warnings`. If no
+    message at all was used, `unused` has the reason of each topic.
     """
     options = options or ReplayOptions()
     if source.exists() and source.resolve() in (target.resolve(), target.parent.resolve()):
@@ -97,6 +101,7 @@ class _Replay:
         self._new_name = _rename_topics(bag.topics, options.topic_map)
         self._factory = BagMessageFactory()
         self.warnings: list[str] = list(bag.notes)
+        self._stuck = StuckStamps()
         topics = {self._new_name[name]: kind for name, kind in bag.topics.items()}
         unknown = sorted(set(options.topic_map) - set(bag.topics))
         if unknown:
@@ -106,16 +111,19 @@ class _Replay:
             raise InputError(f"--topic-map gives two topics the name {new}: choose another name")
         self._static = self._read_static_transforms(topics)
         infos = self._read_first_infos(topics)
-        encoded = {self._new_name[name]: encoding for name, encoding in read_encodings(bag).items()}
+        self._static += self._find_fixed_frames(topics, infos)
+        samples = {self._new_name[name]: sample for name, sample in read_samples(bag).items()}
         self._graph = build_graph(
-            topics, encoded, self._build_frame_tree(), infos, self._collect_settings(), self._factory
+            topics, samples, self._build_frame_tree(), infos, self._collect_settings(), self._factory
         )
         self.warnings += self._graph.notes
-        recorded = {self._new_name[name]: detail.type for name, detail in bag.details.items() if detail.count}
-        self._routes = self._graph.find_routes(recorded)
+        self._recorded = {self._new_name[name]: detail for name, detail in bag.details.items()}
+        self._routes = self._graph.find_routes(
+            {name: detail.type for name, detail in self._recorded.items() if detail.count}
+        )
         self._outputs = self._graph.find_outputs()
         copied = {self._new_name[name] for name, kind in bag.topics.items() if kind in _COPIED_TYPES}
-        self._copied = copied - set(self._outputs)
+        self._copied = (copied | {self._new_name[record.topic] for record in self._static}) - set(self._outputs)
         for instance in self._graph.instances:
             for port in instance.component.outputs:
                 if port.lazy:
@@ -139,6 +147,38 @@ class _Replay:
             topics, lambda name: name == STATIC_TRANSFORMS and topics[name] == TRANSFORMS
         )
         return list(self._bag.messages(names)) if names else []
+
+    def _find_fixed_frames(self, topics: Mapping[str, str], infos: Mapping[str, Any]) -> list[Record]:
+        """Return the transforms that never change of cameras whose frames /tf_static does not connect, as its message.
+
+        Only several cameras need them, so the other recordings are not searched.
+        """
+        frames = self._build_frame_tree()
+        cameras = {info.header.frame_id.lstrip("/") for info in infos.values()}
+        with suppress(InputError):
+            if len(cameras) < MIN_CAMERAS or all(frames.find_root(frame) != frame for frame in cameras):
+                return []
+        names = self._find_recorded_topics(
+            topics, lambda name: name != STATIC_TRANSFORMS and topics[name] == TRANSFORMS
+        )
+        fixed = [
+            item
+            for item in find_static_transforms(self._read_usable(names))
+            if frames.find_root(child := item.child_frame_id.lstrip("/")) == child
+        ]
+        if not fixed:
+            return []
+        children = ", ".join(item.child_frame_id for item in fixed)
+        self.warnings.append(f"the frames {children} on {', '.join(names)} never move: they are used as static")
+        raw = typestore().serialize_cdr(self._factory.make(TRANSFORMS, transforms=fixed), TRANSFORMS)
+        self._new_name[STATIC_TRANSFORMS] = STATIC_TRANSFORMS
+        time_of_first = self._static[0].log_time if self._static else next(iter(self._bag.messages())).log_time
+        return [Record(STATIC_TRANSFORMS, TRANSFORMS, time_of_first, bytes(raw))]
+
+    def _read_usable(self, names: list[str]) -> Iterator[Any]:
+        for record in self._bag.messages(names) if names else ():
+            with suppress(InputError):
+                yield record.message
 
     def _build_frame_tree(self) -> FrameTree:
         """Return the frames of the static transforms; the replay itself warns of unusable ones."""
@@ -207,6 +247,8 @@ class _Replay:
             if self._new_name[name] in self._copied:
                 qos = "latched" if self._new_name[name] == STATIC_TRANSFORMS else detail.qos
                 writer.add_topic(self._new_name[name], detail.type, qos)
+        if self._static and not writer.has_topic(STATIC_TRANSFORMS):  # found on other topics
+            writer.add_topic(STATIC_TRANSFORMS, TRANSFORMS, "latched")
         for topic, port in self._outputs.items():
             if not port.recorded or port.per_person:
                 continue
@@ -228,9 +270,15 @@ class _Replay:
             if str(error) not in self.warnings:
                 self.warnings.append(str(error))
             return
+        if any(self._needs_time(instance, port) for instance, port in routes):
+            self.warnings += self._stuck.advance(topic, record.log_time, message)
         for instance, port in routes:
             named = name_body(instance.resolve(port), topic, message)
             self._emit(writer, log_time, instance, self._handle(instance, port, named))
+
+    def _needs_time(self, instance: Instance, port: str) -> bool:
+        """Return whether messages of an input must follow one another in time; not if partners have their stamps."""
+        return port in ("points", "depth") and instance.resolve("initial") not in self._recorded
 
     def _handle(self, instance: Instance, port: str, message: Any) -> Output:
         return self._run_timed(instance, lambda: instance.component.handle(port, message))
@@ -291,6 +339,7 @@ class _Replay:
             "frames_per_second": round(frames / seconds, 2),
             "seconds_of": {instance.name: round(instance.seconds, 2) for instance in instances},
             "messages": dict(counts),
+            **({} if count_used(instances) else {"unused": explain_unused(self._graph, self._recorded, self.warnings)}),
             **self.describe(),
         }
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pose puppets on the images and video frames of a folder, in the browser; the page works without a network.
 
-Every change is saved in FOLDER/annotations.json.
+Every change is saved in FOLDER/annotations.json. "Find people" gives a first guess.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from flowing_puppet_ros.annotate.folder import ImageFolder
 from flowing_puppet_ros.annotate.store import AnnotationStore
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.networks.choice import IMAGE_SIDE_PX, SOURCE_HELP, SOURCES, load_networks
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 
 WILDCARDS = ("", "0.0.0.0", "::")
@@ -26,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--host", default="127.0.0.1", help="address to listen on; any but 127.0.0.1 admits the network [127.0.0.1]"
     )
     parser.add_argument("--port", type=int, default=8008, help="port to listen on, 0 for a free one [8008]")
+    parser.add_argument("--source", default="auto", choices=SOURCES, help=SOURCE_HELP)
     parser.add_argument("--parts", type=int, default=10, choices=(10, 14), help="14 adds hands and feet [10]")
 
 
@@ -45,7 +47,8 @@ def run(arguments: argparse.Namespace) -> int:
     port = listening.getsockname()[1]
     host = f"[{arguments.host}]" if ":" in arguments.host else arguments.host
     names = {host, "localhost"} if host in ("127.0.0.1", "[::1]") else {host}
-    app = make_app(folder, store, arguments.parts, tuple(f"{name}:{port}" for name in sorted(names)))
+    networks = load_networks(arguments.source, IMAGE_SIDE_PX, thorough=True)
+    app = make_app(folder, store, arguments.parts, tuple(f"{name}:{port}" for name in sorted(names)), networks)
     print(f"{len(folder.items)} images; open http://{host}:{port}/ and stop with Ctrl+C", flush=True)
     try:
         waitress.serve(app, sockets=[listening], threads=4, max_request_body_size=MAX_REQUEST_BYTES, _quiet=True)

@@ -27,7 +27,14 @@ from flowing_puppet_ros.image.formats.frame_names import FrameNames
 from flowing_puppet_ros.image.formats.keypoint_files import read_keypoints
 from flowing_puppet_ros.image.formats.tracks_json import DECIMALS, puppet_to_json, write_tracks
 from flowing_puppet_ros.image.formats.video_reader import FOLDER_FPS, IMAGE_SUFFIXES, FrameSource, open_frames
-from flowing_puppet_ros.image.networks.choice import NETWORK_HELP, NOT_INSTALLED, SOURCE_HELP, SOURCES, load_networks
+from flowing_puppet_ros.image.networks.choice import (
+    IMAGE_SIDE_PX,
+    NETWORK_HELP,
+    NOT_INSTALLED,
+    SOURCE_HELP,
+    SOURCES,
+    load_networks,
+)
 from flowing_puppet_ros.image.pose.estimator import PoseEstimator
 from flowing_puppet_ros.image.pose.result import PosedPuppet
 from flowing_puppet_ros.image.pose.settings import PoseSettings
@@ -37,8 +44,6 @@ from flowing_puppet_ros.model.tree import PartTree
 from flowing_puppet_ros.settings import Settings, nested
 from flowing_puppet_ros.threads import one_opencv_thread
 
-IMAGE_SIDE_PX = 320
-"""Longer side of an image as the networks see it: more than in video, where the next image is another chance."""
 GENDERS = ("neutral", "female", "male")
 
 

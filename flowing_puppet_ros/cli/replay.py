@@ -21,10 +21,10 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from flowing_puppet_ros.bag.paths import is_bag
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.storage.paths import is_bag
 from flowing_puppet_ros.cli.batch import runner
-from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.errors import InputError, PuppetError
 
 _OF_NODES_ONLY = ("queue", "image_transport", "autostart", "use_sim_time")
 
@@ -42,7 +42,11 @@ class ReplayJob:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `replay`."""
     parser.add_argument(
-        "inputs", nargs="+", type=Path, metavar="INPUT", help="bag: .mcap, .db3, a rosbag2 folder, or a folder of bags"
+        "inputs",
+        nargs="+",
+        type=Path,
+        metavar="INPUT",
+        help="bag: .mcap, .db3, .bag of ROS 1, a rosbag2 folder, or a folder of bags",
     )
     parser.add_argument(
         "--out",
@@ -119,6 +123,7 @@ def _one(source: Path, arguments: argparse.Namespace, options: ReplayOptions) ->
     finally:
         # The output bag is there, whatever becomes of the report.
         _tell(summary, arguments.json)
+    _check_used(summary)
     return 0
 
 
@@ -131,7 +136,15 @@ def replay_one(source: Path, told: ReplayJob) -> dict[str, Any]:
         _report(source, target, told.reports / f"{name}.html", summary)
     if told.recordings is not None:
         _record(source, target, told.recordings / f"{name}.rrd", summary)
+    _check_used(summary)
     return summary
+
+
+def _check_used(summary: dict[str, Any]) -> None:
+    """Check that something of the bag was used; PuppetError with the reason of each topic otherwise."""
+    if "unused" in summary:
+        reasons = "; ".join(f"{topic}: {reason}" for topic, reason in summary["unused"].items())
+        raise PuppetError(f"nothing in {summary['input']} could be used: {reasons or 'it has no topics'}")
 
 
 def list_files(summary: dict[str, Any]) -> list[Path]:

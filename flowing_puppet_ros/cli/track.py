@@ -20,7 +20,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from flowing_puppet_ros.bag.paths import is_bag
+from flowing_puppet_ros.bag.storage.paths import is_bag
 from flowing_puppet_ros.draw.overlay_video import check_overlay, read_drawn_tracks, write_overlay
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.frame_names import FrameNames, Size
@@ -39,7 +39,7 @@ from flowing_puppet_ros.image.video.clip import (
     track_live,
 )
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-from flowing_puppet_ros.threads import one_opencv_thread
+from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -71,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 # Held for the whole run: OpenCV makes its threads anew each time that their number changes, here at every frame.
 @one_opencv_thread()
+@one_blas_thread()
 def run(arguments: argparse.Namespace) -> int:
     """Track through the whole input and write the tracks."""
     if arguments.live and arguments.method != "smoothed":

@@ -15,6 +15,8 @@ from flowing_puppet_ros.annotate.folder import ImageFolder
 from flowing_puppet_ros.annotate.server import MAX_REQUEST_BYTES, make_app
 from flowing_puppet_ros.annotate.store import AnnotationStore
 from flowing_puppet_ros.cli import main
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.networks.keypoint_networks import FoundPerson
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
@@ -98,6 +100,33 @@ def test_people_are_carried_by_the_flow(client: FlaskClient) -> None:
     moved = (np.array(carried[0]["joints"]) - np.array(person["joints"]))[inside, :2]
     np.testing.assert_allclose(moved, [[3, 0]] * 4, atol=0.7)
     assert carried[0]["gender"] == "female"
+
+
+class Finder:
+    """Finds the mean puppet at 60 px/m, its face unseen, in bright images."""
+
+    def find(self, image: np.ndarray, *_: Any) -> list[FoundPerson]:
+        model = DeformableStructures.load()
+        places = model.mean_joints() * 60.0 + [80.0, 60.0]
+        confidence = np.where(np.array(model.joint_names) == "face", 0.0, 0.9)
+        return [FoundPerson(Keypoints(model.joint_names, places, confidence), 0.9)] if image.mean() > 20 else []
+
+
+def test_people_are_found_as_a_first_guess(tmp_path: Path) -> None:
+    for name, level in (("bright.png", 200), ("dark.png", 0)):
+        cv2.imwrite(str(tmp_path / name), np.full((120, 160, 3), level, np.uint8))
+    folder = ImageFolder(tmp_path)
+    app = make_app(folder, AnnotationStore(folder.root, JOINT_NAMES[10]), 10, (HOST,), Finder())
+    app.config["SERVER_NAME"] = HOST
+    client = app.test_client()
+    (person,) = client.post("/api/find", json={"key": "bright.png"}).get_json()["people"]
+    model = DeformableStructures.load()
+    seen = np.array(model.joint_names) != "face"
+    found = np.array(person["joints"])
+    np.testing.assert_allclose(found[seen, :2], (model.mean_joints() * 60.0 + [80.0, 60.0])[seen], atol=1e-6)
+    assert found[:, 2].tolist() == seen.astype(int).tolist() and person["view"] == "front"
+    nobody = client.post("/api/find", json={"key": "dark.png"})
+    assert nobody.status_code == 400 and "add a puppet by hand" in nobody.get_json()["error"]
 
 
 @pytest.mark.parametrize(("key", "reason"), [("0.png", "none to copy from"), ("1.png", "no one is annotated")])

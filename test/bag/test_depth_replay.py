@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 
+from flowing_puppet_ros.bag.depth_topics import ImageSample
 from flowing_puppet_ros.bag.graph import build_graph
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evaluate.bag.recording import read_recording, to_cloud
 from flowing_puppet_ros.report.data import gather_data
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
-from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.clouds import decode_cloud, make_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import BODIES, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
@@ -93,12 +95,12 @@ def compressed(message: Any) -> Any:
 
 
 def test_a_depth_image_that_was_also_recorded_compressed_is_used_once() -> None:
-    image, info = "/rig/depth/image_rect", "/rig/depth/camera_info"
+    image, info_topic = "/rig/depth/image_rect", "/rig/depth/camera_info"
     packed = f"{image}/compressedDepth"
     for recorded, fed in ({packed: COMPRESSED_IMAGE, image: IMAGE}, image), ({packed: COMPRESSED_IMAGE}, packed):
-        topics = recorded | {info: CAMERA_INFO}
-        encoded = dict.fromkeys(recorded, "16UC1")
-        graph = build_graph(topics, encoded, FrameTree(), {}, {"body_fitter": FAST}, FACTORY)
+        topics = recorded | {info_topic: CAMERA_INFO}
+        samples = dict.fromkeys(recorded, ImageSample("16UC1", "eye", (WIDTH, HEIGHT)))
+        graph = build_graph(topics, samples, FrameTree(), {info_topic: info(0)}, {"body_fitter": FAST}, FACTORY)
         routes = {topic: [port for _, port in found] for topic, found in graph.find_routes(topics).items()}
         assert [topic for topic in recorded if routes.get(topic) == ["depth"]] == [fed]
 
@@ -191,9 +193,96 @@ def test_depth_without_its_calibration_is_told_of(tmp_path: Path) -> None:
     blank = image(0, NOTHING, "16UC1")
     said, made = warnings_of(tmp_path, ("/lidar/points", POINT_CLOUD, cloud), ("/depth/image", IMAGE, blank))
     assert said == [
-        "no body is fitted to the depth images on /depth/image: there is no /depth/camera_info; --topic-map renames one"
+        "no body is fitted to the depth images on /depth/image (320x240, frame 'eye'): there is no /depth/camera_info, "
+        "nor any other camera_info; record it with the images"
     ]
     assert made["/lidar/bodies"] == 1 and "/depth/bodies" not in made
+
+
+def of_camera(frame: str, width: int = WIDTH) -> Any:
+    message = info(0)
+    message.header.frame_id, message.width = frame, width
+    return message
+
+
+@pytest.mark.parametrize("name", ["image_raw", "image_raw/compressedDepth", "image_raw/compressed"])
+def test_registered_depth_takes_the_calibration_of_its_frame_and_size(name: str, tmp_path: Path) -> None:
+    points = np.array([[0.0, 0, 2.0], [0.5, -0.25, 2.0]])
+    seen = image(0, depth_of(points), "16UC1")
+    if "/" in name:
+        seen = compressed(seen)
+    if name.endswith("compressed"):
+        seen.format, seen.data = "16UC1; png compressed ", seen.data[12:]
+    bag = recorded(
+        tmp_path / "in.mcap",
+        [
+            ("/cam/aligned_depth_to_color/" + name, COMPRESSED_IMAGE if "/" in name else IMAGE, seen),
+            ("/cam/color/camera_info", CAMERA_INFO, of_camera("/eye")),
+            ("/cam/depth/camera_info", CAMERA_INFO, of_camera("other_eye")),
+            ("/cam/infra/camera_info", CAMERA_INFO, of_camera("eye", WIDTH // 2)),
+            ("/other/color/camera_info", CAMERA_INFO, of_camera("eye")),
+        ],
+    )
+    options = ReplayOptions(settings={"body_fitter": FAST | {"scene": False}}, progress=False)
+    summary = replay(bag, tmp_path / "out.mcap", options)
+    assert summary["warnings"][0] == (
+        "the camera_info of the depth images on /cam/aligned_depth_to_color/image_raw is taken from "
+        "/cam/color/camera_info (320x240, frame 'eye')"
+    )
+    assert summary["counters"]["cam/aligned_depth_to_color/image_raw/body_fitter"]["clouds"] == 1
+    assert not [text for text in summary["warnings"] if "camera_info says" in text or "no camera_info" in text]
+    with open_bag(bag) as given, open_bag(tmp_path / "out.mcap") as made:
+        recording = read_recording(given, made)
+        recording.cloud_topics["depth"] = f"/cam/aligned_depth_to_color/{name}"
+        cloud = to_cloud(recording, recording.cloud_topics["depth"], next(given.messages([*given.topics][:1])).message)
+    # A pixel is 1 cm at 2 m, and the middle of a pixel counts.
+    np.testing.assert_allclose(sorted(decode_cloud(cloud)[0].tolist()), sorted(points.tolist()), atol=0.006)
+
+
+def test_candidates_are_named_where_no_calibration_fits(tmp_path: Path) -> None:
+    stream = [
+        ("/cam/depth/image_raw", IMAGE, image(0, NOTHING, "16UC1")),
+        ("/cam/color/camera_info", CAMERA_INFO, of_camera("color_eye")),
+        ("/wrist/color/camera_info", CAMERA_INFO, of_camera("eye", 640)),
+    ]
+    with pytest.raises(InputError) as told:
+        replay(recorded(tmp_path / "in.mcap", stream), tmp_path / "out.mcap", ReplayOptions(progress=False))
+    assert (
+        "/cam/color/camera_info (320x240, frame 'color_eye'), /wrist/color/camera_info (640x240, frame 'eye')"
+        in str(told.value)
+    )
+    old, new = str(told.value).rpartition("--topic-map ")[2].split()[0].split(":=")
+    assert (old, new) == ("/cam/color/camera_info", "/cam/depth/camera_info")
+    options = ReplayOptions(topic_map={old: new}, progress=False)
+    assert replay(tmp_path / "in.mcap", tmp_path / "out.mcap", options)["messages"]["/cam/depth/bodies"] == 1
+
+
+def test_a_calibration_of_another_size_beside_the_images_gives_way_to_one_that_fits(tmp_path: Path) -> None:
+    said, made = warnings_of(
+        tmp_path,
+        ("/cam/depth/image", IMAGE, image(0, NOTHING, "16UC1")),
+        ("/cam/depth/camera_info", CAMERA_INFO, of_camera("eye", 424)),
+        ("/cam/color/camera_info", CAMERA_INFO, of_camera("eye")),
+    )
+    assert "is taken from /cam/color/camera_info (320x240, frame 'eye')" in said[0]
+    assert made["/cam/depth/bodies"] == 1
+
+
+def test_stamps_of_the_calibration_that_differ_are_told_of_once(tmp_path: Path) -> None:
+    stream: list[tuple[str, str, Any]] = []
+    for k in range(3):
+        stream += [
+            ("/cam/depth/image", IMAGE, image(k * TENTH, NOTHING, "16UC1")),
+            ("/cam/depth/camera_info", CAMERA_INFO, info(k * TENTH + 30_000_000)),
+        ]
+    summary = replay(recorded(tmp_path / "in.mcap", stream), tmp_path / "out.mcap", ReplayOptions(progress=False))
+    said = [text for text in summary["warnings"] if "camera_info" in text]
+    assert said == [
+        "cam/depth/image/body_fitter: a depth image has no camera_info of its stamp: it is used with one whose stamp "
+        "differs by 30 ms"
+    ]
+    counters = summary["counters"]["cam/depth/image/body_fitter"]
+    assert (counters["clouds"], counters["depth with camera_info of another stamp"]) == (3, 3)
 
 
 def test_a_camera_whose_points_were_recorded_is_not_fitted_twice(tmp_path: Path) -> None:

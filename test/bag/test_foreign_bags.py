@@ -219,10 +219,11 @@ def test_no_damage_is_more_than_a_sentence(kind: str, data: Any, tmp_path_factor
         try:
             with open_bag(path, salvage) as bag:
                 found = [(record.log_time, record.raw) for record in bag.messages()]
+                unverified = any("from a chunk that is cut off" in note for note in bag.notes)
         except InputError as error:
             assert "\n" not in str(error)
             continue
-        if salvage and kind == "chunks":
+        if salvage and kind == "chunks" and not unverified:
             assert set(found) <= ORIGINALS, "what a checksum vouches for is unchanged"
 
 

@@ -64,6 +64,36 @@ def test_static_transforms_count_wherever_they_were_recorded(golden: Any, tmp_pa
     assert len(payload(tmp_path / "out.mcap", "/hull")) == 1
 
 
+@pytest.mark.slow
+def test_fixed_frames_on_tf_are_static(golden: Any, tmp_path: Path) -> None:
+    """As `tf` of ROS 1 publishes them: again and again on /tf, beside frames that move."""
+    moving = FACTORY.make("geometry_msgs/msg/TransformStamped", child_frame_id="wheel")
+    moving.header.frame_id = "cam1_optical_frame"
+    topics = [f"/cam{k}/{name}" for k in (1, 2) for name in ("image/compressed", "detections", "camera_info")]
+    with open_bag(golden.source) as bag, BagWriter(tmp_path / "in.mcap") as writer:
+        (static,) = bag.messages(["/tf_static"])
+        for topic in topics:
+            writer.add_topic(topic, bag.topics[topic], bag.details[topic].qos)
+        writer.add_topic("/tf", static.type)
+        for record in bag.messages(topics):
+            writer.write_raw(record.topic, record.log_time, record.raw)
+            if record.topic == "/cam1/image/compressed":
+                writer.write_raw("/tf", record.log_time, static.raw)
+                moving.transform.translation.x += 0.1
+                writer.write("/tf", record.log_time, FACTORY.make(static.type, transforms=[moving]))
+    out = tmp_path / "out.mcap"
+    summary = replay(
+        tmp_path / "in.mcap", out, ReplayOptions(settings={"visual_hull": {"hull_every": 7}}, progress=False)
+    )
+    (warning,) = summary["warnings"]
+    assert warning.endswith("on /tf never move: they are used as static") and "wheel" not in warning
+    assert len(payload(out, "/hull")) == 1
+    children = [item.child_frame_id for item in static.message.transforms]
+    with open_bag(out) as made:
+        (written,) = made.messages(["/tf_static"])
+        assert [item.child_frame_id for item in written.message.transforms] == children
+
+
 def test_a_salvaged_recording_gives_the_beginning_of_the_whole_one(golden: Any, tmp_path: Path) -> None:
     only = {f"/cam1/{name}": f"/cam1/{name}" for name in ("image/compressed", "detections", "camera_info")}
     whole = excerpt(golden.source, tmp_path / "in.mcap", only)

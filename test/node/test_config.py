@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameter files are what the settings say, and read back as the same values with the same types."""
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 from ruamel.yaml import YAML
@@ -20,13 +22,19 @@ def test_file_is_generated_from_the_settings(name: str) -> None:
     assert (CONFIG / f"{name}.yaml").read_text() == parameter_yaml(name), "run `make config`"
 
 
+def flatten(part: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the values of nested mappings under their dotted names."""
+    for key, value in part.items():
+        if isinstance(value, dict):
+            yield from flatten(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value
+
+
 @pytest.mark.parametrize("name", COMPONENTS)
 def test_values_survive_the_file(name: str) -> None:
     read = YAML(typ="safe").load(parameter_yaml(name))[f"/**/{name}"]["ros__parameters"]
-    flat = {key: value for key, value in read.items() if not isinstance(value, dict)}
-    flat |= {
-        f"{key}.{leaf}": value for key, part in read.items() if isinstance(part, dict) for leaf, value in part.items()
-    }
+    flat = dict(flatten(read))
     infos = [*COMPONENTS[name].settings_type.describe(), *node_settings(name).describe()]
     assert {key: (type(value), value) for key, value in flat.items()} == {
         info.name: (info.type, info.default) for info in infos if not info.advanced

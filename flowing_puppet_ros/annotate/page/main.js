@@ -100,6 +100,7 @@ const deeds = {
   next: () => show(place + 1),
   todo,
   add: () => add(async () => [await server.newPerson(people.key, $("gender").value, $("view").value)]),
+  find: () => add(async () => (await server.find(people.key)).people),
   copy: () => add(async () => (await server.carry(people.key)).people),
   remove: () => people.remove(),
   undo: () => people.undo(),
@@ -127,7 +128,7 @@ const deeds = {
 };
 
 const KEYS = {
-  ArrowLeft: "previous", ArrowRight: "next", n: "todo", a: "add", c: "copy", Delete: "remove", Backspace: "remove",
+  ArrowLeft: "previous", ArrowRight: "next", n: "todo", a: "add", p: "find", c: "copy", Delete: "remove", Backspace: "remove",
   Tab: "choose", "[": "smaller", "]": "larger", v: "seen", f: "flip", g: "gender", "+": "in", "=": "in", "-": "out",
   0: "fit", "?": "help",
 };

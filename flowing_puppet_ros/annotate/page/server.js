@@ -34,6 +34,7 @@ export const save = (key, revision, people, keepalive) =>
   ask("PUT", "/api/annotation", { key, revision, people }, { keepalive });
 export const outline = (person) => ask("POST", "/api/outline", { person });
 export const newPerson = (key, gender, view) => ask("POST", "/api/new", { key, gender, view });
+export const find = (key) => ask("POST", "/api/find", { key });
 export const carry = (key) => ask("POST", "/api/carry", { key });
 
 export async function picture(key) {

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.bag.depth_topics import holds_depth, image_encoding
+from flowing_puppet_ros.bag.depth_topics import find_info, holds_depth, image_encoding, read_size
 from flowing_puppet_ros.bag.reader import Bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.errors import InputError
@@ -183,8 +183,10 @@ def to_cloud(recording: Recording, topic: str, message: Any) -> Any:
     """Convert a message on a sensor's cloud topic to PointCloud2; InputError if a depth image cannot be used."""
     if topic != recording.cloud_topics.get("depth"):
         return message
-    camera = recording.cameras.get(namespace(topic))
-    return make_depth_cloud(BagMessageFactory(), message, camera and camera.info)
+    cameras = {f"{name}/camera_info": camera.info for name, camera in recording.cameras.items()}
+    infos = {name: info for name, info in cameras.items() if info is not None}
+    info = find_info(base_topic(topic), message.header.frame_id, read_size(message), infos)
+    return make_depth_cloud(BagMessageFactory(), message, infos.get(info))
 
 
 def _calibrate_cameras(recording: Recording, frames: FrameTree) -> None:

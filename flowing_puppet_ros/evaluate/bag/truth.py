@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from flowing_puppet_ros.bag.paths import is_bag
-from flowing_puppet_ros.bag.reader import Bag, open_bag
+from flowing_puppet_ros.bag.reader import Bag, is_bag, open_bag
 from flowing_puppet_ros.body.scans.scan_correspondence import find_closest_on_mesh
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bag.recording import Joints, Recording, body_joints, read_recording

@@ -29,22 +29,32 @@ MAX_CROSSED = 0.7  # of the distance of two poses: if that with left and right e
 MIN_WEIGHT = 1e-3
 
 
-def combine(poses: Sequence[NetworkPose], trusts: Sequence[F64], size: float) -> tuple[F64, F64]:
+def combine(networks: Sequence[Sequence[NetworkPose]], trusts: Sequence[F64], size: float) -> tuple[F64, F64]:
     """Return the mean joints (17, 2) px of a person's poses, and their confidence (17,).
 
-    Poses are weighted by their scores and by the `trusts` (17,) in the joints of their networks; `size` is the person's
-    shoulder width px. A single pose has the confidence of its scores alone.
+    Args:
+        networks: the poses by each network, of which there is at least one.
+        trusts: for each network a factor (17,) on the scores of its joints.
+        size: the person's shoulder width, px.
+
+    Poses are weighted by their scores. Two poses by one network agree even when they are wrong: the confidence is how
+    well the means of the networks agree, or the scores alone where there is one network.
     """
-    joints = np.array([pose.joints for pose in poses])
-    scores = np.maximum([pose.scores for pose in poses], MIN_WEIGHT)
-    weight = scores * np.array(trusts)
-    mean = (weight[..., None] * joints).sum(axis=0) / weight.sum(axis=0)[:, None]
-    sure = np.minimum(scores.mean(axis=0) / SURE_SCORE, 1.0)
-    if len(poses) == 1:
+    joints = [np.array([pose.joints for pose in poses]) for poses in networks]
+    scores = [np.maximum([pose.scores for pose in poses], MIN_WEIGHT) for poses in networks]
+    means = [_weighted_mean(*pair) for pair in zip(joints, scores, strict=True)]
+    weight = np.array([own.sum(axis=0) * trust for own, trust in zip(scores, trusts, strict=True)])
+    mean = _weighted_mean(np.array(means), weight)
+    sure = np.minimum(np.concatenate(scores).mean(axis=0) / SURE_SCORE, 1.0)
+    if len(networks) == 1:
         return mean, sure
-    pairs = [joints[i] - joints[k] for i in range(len(poses)) for k in range(i)]
-    apart = np.mean([np.hypot(*pair.T) for pair in pairs], axis=0) / size
+    apart = np.max([np.hypot(*(one - other).T) for one in means for other in means], axis=0) / size
     return mean, np.interp(apart, DISTANCES, PROBABILITIES) * sure
+
+
+def _weighted_mean(joints: F64, weight: F64) -> F64:
+    """Return the mean (17, 2) of joints (N, 17, 2) by their weights (N, 17)."""
+    return np.asarray((weight[..., None] * joints).sum(axis=0) / weight.sum(axis=0)[:, None])
 
 
 def calibrate(confidence: F64) -> F64:

@@ -11,6 +11,8 @@ from flowing_puppet_ros.image.networks.files import FILES, REMEDY, find_file
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointNetworks, KeypointSource
 from flowing_puppet_ros.image.networks.user_network import UserNetwork
 
+IMAGE_SIDE_PX = 320
+"""Longer side of a single image as the networks see it: more than in video, where the next image is another chance."""
 SOURCES = ("auto", "neural", "own")
 SOURCE_HELP = (
     "who finds people: neural, keypoint networks; own, the package's detector; auto, the networks if installed [auto]"

@@ -172,8 +172,9 @@ class KeypointNetworks:
             poses, seen = [*poses, *more], [again, *seen]
         turned = turn_sides([*poses, *seen], None if person.expected is None else person.expected.joints)
         agree = landmarks.presence >= MIN_PRESENCE and pose_distance(turned[-1], turned[0]) <= MAX_LANDMARK_DISTANCE
-        trusts = [np.ones(len(COCO_17))] * len(poses) + [LANDMARK_TRUST] * (len(seen) if agree else 0)
-        joints, confidence = combine(turned[: len(trusts)], trusts, turned[0].size)
+        networks = [turned[: len(poses)], turned[len(poses) :]] if agree else [turned[: len(poses)]]
+        trusts = [np.ones(len(COCO_17)), LANDMARK_TRUST][: len(networks)]
+        joints, confidence = combine(networks, trusts, turned[0].size)
         found = dict(zip(COCO_17, zip(joints, confidence.tolist(), strict=True), strict=True))
         if agree:
             found |= _place_extremities(landmarks, found, crossed=turned[-1] is not seen[-1])

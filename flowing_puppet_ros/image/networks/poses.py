@@ -93,17 +93,27 @@ def cut_square(image: Image, center: F64, half: float, side: int, angle: float =
     shrink = int(step)
     source, towards = image, matrix
     if shrink > 1:
-        height, width = image.shape[0] // shrink, image.shape[1] // shrink
-        if min(height, width) > 0:
-            source = np.asarray(
-                cv2.resize(image[: height * shrink, : width * shrink], (width, height), interpolation=cv2.INTER_AREA)
-            )
-            towards = matrix / shrink
-            towards[:, 2] = (matrix[:, 2] + 0.5) / shrink - 0.5
+        source, origin = _reduce_around(image, matrix, side, shrink)
+        towards = matrix / shrink
+        towards[:, 2] = (matrix[:, 2] - origin + 0.5) / shrink - 0.5
     square = cv2.warpAffine(
         source, towards, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, borderMode=cv2.BORDER_CONSTANT
     )
     return np.asarray(square), Warp(matrix)
+
+
+def _reduce_around(image: Image, matrix: F64, side: int, shrink: int) -> tuple[Image, F64]:
+    """Return what a square shows of an image, reduced by a whole number, and the corner (2,) px of that piece."""
+    corners = np.array([[0, 0], [side, 0], [0, side], [side, side]]) @ matrix[:, :2].T + matrix[:, 2]
+    size = np.array(image.shape[1::-1])
+    low = np.clip(np.floor(corners.min(axis=0)) - shrink, 0, size).astype(int)
+    count = (np.clip(np.ceil(corners.max(axis=0)) + shrink, 0, size).astype(int) - low) // shrink
+    if count.min() <= 0:
+        return image[:1, :1] * 0, low.astype(np.float64)
+    high = low + count * shrink
+    piece = image[low[1] : high[1], low[0] : high[0]]
+    reduced = cv2.resize(piece, (int(count[0]), int(count[1])), interpolation=cv2.INTER_AREA)
+    return np.asarray(reduced), low.astype(np.float64)
 
 
 def fit_to_rectangle(image: Image, size: tuple[int, int]) -> tuple[Image, Warp]:

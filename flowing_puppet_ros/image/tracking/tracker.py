@@ -40,8 +40,12 @@ HIDDEN_CONFIDENCE = 0.3  # share of the confidence that a joint behind a nearer 
 OUTSIDE_CONFIDENCE = 0.1  # ... and one outside of the image
 
 
-type DetectInTracks = Callable[[Sequence[Track]], tuple[Sequence[Keypoints] | None, Collection[str] | None]]
-"""From the tracks in an image to the people detected there (None: no detector ran), and the ids that were searched."""
+type DetectInTracks = Callable[
+    [Sequence[Track], FlowPair | None], tuple[Sequence[Keypoints] | None, Collection[str] | None]
+]
+"""From the tracks in an image, and the flow at working scale from the image before, to the people detected there and
+the ids that were searched. None for the flow: there is no image before, or nobody was tracked in it. None for the
+people: no detector ran."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -167,7 +171,7 @@ class FlowingPuppetTracker:
                 propagation = propagate_tracks(self.model, self.tracks, pair, frame.grid, self.settings)
         self._count_image()
         if detect is not None:
-            detections, searched_ids = detect(self.tracks)
+            detections, searched_ids = detect(self.tracks, pair)
         if detections is not None:
             found = [joints_from_keypoints(self.model, keypoints) for keypoints in detections]
             appearances = self._measure_appearances(image, found)

@@ -225,7 +225,9 @@ class LiveTracker:
         """Track an image, with an ROI re-detection in it where the tracks lead."""
         seen: list[DetectedPerson] = []
 
-        def detect(tracks: Sequence[Track]) -> tuple[list[Keypoints] | None, Collection[str] | None]:
+        def detect(
+            tracks: Sequence[Track], _: FlowPair | None
+        ) -> tuple[list[Keypoints] | None, Collection[str] | None]:
             rois = self._take_rois({track.id: track.mean for track in tracks}) if tracks else {}
             if not rois:
                 return None, None

@@ -80,7 +80,7 @@ class NetworkTracker:
     def reset(self) -> None:
         """Forget the images; everybody is looked for in the next one."""
         self._clock = StreamClock()
-        self._previous: tuple[Image, int] | None = None
+        self._previous_ns: int | None = None
         self._run: _Run | None = None
         self._everybody_ns: int | None = None
         self._looked_ns: dict[str, int] = {}
@@ -99,14 +99,14 @@ class NetworkTracker:
         if not self._clock.advance(image, stamp_ns):
             self.reset()
             self._clock.advance(image, stamp_ns)
-        before = None if self._previous is None else self._previous[1]
+        before = self._previous_ns
         passed = to_ns(self._settings.min_wait) if before is None else self._clock.now_ns - before
         due, self._run = self._run, self._start_run(image, stamp_ns, passed, executor)
         if passed >= to_ns(self._settings.min_wait):
             result = self._track_here(image, stamp_ns, flow)
         else:
             result = self._track(due, image, stamp_ns, flow)
-        self._previous = image, self._clock.now_ns
+        self._previous_ns = self._clock.now_ns
         # The tracker weighs joints by their raw confidence; what is told is a probability.
         told = [
             replace(one, confidence=calibrate(one.confidence / one.visible) * one.visible) for one in result.puppets
@@ -117,7 +117,9 @@ class NetworkTracker:
         """Track an image with what the run on itself finds."""
         run, self._run, self.people = self._run, None, None
 
-        def detect(tracks: Sequence[Track]) -> tuple[list[Keypoints] | None, Collection[str] | None]:
+        def detect(
+            tracks: Sequence[Track], flow: FlowPair | None
+        ) -> tuple[list[Keypoints] | None, Collection[str] | None]:
             if run is None:
                 return None, None
             self.people = run.people.result()
@@ -128,25 +130,22 @@ class NetworkTracker:
     def _track(self, run: _Run | None, image: Image, stamp_ns: int, flow: FlowPair | None) -> TrackResult:
         """Track an image with what a run on the image before has found."""
         self.people = None
-        if run is None or self._previous is None:
-            return self._forget_after_cut(self._tracker.step(image, stamp_ns, None, flow))
-        people = run.people.result()
-        if not self._tracker.tracks:
-            return self._start_tracks(run, people, image, stamp_ns, flow)
-        flow = flow or self._tracker.optical_flow.estimate_at_working_scale(self._previous[0], image)
-        move = partial(propagate_points, flows=[reduce_flow(flow[0])], size=(image.shape[1], image.shape[0]))
-        moved = [replace(person, xy=move(person.xy)) for person in people]
-        result = self._tracker.step(image, stamp_ns, moved, flow, run.searched)
-        if result.restarted:
-            # After a cut the people of the image before it are not there.
-            self._tracker.reset()
-            result = replace(self._tracker.step(image, stamp_ns), warnings=result.warnings, restarted=True)
-        return self._forget_after_cut(result)
+        if run is not None and not self._tracker.tracks:
+            return self._start_tracks(run, image, stamp_ns, flow)
 
-    def _start_tracks(
-        self, run: _Run, people: list[Keypoints], image: Image, stamp_ns: int, flow: FlowPair | None
-    ) -> TrackResult:
+        def detect(
+            tracks: Sequence[Track], flow: FlowPair | None
+        ) -> tuple[list[Keypoints] | None, Collection[str] | None]:
+            if run is None or flow is None:
+                return None, None  # after a cut the people of the image before are not there
+            move = partial(propagate_points, flows=[reduce_flow(flow[0])], size=(image.shape[1], image.shape[0]))
+            return [replace(person, xy=move(person.xy)) for person in run.people.result()], run.searched
+
+        return self._forget_after_cut(self._tracker.step(image, stamp_ns, flow=flow, detect=detect))
+
+    def _start_tracks(self, run: _Run, image: Image, stamp_ns: int, flow: FlowPair | None) -> TrackResult:
         """Start tracks in the image of a run, and track from there to `image`."""
+        people = run.people.result()
         if not people:
             return self._tracker.step(image, stamp_ns, None, flow)
         self._tracker.reset()

@@ -44,6 +44,10 @@ from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 
 OPTICAL = re.compile(r"optical(_frame)?$")
 """Frames that look along z with y down (REP-103)."""
+ASSUMED_INTERVAL_NS = 100_000_000
+"""Between clouds whose stamps do not advance (drivers that stamp nothing)."""
+MIN_CAMERA_DISTANCE_M = 0.1
+MAX_FIELD_OF_VIEW = 1.2  # tangent of half of it: 100 degrees from side to side
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,8 @@ class BodyFitterSettings(SceneSettings):
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     up: str = setting(
         "auto",
-        "axis of the cloud's frame that points up; auto: -y in frames named *optical or *optical_frame, else z",
+        "axis of the cloud's frame that points up; auto: -y in frames named *optical or *optical_frame and for"
+        " clouds without a frame_id that lie ahead along z as those of cameras do, else z",
         choices=("auto", "z", "y", "-y"),
     )
     wait: int = setting(
@@ -92,7 +97,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._fitter = BodyFitter(self._model, settings.fitter)
         self._scene = SceneTracker(self._fitter, settings, self.report)
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
-        self._depth = DepthPairs()
+        self._depth = DepthPairs(self.report)
+        self._up_of_nameless = ""
+        self._clock: tuple[int, int] | None = None
         self._line = PendingQueue()
         self._initial = StampBuffer()
         self._outputs = BodyOutputs(settings.output, settings.ros4hri, factory, self._model)
@@ -109,6 +116,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._depth.reset()
         self._line.clear()
         self._initial.clear()
+        self._up_of_nameless = ""
+        self._clock = None
 
     def flush(self) -> Output:
         """Fit the clouds that still wait."""
@@ -136,16 +145,30 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
         That of a depth image is seen from one side, in an optical frame, whatever its name, whose y axis points down.
         """
-        up = self.settings.up
-        if up == "auto":
-            up = "-y" if of_depth or OPTICAL.search(cloud.header.frame_id) else "z"
-        to_z_up = rotation_to_z_up(parse_axis(up))
         points, normals = decode_cloud(cloud)
         inside = crop_to_region(points, self.settings.region)
         if not inside.all():
             points, normals = points[inside], None if normals is None else normals[inside]
+        to_z_up = rotation_to_z_up(parse_axis(self._find_up(cloud.header.frame_id, points, of_depth)))
         rotated = None if normals is None else normals @ to_z_up.T
         return SceneCloud(points @ to_z_up.T, rotated, stamp_ns(cloud), of_depth), to_z_up
+
+    def _find_up(self, frame: str, points: F64, of_depth: bool) -> str:
+        """Return the axis that is up in a frame; for one without a name the first cloud decides."""
+        if self.settings.up != "auto":
+            return self.settings.up
+        if of_depth or OPTICAL.search(frame):
+            return "-y"
+        if frame or not len(points):
+            return "z"
+        if not self._up_of_nameless:
+            ahead = is_ahead_along_z(points)
+            self._up_of_nameless = "-y" if ahead else "z"
+            self.report.warn(
+                f"the clouds have no frame_id: {self._up_of_nameless} is taken as up, since their points lie "
+                f"{'ahead along z as in the frame of a camera' if ahead else 'around the origin'}; `up` sets it"
+            )
+        return self._up_of_nameless
 
     def _fit_initial(
         self, scene: SceneCloud, to_z_up: F64, initial: Any, seed: int, progress: Progress | None = None
@@ -215,6 +238,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         occluded: list[str] = []
         try:
             scene, to_z_up = self._decode(cloud, of_depth)
+            scene = replace(scene, stamp=self._advance_clock(stamp))
             if initial is not None and initial.bodies:
                 fits = self._fit_initial(scene, to_z_up, initial, self.seed_of(stamp))
             else:
@@ -224,6 +248,17 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             self.report.count_unusable(error)
         self.counters["bodies"] += len(fits)
         return self._outputs.make(cloud.header, fits, occluded, self._subscribed)
+
+    def _advance_clock(self, stamp: int) -> int:
+        """Return the time of a cloud, ns: its stamp, or some time after the cloud before it if that has the same."""
+        earlier, self._clock = self._clock, (stamp, stamp)
+        if earlier is None or stamp != earlier[0]:
+            return stamp
+        self.report.warn(
+            f"two clouds have the stamp {stamp} ns: they are taken as {ASSUMED_INTERVAL_NS * 1e-9:g} s apart"
+        )
+        self._clock = stamp, earlier[1] + ASSUMED_INTERVAL_NS
+        return self._clock[1]
 
     def _fit_silhouettes(self, message: Any) -> Output:
         self.counters["silhouettes"] += 1
@@ -235,6 +270,17 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self.counters["bodies"] += len(fits)
         self.counters["doubtful bodies"] += sum(not fit.reliable for _, fit in fits)
         return self._outputs.make(message.header, fits, subscribed=self._subscribed)
+
+
+def is_ahead_along_z(points: F64) -> bool:
+    """Return whether (all but one in a hundred of) the points (N, 3) m lie in a cone ahead of a camera at the origin.
+
+    In an optical frame (REP-103) all that a camera sees lies within its field of view about z. In a frame with z up the
+    floor does not.
+    """
+    z = points[:, 2]
+    inside = (z > MIN_CAMERA_DISTANCE_M) & (np.abs(points[:, :2]).max(axis=1) < MAX_FIELD_OF_VIEW * z)
+    return bool(inside.mean() > 0.99)
 
 
 def _rotate_joints(joints: dict[str, JointPosition], rotation: F64) -> dict[str, JointPosition]:

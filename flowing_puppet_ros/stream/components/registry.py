@@ -66,15 +66,20 @@ def parameter_yaml(name: str) -> str:
         f"/**/{name}:",
         "  ros__parameters:",
     ]
-    part = ""
+    parts: list[str] = []
     for info in published(name):
-        above, dot, leaf = info.name.rpartition(".")
-        if above != part:
-            lines += [f"    {above}:"] if dot else []
-            part = above
-        indent = " " * (6 if dot else 4)
+        *above, leaf = info.name.split(".")
+        for depth, part in enumerate(above):
+            if above[: depth + 1] != parts[: depth + 1]:
+                lines.append(f"{_indent(depth)}{part}:")
+        parts, indent = above, _indent(len(above))
         lines += [f"{indent}# {info.description}", f"{indent}{leaf}: {_to_yaml(info.default)}"]
     return "\n".join(lines) + "\n"
+
+
+def _indent(depth: int) -> str:
+    """Return the spaces before a parameter of a part at some depth."""
+    return " " * (4 + 2 * depth)
 
 
 def published(name: str) -> list[SettingInfo]:

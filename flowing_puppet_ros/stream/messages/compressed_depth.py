@@ -41,9 +41,12 @@ def is_compressed_depth(form: str) -> bool:
 def decode_compressed_depth(message: Any) -> U16 | F32:
     """Return the image (H, W) of a `compressedDepth` message: 16UC1 as uint16, 32FC1 as float32 metres, NaN unknown.
 
-    InputError if it is not such a message, if data is missing, or if it has more than MAX_PIXELS.
+    A 16UC1 image that was sent as a picture, by the transport `compressed` (`16UC1; png compressed`), is a PNG without
+    a header. InputError if it is neither, if data is missing, or if it has more than MAX_PIXELS.
     """
     encoding, data = source_encoding(message.format), message_bytes(message.data)
+    if not is_compressed_depth(message.format) and encoding.lower() in ("16uc1", "mono16"):
+        return _decode_png(data)
     if not is_compressed_depth(message.format) or encoding.lower() not in ("16uc1", "mono16", "32fc1"):
         raise InputError(f"the format {message.format!r} is not that of a depth image of 16UC1 or 32FC1")
     if len(data) <= HEADER.size:

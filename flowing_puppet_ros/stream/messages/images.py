@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import cv2
@@ -18,31 +19,55 @@ JPEG_QUALITY = 85  # of compressed outputs, 0 to 100
 MAX_FLOW_PX = 1e5
 """Maximum displacement in pixels; no flow is larger than images are wide."""
 
-# encoding -> (channels, bytes per channel, OpenCV conversion to RGB)
+# encoding -> (channels, bits per channel, OpenCV conversion to RGB); 9 to 16 bits are the low ones of two bytes
 _RAW: dict[str, tuple[int, int, int | None]] = {
-    "rgb8": (3, 1, None),
-    "bgr8": (3, 1, cv2.COLOR_BGR2RGB),
-    "8uc3": (3, 1, cv2.COLOR_BGR2RGB),
-    "rgba8": (4, 1, cv2.COLOR_RGBA2RGB),
-    "bgra8": (4, 1, cv2.COLOR_BGRA2RGB),
-    "8uc4": (4, 1, cv2.COLOR_BGRA2RGB),
-    "mono8": (1, 1, cv2.COLOR_GRAY2RGB),
-    "8uc1": (1, 1, cv2.COLOR_GRAY2RGB),
-    "rgb16": (3, 2, None),
-    "bgr16": (3, 2, cv2.COLOR_BGR2RGB),
-    "rgba16": (4, 2, cv2.COLOR_RGBA2RGB),
-    "bgra16": (4, 2, cv2.COLOR_BGRA2RGB),
-    "mono16": (1, 2, cv2.COLOR_GRAY2RGB),
-    "yuv422": (2, 1, cv2.COLOR_YUV2RGB_UYVY),
-    "uyvy": (2, 1, cv2.COLOR_YUV2RGB_UYVY),
-    "yuv422_yuy2": (2, 1, cv2.COLOR_YUV2RGB_YUY2),
-    "yuyv": (2, 1, cv2.COLOR_YUV2RGB_YUY2),
+    "rgb8": (3, 8, None),
+    "bgr8": (3, 8, cv2.COLOR_BGR2RGB),
+    "8uc3": (3, 8, cv2.COLOR_BGR2RGB),
+    "rgba8": (4, 8, cv2.COLOR_RGBA2RGB),
+    "bgra8": (4, 8, cv2.COLOR_BGRA2RGB),
+    "8uc4": (4, 8, cv2.COLOR_BGRA2RGB),
+    "mono8": (1, 8, cv2.COLOR_GRAY2RGB),
+    "8uc1": (1, 8, cv2.COLOR_GRAY2RGB),
+    "rgb16": (3, 16, None),
+    "bgr16": (3, 16, cv2.COLOR_BGR2RGB),
+    "16uc3": (3, 16, cv2.COLOR_BGR2RGB),
+    "rgba16": (4, 16, cv2.COLOR_RGBA2RGB),
+    "bgra16": (4, 16, cv2.COLOR_BGRA2RGB),
+    "16uc4": (4, 16, cv2.COLOR_BGRA2RGB),
+    **{f"mono{bits}": (1, bits, cv2.COLOR_GRAY2RGB) for bits in (10, 12, 14, 16)},
+    **dict.fromkeys(("yuv422", "uyvy", "uyvy422", "2vuy"), (2, 8, cv2.COLOR_YUV2RGB_UYVY)),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv", "yuyv422", "yuy2"), (2, 8, cv2.COLOR_YUV2RGB_YUY2)),
+    "yvyu": (2, 8, cv2.COLOR_YUV2RGB_YVYU),
     **{
-        f"bayer_{pattern.lower()}{8 * size}": (1, size, getattr(cv2, f"COLOR_Bayer{pattern}2RGB"))
+        f"bayer_{pattern.lower()}{bits}": (1, bits, getattr(cv2, f"COLOR_Bayer{pattern}2RGB"))
         for pattern in ("RGGB", "BGGR", "GBRG", "GRBG")
-        for size in (1, 2)
+        for bits in (8, 10, 12, 14, 16)
     },
 }
+# encoding -> (bytes of the planes of colour per pixel, OpenCV conversion of the 4:2:0 layout to RGB)
+_PLANAR: dict[str, tuple[float, int]] = {
+    "nv12": (0.5, cv2.COLOR_YUV2RGB_NV12),
+    "nv21": (0.5, cv2.COLOR_YUV2RGB_NV21),
+    "nv16": (1, cv2.COLOR_YUV2RGB_NV12),
+    "nv61": (1, cv2.COLOR_YUV2RGB_NV21),
+    "nv24": (2, cv2.COLOR_YUV2RGB_NV12),
+    "nv42": (2, cv2.COLOR_YUV2RGB_NV21),
+    **dict.fromkeys(("i420", "iyuv", "yuv420", "yuv420p"), (0.5, cv2.COLOR_YUV2RGB_I420)),
+    "yv12": (0.5, cv2.COLOR_YUV2RGB_YV12),
+}
+_FILES = ("jpeg", "jpg", "mjpeg", "png")
+"""Encodings of raw images whose data is a file of that kind."""
+_VIDEO_NAMES = {
+    "h264": r"h\.?264|x264|avc1?",
+    "hevc": r"h\.?265|x265|hevc",
+    "vp8": "vp8",
+    "vp9": "vp9",
+    "av1": "av1",
+    "mpeg4": "mpeg-?4",
+}
+"""Codec of FFmpeg -> how formats name it."""
+_VIDEO = {codec: re.compile(rf"(?<![a-z0-9])(?:{names})(?![0-9])") for codec, names in _VIDEO_NAMES.items()}
 # encoding -> (type of a pixel, metres per unit); some drivers call millimetres mono16 (REP-118 has the other two)
 _DEPTH = {"16uc1": ("u2", 0.001), "mono16": ("u2", 0.001), "32fc1": ("f4", 1.0)}
 
@@ -51,35 +76,81 @@ def decode_image(message: Any) -> U8:
     """Return the RGB image (H, W, 3) of an Image or a CompressedImage; InputError when it cannot be decoded."""
     if hasattr(message, "format"):
         return _decode_compressed(message)
-    encoding = message.encoding.lower()
+    encoding = message.encoding.lower().strip()
+    if encoding in _FILES:
+        return _decode_file(message_bytes(message.data), message.encoding)
+    if encoding in _PLANAR:
+        return _decode_planar(message, *_PLANAR[encoding])
     if encoding not in _RAW:
-        raise InputError(f"the image encoding {message.encoding!r} is not one of {', '.join(_RAW)}")
-    channels, size, conversion = _RAW[encoding]
-    pixels = _read_rows(message, channels, np.dtype("u1" if size == 1 else ">u2" if message.is_bigendian else "<u2"))
-    if size == 2:
-        pixels = (pixels >> 8).astype(np.uint8)
+        raise InputError(f"the image encoding {message.encoding!r} is not one of {', '.join((*_RAW, *_PLANAR))}")
+    channels, bits, conversion = _RAW[encoding]
+    pixels = _read_rows(message, channels, np.dtype("u1" if bits == 8 else ">u2" if message.is_bigendian else "<u2"))
+    if bits > 8:
+        pixels = np.minimum(pixels >> (bits - 8), 255).astype(np.uint8)
     if conversion is None:
         # Kernels are compiled for writeable arrays, which all other conversions return.
         return np.array(pixels)
     try:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
     except cv2.error as error:  # packed formats need an even width, Bayer patterns two rows
-        raise InputError(
-            f"an image of {message.width}x{message.height} is not a whole {message.encoding} image"
-        ) from error
+        raise _not_whole(message) from error
+
+
+def _decode_planar(message: Any, colour_bytes: float, conversion: int) -> U8:
+    """Return the RGB image of YUV whose planes of colour follow that of brightness; colours are thinned to 4:2:0."""
+    data, width, height, step = message_bytes(message.data), int(message.width), int(message.height), int(message.step)
+    if height * width > MAX_PIXELS:
+        raise InputError(f"an image of {width}x{height} is larger than {MAX_PIXELS // 1_000_000} million pixels")
+    share = 1 + colour_bytes
+    if len(data) == int(width * height * share):
+        step = width  # some drivers count the colours in
+    elif height % 3 == 0 and colour_bytes == 0.5 and step * height <= len(data) < int(step * height * share):
+        height = height * 2 // 3  # others count the rows of colours
+    if height < 2 or width < 2 or height % 2 or width % 2 or step < width or len(data) < int(step * height * share):
+        raise _not_whole(message)
+    bright, colours = data[: step * height], data[step * height : int(step * height * share)]
+    if conversion in (cv2.COLOR_YUV2RGB_I420, cv2.COLOR_YUV2RGB_YV12):
+        colours = colours.reshape(height, step // 2)[:, : width // 2].reshape(height // 2, width)
+    elif colour_bytes == 2:
+        colours = colours.reshape(height, step, 2)[::2, :width:2].reshape(height // 2, width)
+    else:
+        colours = colours.reshape(-1, step)[:: int(2 * colour_bytes), :width]
+    planes = np.vstack([bright.reshape(height, step)[:, :width], colours])
+    return np.asarray(cv2.cvtColor(planes, conversion), np.uint8)
+
+
+def _not_whole(message: Any) -> InputError:
+    size = f"{message.width}x{message.height}"
+    return InputError(
+        f"an image of {size} is not a whole {message.encoding} image: step {message.step}, {len(message.data)} bytes"
+    )
 
 
 def _decode_compressed(message: Any) -> U8:
-    data = message_bytes(message.data)
     if is_compressed_depth(message.format):
         raise InputError(f"the compressed image format {message.format!r} is a depth image, not a picture")
+    if find_video_codec(message.format):
+        raise InputError(
+            f"the compressed image format {message.format!r} is video, whose images need those before them: in bags it "
+            "is decoded from the first key frame on if PyAV is there (`pip install av`), nodes need JPEG or raw images"
+        )
+    return _decode_file(message_bytes(message.data), message.format)
+
+
+def find_video_codec(form: str) -> str:
+    """Return FFmpeg's name of the codec of a `format` that is video, or of any text with such a name; else empty."""
+    words = form.lower()
+    return next((codec for codec, names in _VIDEO.items() if names.search(words)), "")
+
+
+def _decode_file(data: U8, form: str) -> U8:
     flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(data, flags) if len(data) else None
     except cv2.error:  # the header names more pixels than OpenCV accepts
         image = None
     if image is None:
-        raise InputError(f"a compressed image of format {message.format!r} and {len(data)} bytes cannot be decoded")
+        raise InputError(f"a compressed image of format {form!r} and {len(data)} bytes cannot be decoded")
     return np.asarray(image, np.uint8)
 
 

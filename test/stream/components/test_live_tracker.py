@@ -220,7 +220,7 @@ class LastMoment(Executor):
 def puppets(threads: Executor | None) -> tuple[list[bytes], list[Any]]:
     """Return what the tracker says of a drawn person, as bytes and as messages."""
     settings = PuppetTrackerSettings.from_mapping(
-        {"flow.preset": "fast"}
+        {"flow.preset": "fast", "detection.source": "own"}
         | {
             f"detection.{name}": value
             for name, value in (("full_frame_delay", 0.1), ("full_frame_interval", 0.4), ("search_interval", 0.4))

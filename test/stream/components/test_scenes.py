@@ -104,6 +104,21 @@ def test_new_people_are_searched_one_at_a_time_and_the_others_followed(
 
 
 @pytest.mark.slow
+def test_people_keep_their_ids_where_stamps_stand_still(
+    person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
+) -> None:
+    stage = Stage(person, floor)
+    for k in range(4):
+        stage.tenths = 6
+        assert stage.show((0.05 * k, 1.0)) == {(0.05 * k, 1.0): "b1"}
+    assert len(fits) == 1, "followed, not searched again"
+    (warning,) = stage.component.report.drain_warnings()
+    assert "two clouds have the stamp 700000000 ns: they are taken as 0.1 s apart" in warning
+    stage.tenths = 6 + 6
+    assert stage.show((0.2, 1.0)) == {(0.2, 1.0): "b1"}, "a stamp that advances counts again"
+
+
+@pytest.mark.slow
 def test_who_is_hidden_for_a_while_keeps_the_id_and_who_is_gone_does_not(
     person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]
 ) -> None:
@@ -247,11 +262,11 @@ def test_goals_fit_everybody_and_touch_no_track(person: np.ndarray, floor: np.nd
 def test_clouds_that_cannot_show_people_are_one_sentence(person: np.ndarray) -> None:
     component = BodyFitterComponent(BodyFitterSettings(), FACTORY)
     millimetres = person * 1000 + 3000
-    for points, sentence in (
-        (millimetres, "beyond the segmentation.max_range of 30 m; check the unit"),
-        (person[:0], "no finite"),
+    for stamp, points, sentence in (
+        (1, millimetres, "beyond the segmentation.max_range of 30 m; check the unit"),
+        (2, person[:0], "no finite"),
     ):
-        made = dict(component.handle("points", make_cloud(FACTORY, make_header(FACTORY, 1, "map"), points)))
+        made = dict(component.handle("points", make_cloud(FACTORY, make_header(FACTORY, stamp, "map"), points)))
         assert made["bodies"].bodies == []
         (warning,) = component.report.drain_warnings()
         assert sentence in warning

@@ -17,6 +17,7 @@ from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
+from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
@@ -27,10 +28,11 @@ def state():
     kernels = {f"{m}.{n}": f for m, module in loaded for n, f in vars(module).items() if isinstance(f, Dispatcher)}
     return {name: [str(one) for one in kernel.signatures] for name, kernel in kernels.items()}
 
+OWN = LiveDetectionSettings(source="own")
 factory = BagMessageFactory()
 components = {}
 for name, kind, settings in (
-    ("flow", OpticalFlowComponent, {}), ("told", PuppetTrackerComponent, {}), ("cam1", PuppetTrackerComponent, {}),
+    ("flow", OpticalFlowComponent, {}), ("told", PuppetTrackerComponent, {"detection": OWN}), ("cam1", PuppetTrackerComponent, {}),
     ("cam2", PuppetTrackerComponent, {}), ("hull", VisualHullComponent, {"cameras": "cam1,cam2", "hull_every": 1}),
 ):
     component = components[name] = kind(kind.settings_type(**settings), factory)

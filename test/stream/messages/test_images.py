@@ -74,6 +74,117 @@ def test_yuv422_packs_one_colour_for_two_pixels(encoding: Any, order: Any) -> No
     assert np.abs(decoded - rgb).mean() < 14
 
 
+def planes_of(rgb: Any) -> Any:
+    """Return Y, U, V (H, W) of the video range (BT.601), by its definition."""
+    r, g, b = (rgb[:, :, k].astype(float) for k in range(3))
+    y = 16 + (65.738 * r + 129.057 * g + 25.064 * b) / 256
+    u = 128 + (-37.945 * r - 74.494 * g + 112.439 * b) / 256
+    v = 128 + (112.439 * r - 94.154 * g - 18.285 * b) / 256
+    return (np.rint(plane).astype(np.uint8) for plane in (y, u, v))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "order"),
+    [("yuyv", "yuyv"), ("YUY2", "yuyv"), ("yuv422_yuy2", "yuyv"), ("uyvy", "uyvy"), ("yvyu", "yvyu"), ("2vuy", "uyvy")],
+)
+def test_packed_yuv_comes_back_to_a_few_levels(encoding: Any, order: Any) -> None:
+    rgb = ramp()
+    y, u, v = planes_of(rgb)
+    ys = iter((y[:, 0::2], y[:, 1::2]))
+    columns = [next(ys) if letter == "y" else (u if letter == "u" else v)[:, ::2] for letter in order]
+    packed = np.stack(columns, axis=2).reshape(rgb.shape[0], rgb.shape[1], 2)
+    for padding in (0, 6):
+        decoded = images.decode_image(message(packed, encoding, padding)).astype(int)
+        assert np.abs(decoded - rgb).max() < 16 and np.abs(decoded - rgb).mean() < 4
+
+
+def planar(encoding: str, rgb: Any, padding: int = 0) -> Any:
+    """Return a message of semi-planar or planar YUV."""
+    y, u, v = planes_of(rgb)
+    if encoding in ("nv21", "nv61", "nv42", "yv12"):
+        u, v = v, u
+    down, across = {"nv16": (1, 2), "nv61": (1, 2), "nv24": (1, 1), "nv42": (1, 1)}.get(encoding, (2, 2))
+    u, v = u[::down, ::across], v[::down, ::across]
+
+    def padded(plane: Any, bytes_more: int) -> bytes:
+        return bytes(np.pad(plane, ((0, 0), (0, bytes_more)), constant_values=200).tobytes())
+
+    data = padded(y, padding)
+    if encoding.startswith("nv"):
+        both = np.stack([u, v], axis=2).reshape(len(u), -1)
+        data += padded(both, padding * both.shape[1] // y.shape[1])
+    else:
+        data += padded(u, padding // 2) + padded(v, padding // 2)
+    made = message(y, encoding)
+    made.step += padding
+    made.data = array.array("B", data)
+    return made
+
+
+PLANAR = ["nv12", "nv21", "nv16", "nv61", "nv24", "nv42", "i420", "yuv420", "yv12"]
+
+
+@pytest.mark.parametrize("encoding", PLANAR)
+def test_planar_yuv_comes_back_to_a_few_levels(encoding: str) -> None:
+    rgb = ramp()
+    for padding in (0, 8):
+        decoded = images.decode_image(planar(encoding, rgb, padding)).astype(int)
+        assert np.abs(decoded - rgb).max() < 20 and np.abs(decoded - rgb).mean() < 4
+    # U and V the other way round would be seen.
+    swapped = {"nv12": "nv21", "nv16": "nv61", "nv24": "nv42", "i420": "yv12", "yuv420": "yv12"}
+    other = planar(encoding, rgb)
+    other.encoding = swapped.get(encoding, next((a for a, b in swapped.items() if b == encoding), ""))
+    assert np.abs(images.decode_image(other).astype(int) - rgb).mean() > 20
+
+
+@pytest.mark.parametrize("encoding", ["nv12", "i420"])
+def test_planar_yuv_is_read_whatever_height_and_step_count(encoding: str) -> None:
+    rgb = ramp()
+    right = images.decode_image(planar(encoding, rgb))
+    counted = planar(encoding, rgb)
+    counted.step = counted.step * 3 // 2
+    np.testing.assert_array_equal(images.decode_image(counted), right)
+    counted = planar(encoding, rgb)
+    counted.height = counted.height * 3 // 2
+    np.testing.assert_array_equal(images.decode_image(counted), right)
+
+
+@pytest.mark.parametrize("encoding", PLANAR)
+def test_planar_yuv_that_is_not_whole_is_refused(encoding: str) -> None:
+    short = planar(encoding, ramp(10, 16))
+    short.data = short.data[:-1]
+    odd = planar(encoding, ramp(10, 16))
+    odd.width, odd.step = 15, 15
+    for bad in (short, odd):
+        with pytest.raises(InputError, match=f"is not a whole {encoding} image"):
+            images.decode_image(bad)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_deep_greys_and_mosaics_use_all_their_bits(bits: int) -> None:
+    grey = ramp()[:, :, 0]
+    deep = (grey.astype(np.uint16) << (bits - 8)) + 1
+    np.testing.assert_array_equal(images.decode_image(message(deep, f"mono{bits}")), np.dstack([grey] * 3))
+    flat = np.full((6, 8), (90 << (bits - 8)) + 3, np.uint16)
+    assert (images.decode_image(message(flat, f"bayer_rggb{bits}")) == 90).all()
+
+
+def test_files_in_raw_images_are_read() -> None:
+    rgb = ramp(16, 24)
+    png = message(cv2.imencode(".png", rgb[:, :, ::-1])[1].reshape(1, -1), "png")
+    np.testing.assert_array_equal(images.decode_image(png), rgb)
+    jpeg = message(images.encode_jpeg(rgb, 98).reshape(1, -1), "jpeg")
+    assert np.abs(images.decode_image(jpeg).astype(int) - rgb).max() < 16
+
+
+@pytest.mark.parametrize("form", ["h264", "H.265", "hevc", "h264; yuv420p", "vp9", "av1"])
+def test_video_is_named_with_the_way_out(form: str) -> None:
+    data = np.frombuffer(b"\0\0\0\1\x67", np.uint8)
+    video = FACTORY.make("sensor_msgs/msg/CompressedImage", format=form, data=data)
+    with pytest.raises(InputError, match=f"'{form}' is video, whose images need those before them"):
+        images.decode_image(video)
+
+
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 def test_bayer_mosaics_give_the_colours_back(pattern: Any) -> None:
     rgb = ramp()
@@ -92,6 +203,16 @@ def test_compressed_images_are_rgb() -> None:
     png = cv2.imencode(".png", rgb[:, :, ::-1])[1].reshape(-1)
     lossless = FACTORY.make("sensor_msgs/msg/CompressedImage", format="png", data=png)
     np.testing.assert_array_equal(images.decode_image(lossless), rgb)
+
+
+@pytest.mark.parametrize("suffix", ["png", "webp", "bmp", "tiff"])
+def test_compressed_images_are_known_by_their_content(suffix: str) -> None:
+    rgb = ramp(16, 24)
+    options = [cv2.IMWRITE_WEBP_QUALITY, 101] if suffix == "webp" else []  # above 100: lossless
+    data = cv2.imencode(f".{suffix}", rgb[:, :, ::-1], options)[1].reshape(-1)
+    for form in (suffix, "", "rgb8; something compressed bgr8"):
+        found = images.decode_image(FACTORY.make("sensor_msgs/msg/CompressedImage", format=form, data=data))
+        np.testing.assert_array_equal(found, rgb)
 
 
 @pytest.mark.parametrize("data", [b"", b"no picture", bytes(1000)])

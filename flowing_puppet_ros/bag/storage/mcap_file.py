@@ -11,10 +11,10 @@ import heapq
 import io
 import re
 import struct
+import zlib
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -24,27 +24,23 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import breakup_chunk
 
+from flowing_puppet_ros.bag.storage.compression import decompress_prefix
+from flowing_puppet_ros.bag.storage.stored_file import ChunkSpan, StoredTopic, merge_chunks, parse_qos
 from flowing_puppet_ros.errors import InputError
 
 MAGIC = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES = 1 << 30
 """Maximum size of a record or chunk."""
+MESSAGE_ENCODINGS = ("cdr", "ros1", "json", "protobuf")
+"""Encodings of messages that are passed on; others, and messages without a schema, are left out."""
 _RECORD_HEADER = struct.Struct("<BQ")
 _COMPRESSION_OFFSET = _RECORD_HEADER.size + 8 + 8 + 8 + 4
 """Bytes of a chunk record before the name of its compression."""
+_CHUNK_HEAD = struct.Struct("<QQQII")
+"""Times of the first and last message, size, checksum, length of the name of the compression."""
 _CHUNK_MARK = re.compile(rb"\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4")
 _SEARCH_BYTES = 1 << 20
 """Bytes that are searched at a time for the next chunk."""
-
-
-@dataclass(frozen=True, slots=True)
-class _ChunkSpan:
-    """A chunk: the log times (ns) of its first and last message, its offset, and the length of its data in bytes."""
-
-    first: int
-    last: int
-    offset: int
-    length: int
 
 
 def is_mcap(path: Path) -> bool:
@@ -69,10 +65,8 @@ class McapFile:
     """The messages of one file.
 
     Attributes:
-        channels: by id; only those whose messages are CDR of a named type.
-        types: message type of each channel, by id.
-        definitions: text of the type's definition, by id of the channel; only those in the form of `.msg` files.
-        counts: number of messages of each channel, by id.
+        topics: only those whose messages have an encoding that somebody here reads, and a named type.
+        notes: with `salvage`, how many messages were read and what was passed over.
         damaged: chunks and records that could not be read.
         skipped_bytes: bytes that were skipped because of damage.
     """
@@ -80,61 +74,78 @@ class McapFile:
     def __init__(self, path: Path, salvage: bool = False) -> None:
         """Scan the file. Damage is skipped with `salvage`, otherwise it is an InputError."""
         self.path = path
-        self.channels: dict[int, Channel] = {}
-        self.counts: Counter[int] = Counter()
+        self.notes: list[str] = []
         self.damaged = 0
         self.skipped_bytes = 0
         self._salvage = salvage
+        self._channels: dict[int, Channel] = {}
+        self._counts: Counter[int] = Counter()
         self._schemas: dict[int, Schema] = {}
-        self._chunks: list[_ChunkSpan] = []
+        self._chunks: list[ChunkSpan] = []
         # Log times and offsets of the messages outside of chunks.
         self._times, self._offsets = array("Q"), array("Q")
+        self._of_cut_chunk = 0
         self._size = path.stat().st_size
         with path.open("rb") as stream:
             self._scan(stream)
-        usable = {number for number, channel in self.channels.items() if self._is_usable(channel)}
-        self.channels = {number: self.channels[number] for number in sorted(usable)}
-        schemas = {number: self._schemas[channel.schema_id] for number, channel in self.channels.items()}
-        self.types = {number: schema.name for number, schema in schemas.items()}
-        self.definitions = {
-            number: schema.data.decode("utf8", "replace")
-            for number, schema in schemas.items()
-            if schema.encoding == "ros2msg"
-        }
+        self._numbers = sorted(number for number, channel in self._channels.items() if self._is_usable(channel))
+        self.topics = [self._describe_topic(number) for number in self._numbers]
+        if salvage:
+            self.notes.append(self._describe_salvage())
 
-    def messages(self, numbers: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (channel id, log time, bytes) of the messages of some channels in the order of log times."""
-        chosen = set(numbers)
+    def messages(self, chosen: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (index in `topics`, log time, bytes) of the messages of some topics in the order of log times."""
+        indices = {self._numbers[index]: index for index in chosen}
         with self.path.open("rb") as loose, self.path.open("rb") as chunked:
-            yield from heapq.merge(
-                self._read_loose(loose, chosen), self._read_chunks(chunked, chosen), key=lambda item: item[1]
-            )
+            chunks = merge_chunks(self._chunks, lambda chunk: self._read_chunk(chunked, chunk, indices))
+            yield from heapq.merge(self._read_loose(loose, indices), chunks, key=lambda item: item[1])
+
+    def close(self) -> None:
+        """Do nothing: it is open only while it is read."""
+
+    def _describe_topic(self, number: int) -> StoredTopic:
+        channel = self._channels[number]
+        schema = self._schemas[channel.schema_id]
+        qos = parse_qos(channel.metadata.get("offered_qos_profiles", ""))
+        return StoredTopic(
+            channel.topic,
+            schema.name,
+            channel.message_encoding,
+            schema.encoding,
+            schema.data,
+            self._counts[number],
+            qos,
+        )
+
+    def _describe_salvage(self) -> str:
+        note = f"{self.path}: {sum(topic.count for topic in self.topics)} messages salvaged"
+        if self._of_cut_chunk:
+            note += f", {self._of_cut_chunk} of them from a chunk that is cut off, whose checksum is lost"
+        if self.damaged:
+            note += f", {self.damaged} damaged places ({self.skipped_bytes} bytes) passed over"
+        return note
 
     def _is_usable(self, channel: Channel) -> bool:
-        return channel.message_encoding == "cdr" and channel.schema_id in self._schemas
+        return channel.message_encoding in MESSAGE_ENCODINGS and channel.schema_id in self._schemas
 
-    def _read_loose(self, stream: BinaryIO, chosen: set[int]) -> Iterator[tuple[int, int, bytes]]:
-        for index in sorted(range(len(self._times)), key=self._times.__getitem__):
-            stream.seek(self._offsets[index])
+    def _read_loose(self, stream: BinaryIO, indices: Mapping[int, int]) -> Iterator[tuple[int, int, bytes]]:
+        for place in sorted(range(len(self._times)), key=self._times.__getitem__):
+            stream.seek(self._offsets[place])
             message = _parse(*self._read_record(stream))
-            if isinstance(message, Message) and message.channel_id in chosen:
-                yield message.channel_id, message.log_time, message.data
+            if isinstance(message, Message) and message.channel_id in indices:
+                yield indices[message.channel_id], message.log_time, message.data
 
-    def _read_chunks(self, stream: BinaryIO, chosen: set[int]) -> Iterator[tuple[int, int, bytes]]:
-        pending: list[tuple[int, int, int, bytes]] = []
-        order = 0
-        for chunk in sorted(self._chunks, key=lambda chunk: (chunk.first, chunk.offset)):
-            while pending and pending[0][0] < chunk.first:
-                time, _, number, data = heapq.heappop(pending)
-                yield number, time, data
-            stream.seek(chunk.offset)
-            for message in _unpack_chunk(*self._read_record(stream)):
-                if isinstance(message, Message) and message.channel_id in chosen:
-                    heapq.heappush(pending, (message.log_time, order, message.channel_id, message.data))
-                    order += 1
-        while pending:
-            time, _, number, data = heapq.heappop(pending)
-            yield number, time, data
+    def _read_chunk(
+        self, stream: BinaryIO, chunk: ChunkSpan, indices: Mapping[int, int]
+    ) -> Iterator[tuple[int, int, bytes]]:
+        stream.seek(chunk.offset)
+        if chunk.cut:
+            records = _unpack_cut_chunk(stream.read(_RECORD_HEADER.size + chunk.length)[_RECORD_HEADER.size :])
+        else:
+            records = _unpack_chunk(*self._read_record(stream))
+        for message in records:
+            if isinstance(message, Message) and message.channel_id in indices:
+                yield indices[message.channel_id], message.log_time, message.data
 
     def _scan(self, stream: BinaryIO) -> None:
         end_of_records = self._size if self._salvage else self._size - len(MAGIC)
@@ -148,7 +159,10 @@ class McapFile:
             known = 0 < code <= Opcode.DATA_END or code >= 0x80
             if not known or end > self._size or length > MAX_RECORD_BYTES:
                 self._report_damage(f"the record of {length} bytes at byte {offset} is not valid")
-                offset = self._find_next_chunk(stream, offset + 1)
+                next_chunk = self._find_next_chunk(stream, offset + 1)
+                if code == Opcode.CHUNK and next_chunk == self._size:
+                    self._index_cut_chunk(stream, offset)
+                offset = next_chunk
                 continue
             if code in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK):
                 self._index_record(stream, offset, length)
@@ -164,20 +178,36 @@ class McapFile:
             self._report_damage(f"the record at byte {offset} cannot be read ({type(error).__name__})")
             self.skipped_bytes += length
             return
+        times = self._note_records(records)
+        if code == Opcode.CHUNK and times:
+            self._chunks.append(ChunkSpan(min(times), max(times), offset, length))
+        elif times:
+            self._times.append(times[0])
+            self._offsets.append(offset)
+
+    def _index_cut_chunk(self, stream: BinaryIO, offset: int) -> None:
+        """Index the whole messages at the beginning of a chunk after which the file ends."""
+        stream.seek(offset + _RECORD_HEADER.size)
+        data = stream.read(MAX_RECORD_BYTES)
+        times = self._note_records(_unpack_cut_chunk(data))
+        if times:
+            self._chunks.append(ChunkSpan(min(times), max(times), offset, len(data), cut=True))
+            self._of_cut_chunk = len(times)
+            self.damaged -= 1
+            self.skipped_bytes -= max(0, self._size - offset - 1)
+
+    def _note_records(self, records: Iterable[McapRecord | None]) -> list[int]:
+        """Keep schemas and channels, count messages and return their log times."""
         times = []
         for record in records:
             if isinstance(record, Schema):
                 self._schemas[record.id] = record
             elif isinstance(record, Channel):
-                self.channels[record.id] = record
+                self._channels[record.id] = record
             elif isinstance(record, Message):
-                self.counts[record.channel_id] += 1
+                self._counts[record.channel_id] += 1
                 times.append(record.log_time)
-        if code == Opcode.CHUNK and times:
-            self._chunks.append(_ChunkSpan(min(times), max(times), offset, length))
-        elif times:
-            self._times.append(times[0])
-            self._offsets.append(offset)
+        return times
 
     def _report_damage(self, problem: str) -> None:
         if not self._salvage:
@@ -227,3 +257,35 @@ def _unpack_chunk(code: int, data: bytes) -> list[McapRecord]:
     if chunk.uncompressed_size > MAX_RECORD_BYTES:
         raise McapError(f"a chunk of {chunk.uncompressed_size} bytes is too large")
     return breakup_chunk(chunk, validate_crc=True)
+
+
+def _unpack_cut_chunk(data: bytes) -> list[McapRecord]:
+    """Return the whole records at the beginning of a chunk that ends too early.
+
+    Nothing vouches for them unless all are there, so they have to be what a chunk may contain, with log times in the
+    range of the chunk.
+    """
+    if len(data) < _CHUNK_HEAD.size:
+        return []
+    first, last, size, checksum, length = _CHUNK_HEAD.unpack_from(data)
+    (name, start) = (data[_CHUNK_HEAD.size : _CHUNK_HEAD.size + length], _CHUNK_HEAD.size + length + 8)
+    if name not in (b"", b"zstd", b"lz4") or size > MAX_RECORD_BYTES or len(data) <= start:
+        return []
+    unpacked, found, offset = decompress_prefix(name.decode(), data[start:])[:size], list[McapRecord](), 0
+    if len(unpacked) == size and checksum and zlib.crc32(unpacked) != checksum:
+        return []
+    while offset + _RECORD_HEADER.size <= len(unpacked):
+        code, length = _RECORD_HEADER.unpack_from(unpacked, offset)
+        offset, end = offset + _RECORD_HEADER.size, offset + _RECORD_HEADER.size + length
+        if code not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE) or end > len(unpacked):
+            break
+        try:
+            record = _parse(code, unpacked[offset:end])
+        except Exception:  # as with damaged records
+            break
+        if isinstance(record, Message) and not first <= record.log_time <= last:
+            break
+        if record is not None:
+            found.append(record)
+        offset = end
+    return found
