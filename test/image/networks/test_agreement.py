@@ -20,11 +20,11 @@ def pose(shift: float = 0.0, score: float = 0.65) -> NetworkPose:
 
 
 def test_mean_is_weighted_by_score_and_trust() -> None:
-    mean, _ = combine([pose(0.0, 0.6), pose(10.0, 0.2)], [ONES, ONES], size=100.0)
+    mean, _ = combine([[pose(0.0, 0.6)], [pose(10.0, 0.2)]], [ONES, ONES], size=100.0)
     np.testing.assert_allclose(mean[0], (2.5, 0))  # (0.6 * 0 + 0.2 * 10) / 0.8
     trust = ONES.copy()
     trust[LEFT] = 0.5
-    mean, _ = combine([pose(0.0, 0.5), pose(9.0, 0.5)], [ONES, trust], size=100.0)
+    mean, _ = combine([[pose(0.0, 0.5)], [pose(9.0, 0.5)]], [ONES, trust], size=100.0)
     np.testing.assert_allclose(mean[[LEFT, RIGHT], 0], (10 + 3, -10 + 4.5))
 
 
@@ -41,20 +41,29 @@ def test_mean_is_weighted_by_score_and_trust() -> None:
 def test_confidence_is_how_well_the_poses_agree_in_shoulder_widths(
     apart: float, scores: tuple[float, float], confidence: float
 ) -> None:
-    _, found = combine([pose(0.0, scores[0]), pose(apart, scores[1])], [ONES, ONES], size=100.0)
+    _, found = combine([[pose(0.0, scores[0])], [pose(apart, scores[1])]], [ONES, ONES], size=100.0)
     np.testing.assert_allclose(found, confidence, rtol=2e-3)
 
 
-def test_of_three_poses_the_mean_of_all_pairs_counts() -> None:
-    _, found = combine([pose(0.0), pose(0.0), pose(30.0)], [ONES] * 3, size=100.0)
-    np.testing.assert_allclose(found, 0.7)  # distances 0, 30 and 30: 20 on average
+def test_two_poses_by_one_network_are_one_opinion() -> None:
+    """Their mean is at 10 px: 20 px, or a fifth of the shoulder width, from the other network's."""
+    mean, found = combine([[pose(0.0), pose(20.0)], [pose(30.0)]], [ONES, ONES], size=100.0)
+    np.testing.assert_allclose(found, 0.7)
+    np.testing.assert_allclose(mean[0, 0], 50 / 3)
+    _, alone = combine([[pose(0.0), pose(200.0)]], [ONES], size=100.0)
+    np.testing.assert_allclose(alone, 1.0)
+
+
+def test_of_three_networks_the_two_that_agree_least_count() -> None:
+    _, found = combine([[pose(0.0)], [pose(0.0)], [pose(20.0)]], [ONES] * 3, size=100.0)
+    np.testing.assert_allclose(found, 0.7)
 
 
 def test_a_single_pose_has_its_scores() -> None:
-    mean, found = combine([pose(3.0, 0.325)], [ONES], size=100.0)
+    mean, found = combine([[pose(3.0, 0.325)]], [ONES], size=100.0)
     np.testing.assert_allclose(mean, pose(3.0).joints)
     np.testing.assert_allclose(found, 0.5)
-    assert combine([pose(0.0, 0.9)], [ONES], size=1.0)[1].max() == 1.0
+    assert combine([[pose(0.0, 0.9)]], [ONES], size=1.0)[1].max() == 1.0
 
 
 def test_calibration_rises_from_nothing_to_nearly_one() -> None:

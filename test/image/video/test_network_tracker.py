@@ -93,7 +93,8 @@ class Seer:
 def tracking(seer: Seer | None = None, **timing: float) -> tuple[NetworkTracker, Seer]:
     seer = seer or Seer()
     settings = LiveDetectionSettings(networks=NetworkTimingSettings(**timing))
-    return NetworkTracker(FlowingPuppetTracker(CapsuleModel(), flow_settings=QUICK), settings, seer, Counter()), seer
+    model: Any = CapsuleModel()
+    return NetworkTracker(FlowingPuppetTracker(model, flow_settings=QUICK), settings, seer, Counter()), seer
 
 
 def play(live: NetworkTracker, numbers: Sequence[int], scene: str = "one", rate: float = 30.0) -> list[TrackResult]:

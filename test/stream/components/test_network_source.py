@@ -14,6 +14,7 @@ from flowing_puppet_ros.bag.frames import open_bag_frames
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.networks import choice
 from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED, are_installed
 from flowing_puppet_ros.image.networks.keypoint_networks import FoundPerson
 from flowing_puppet_ros.image.video import live_tracker
@@ -49,6 +50,7 @@ def nothing_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("FLOWING_PUPPET_NETWORKS", str(tmp_path / "networks"))
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "python"))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "user"))
+    choice._load.cache_clear()
 
 
 def settings(**values: Any) -> PuppetTrackerSettings:
@@ -102,14 +104,14 @@ def test_the_source_can_change_while_the_tracker_runs(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(live_tracker, "load_networks", load)
     component = PuppetTrackerComponent(settings(**{"detection.source": "none"}), FACTORY)
-    assert isinstance(component._live, LiveTracker) and not asked
+    assert type(component._live) is LiveTracker and not asked
     component.reconfigure(settings(**{"detection.source": "neural"}))
-    assert isinstance(component._live, NetworkTracker) and asked == ["neural"]
+    assert type(component._live) is NetworkTracker and asked == ["neural"]
     messages = play(component, plain(4))
     assert [len(message.puppets) for message in messages] == [1] * 4 and fixed.asked == 4
     assert component.counters["searches for everybody"] == 1 and component.counters["close looks"] == 3
     component.reconfigure(settings(**{"detection.source": "neural", "detection.min_probability": 0.5}))
-    assert isinstance(component._live, NetworkTracker) and asked == ["neural"], "they are not loaded again"
+    assert type(component._live) is NetworkTracker and asked == ["neural"], "they are not loaded again"
     component.set_expected("detections", True)
     play(component, plain(2))
     assert fixed.asked == 4, "while somebody publishes detections the networks rest"
