@@ -65,9 +65,11 @@ class Seeing:
     visibility: float = 1.0
     shifts: dict[str, float] = field(default_factory=dict)
     looks: list[str] = field(default_factory=list)
+    light: float = 0.0
 
     def detect(self, image: np.ndarray, side: int) -> list[NetworkPose]:
         self.looks.append("all")
+        self.light = float(image.mean())
         return self.everybody
 
     def detect_in_square(self, image: np.ndarray, center: Any, half: float, side: int) -> list[NetworkPose]:
@@ -169,8 +171,11 @@ def test_a_known_person_who_is_seen_in_the_whole_image_too_is_one_person_by_both
 
 
 def test_two_known_people_in_one_place_are_one_the_one_who_is_nearer_to_where_expected() -> None:
-    found = find(Seeing([], [pose(300)]), [known(240), known(305)], everybody=False)
+    turned = known(240)
+    turned.xy[:] = pose(240).exchange_sides().joints
+    found = find(Seeing([], [pose(300)], exchanged=True), [turned, known(305)], everybody=False)
     assert necks(found) == [300]
+    assert at(found[0], "left_shoulder")[0][0] > 300, "sides are those of the person who is expected at 305"
     assert len(find(Seeing([], [pose(300), pose(340)]), [known(295), known(345)], everybody=False)) == 2
 
 
@@ -252,6 +257,9 @@ def test_only_a_nearly_black_image_is_brightened_and_keeps_its_order_of_light() 
     assert lit.mean() > 40 > dark.mean() and (np.diff(row) >= 0).all() and row[-1] >= 250
     assert lit[0, 0, 0] == 0 and lit.dtype == np.uint8
     assert not brighten(np.zeros((3, 2000, 3), np.uint8)).any()
+    seeing = Seeing([], [])
+    KeypointNetworks(seeing, seeing).find(dark)  # type: ignore[arg-type]
+    assert seeing.light == pytest.approx(lit.mean()), "the networks see the brightened image"
 
 
 def furniture(seed: int) -> np.ndarray:

@@ -128,6 +128,7 @@ def test_two_people_are_looked_at_in_turn_in_a_fast_stream_and_both_in_each_imag
     assert seer.counts[0] == 0 and set(seer.counts[2:]) == {1}, "30 looks a second at 30 images a second"
     sides = [necks[0] < 160 for _, necks, _ in seer.looks if necks]
     assert all(one != other for one, other in pairwise(sides)), "the two in turn"
+    assert not any(track.missed for track in live._tracker.tracks), "who is not looked at is not missed"
     live, seer = tracking(everybody_interval=100.0)
     play(live, range(6), "two", rate=10.0)
     assert seer.counts == [0] + [2] * 5
@@ -166,12 +167,13 @@ def test_who_is_lost_is_dropped_and_found_again_under_a_new_id() -> None:
     assert again != first
 
 
-def test_after_a_cut_everybody_is_looked_for_at_once_and_nobody_stays() -> None:
-    live, seer = tracking()
-    play(live, range(6))
-    after = play(live, range(6, 9), "elsewhere")
+def test_after_a_cut_nobody_stays_and_everybody_is_looked_for_in_the_next_image() -> None:
+    live, seer = tracking(everybody_interval=0.2, search_interval=0.1)
+    play(live, range(7))
+    assert seer.searches == [0, 6]
+    after = play(live, range(7, 10), "elsewhere")
     assert after[0].restarted and not any(result.puppets for result in after)
-    assert [everybody for _, _, everybody in seer.looks[7:]] == [True]
+    assert seer.searches == [0, 6, 8]
 
 
 @pytest.mark.parametrize("change", ["stamp", "size"])
