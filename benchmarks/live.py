@@ -27,7 +27,11 @@ TARGETS = {
     "puppet_tracker": "15 Hz, median 150 ms, lock-on 10 s",
     "body_fitter": "5 Hz, lock-on 10 s",
 }
-_ARGUMENTS = {"puppet_tracker": ("-p", "flow.preset:=fast"), "body_fitter": ("-p", "track:=true")}
+# The networks find no drawn person, our own detector does.
+_ARGUMENTS = {
+    "puppet_tracker": ("-p", "flow.preset:=fast", "-p", "detection.source:=own"),
+    "body_fitter": ("-p", "track:=true"),
+}
 _BOOTSTRAP_GUARD = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 
 

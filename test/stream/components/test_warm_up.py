@@ -32,8 +32,9 @@ OWN = LiveDetectionSettings(source="own")
 factory = BagMessageFactory()
 components = {}
 for name, kind, settings in (
-    ("flow", OpticalFlowComponent, {}), ("told", PuppetTrackerComponent, {"detection": OWN}), ("cam1", PuppetTrackerComponent, {}),
-    ("cam2", PuppetTrackerComponent, {}), ("hull", VisualHullComponent, {"cameras": "cam1,cam2", "hull_every": 1}),
+    ("flow", OpticalFlowComponent, {}), ("told", PuppetTrackerComponent, {"detection": OWN}),
+    ("cam1", PuppetTrackerComponent, {}), ("cam2", PuppetTrackerComponent, {}),
+    ("hull", VisualHullComponent, {"cameras": "cam1,cam2", "hull_every": 1}),
 ):
     component = components[name] = kind(kind.settings_type(**settings), factory)
     component.warm_up()
