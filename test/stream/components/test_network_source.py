@@ -18,7 +18,6 @@ from flowing_puppet_ros.image.networks import choice
 from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED, are_installed
 from flowing_puppet_ros.image.networks.keypoint_networks import FoundPerson
 from flowing_puppet_ros.image.video import live_tracker
-from flowing_puppet_ros.image.video.live_tracker import LiveTracker
 from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.messages.geometry import make_header
@@ -66,6 +65,10 @@ def play(component: PuppetTrackerComponent, images: Sequence[np.ndarray]) -> lis
     return [message for port, message in told if port == "puppets"]
 
 
+def uses_networks(component: PuppetTrackerComponent) -> bool:
+    return isinstance(component._live, NetworkTracker)
+
+
 def plain(count: int) -> list[np.ndarray]:
     texture = np.random.default_rng(4).integers(100, 140, (120, 160, 3)).astype(np.uint8)
     return [texture] * count
@@ -73,7 +76,7 @@ def plain(count: int) -> list[np.ndarray]:
 
 def test_auto_without_networks_warns_once_and_takes_the_own_detector(nothing_installed: None) -> None:
     component = PuppetTrackerComponent(settings(), FACTORY)
-    assert isinstance(component._live, LiveTracker)
+    assert not uses_networks(component)
     assert len(play(component, plain(3))) == 3
     assert [text for text in component.report.warnings if "networks" in text] == [NOT_INSTALLED]
     assert component.counters["images"] == 3 and component.counters["unusable"] == 0
@@ -104,14 +107,14 @@ def test_the_source_can_change_while_the_tracker_runs(monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(live_tracker, "load_networks", load)
     component = PuppetTrackerComponent(settings(**{"detection.source": "none"}), FACTORY)
-    assert type(component._live) is LiveTracker and not asked
+    assert not uses_networks(component) and not asked
     component.reconfigure(settings(**{"detection.source": "neural"}))
-    assert type(component._live) is NetworkTracker and asked == ["neural"]
+    assert uses_networks(component) and asked == ["neural"]
     messages = play(component, plain(4))
     assert [len(message.puppets) for message in messages] == [1] * 4 and fixed.asked == 4
     assert component.counters["searches for everybody"] == 1 and component.counters["close looks"] == 3
     component.reconfigure(settings(**{"detection.source": "neural", "detection.min_probability": 0.5}))
-    assert type(component._live) is NetworkTracker and asked == ["neural"], "they are not loaded again"
+    assert uses_networks(component) and asked == ["neural"], "they are not loaded again"
     component.set_expected("detections", True)
     play(component, plain(2))
     assert fixed.asked == 4, "while somebody publishes detections the networks rest"
