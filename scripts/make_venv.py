@@ -214,12 +214,16 @@ def check_imports(environment: dict[str, str]) -> None:
 
 
 def install_networks(environment: dict[str, str]) -> None:
-    """Install the keypoint networks; a failure is only told, since the package has a detector of its own."""
+    """Install the keypoint networks; a failure is only told, since the package has a detector of its own.
+
+    It is not tried again by each make, which would take long where there is no network.
+    """
+    command: list[str | Path] = [VENV / "bin" / "flowing-puppet", "networks", "--install"]
     try:
-        command: list[str | Path] = [VENV / "bin" / "flowing-puppet", "networks", "--install"]
         run(command, environment, "networks", "The keypoint networks were not installed")
     except SetupError as error:
-        print(f"\r{error} People are found by the package's own detector instead.", file=sys.stderr)
+        remedy = f"until you run `{' '.join(map(str, command))}`"
+        print(f"\r{error} People are found by the package's own detector {remedy}.", file=sys.stderr)
 
 
 def make_steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]:

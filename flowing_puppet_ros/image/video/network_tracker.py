@@ -17,7 +17,7 @@ from functools import partial
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Image
-from flowing_puppet_ros.flow.estimate import FlowPair
+from flowing_puppet_ros.flow.estimate import MIN_SIDE_PX, FlowPair
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.networks.agreement import calibrate
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
@@ -32,6 +32,7 @@ from flowing_puppet_ros.image.video.pending_detection import (
     to_ns,
 )
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
+from flowing_puppet_ros.images import as_image
 from flowing_puppet_ros.units import NANOSECONDS
 
 
@@ -88,12 +89,13 @@ class NetworkTracker:
     def step(
         self, image: Image, stamp_ns: int, flow: FlowPair | None = None, executor: Executor | None = None
     ) -> TrackResult:
-        """Track the next `image` (H, W, 3) RGB.
+        """Track the next `image` (H, W, 3) RGB or (H, W) grey; InputError, and nothing has changed, if it is not one.
 
         `flow` is as `FlowingPuppetTracker.step` takes it. Runs of the networks go to the `executor`, or finish at once.
         In a slow stream an image waits for the run on itself; in a fast one, tracking goes on beside it, and the next
         image uses what it finds.
         """
+        image = as_image(image, MIN_SIDE_PX)
         if not self._clock.advance(image, stamp_ns):
             self.reset()
             self._clock.advance(image, stamp_ns)
@@ -159,7 +161,9 @@ class NetworkTracker:
     def _start_run(self, image: Image, stamp_ns: int, passed_ns: int, executor: Executor | None) -> _Run | None:
         """Start a run on the next image: a search for everybody, or as many looks as there is time for."""
         settings, tracks = self._settings, self._tracker.tracks
-        self._looks = min(self._looks + settings.looks * passed_ns / NANOSECONDS, len(tracks) + 1.0)
+        # Only an image that waits for them can take all looks and a search besides.
+        most = max(1.0, len(tracks) + (passed_ns >= to_ns(settings.min_wait)))
+        self._looks = min(self._looks + settings.looks * passed_ns / NANOSECONDS, most)
         interval = settings.everybody_interval if tracks else settings.search_interval
         everybody = self._everybody_ns is None or self._clock.now_ns - self._everybody_ns >= to_ns(interval)
         chosen = self._choose(tracks, everybody)
@@ -169,6 +173,9 @@ class NetworkTracker:
             self._everybody_ns = self._clock.now_ns
         names = self._tracker.model.joint_names
         known = [known_keypoints(names, track.mean, track.confidence) for track in chosen]
+        # Counted here: two runs may be under way at once.
+        self._counters["searches for everybody"] += everybody
+        self._counters["close looks"] += len(known)
         people = submit(partial(self._look, image, known, everybody), executor)
         searched = None if everybody else frozenset(track.id for track in chosen)
         return _Run(image, stamp_ns, self._clock.now_ns, people, searched=searched)
@@ -188,7 +195,5 @@ class NetworkTracker:
         return chosen
 
     def _look(self, image: Image, known: Sequence[Keypoints], everybody: bool) -> list[Keypoints]:
-        self._counters["searches for everybody"] += everybody
-        self._counters["close looks"] += len(known)
         people = self._source.find(image, known, everybody, self._tracker.settings.max_people)
         return [person.keypoints for person in people]

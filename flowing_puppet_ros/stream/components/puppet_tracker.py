@@ -119,11 +119,12 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
 
     def reconfigure(self, settings: PuppetTrackerSettings) -> None:
         """Go on tracking the same people with other settings."""
-        if settings.flow.preset != self.settings.flow.preset:
-            self._tracker.optical_flow = OpticalFlow(settings.flow)
         before = self.settings.detection
+        # First, since it may be impossible; then nothing has changed.
         if (settings.detection.source, settings.detection.network) != (before.source, before.network):
             self._live = make_live_tracker(self._tracker, settings.detection, self.counters)
+        if settings.flow.preset != self.settings.flow.preset:
+            self._tracker.optical_flow = OpticalFlow(settings.flow)
         self.settings, self._tracker.settings = settings, settings.tracker
         self._live.reconfigure(settings.detection)
 
