@@ -44,7 +44,24 @@ MAY_IMPORT: dict[str, set[str]] = {
     "body.scans": {"body.cloud", "model"},
     "body.search": {"body.cloud", "evidence.cloud", "inference", "model"},
     "body.segmentation": {"body.cloud", "body.scans"},
-    "body.track": {"body.cloud", "body.fit", "body.refine", "body.search", "body.segmentation", "model"},
+    "body.track": {
+        "body.cloud",
+        "body.fit",
+        "body.refine",
+        "body.search",
+        "body.segmentation",
+        "body.upright",
+        "model",
+    },
+    "body.upright": {
+        "body.cloud",
+        "body.fit",
+        "body.refine",
+        "body.search",
+        "body.segmentation",
+        "evidence.cloud",
+        "model",
+    },
     "cli": {
         "annotate",
         "bag",
@@ -66,11 +83,15 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cli.evaluate": {
         "bag",
         "body.fit",
+        "body.scans",
+        "body.track",
+        "body.upright",
         "draw",
         "evaluate",
         "evaluate.bag",
         "evaluate.body",
         "evaluate.image",
+        "evaluate.scene",
         "evaluate.video",
         "evidence.image",
         "image.detector",
@@ -96,6 +117,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "learn.thesis_loop",
         "model.ds",
     },
+    "evaluate.scene": {"body.scans", "evaluate.body"},
     "evaluate.video": {
         "evaluate",
         "evaluate.bag",
@@ -144,6 +166,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "learn.detector": {"evidence.image", "image.detector", "image.formats", "model", "model.ds"},
     "learn.ds": {"learn.anny", "model", "model.ds"},
     "learn.likelihood": {"evidence.image", "image.formats", "model", "model.ds"},
+    "learn.people": {"body.fit", "body.scans", "body.segmentation", "body.upright", "model"},
     "learn.sp": {"learn.anny", "model"},
     "learn.thesis_loop": {
         "evidence.image",
@@ -368,13 +391,8 @@ def test_limits_are_called_min_and_max() -> None:
     other = re.compile(r"(?:^|_)(least|most|fewest|farthest|longest|shortest|largest|smallest)(?:_|$)", re.IGNORECASE)
     for path in MODULES:
         for node in parsed(path).body:
-            targets = (
-                node.targets
-                if isinstance(node, ast.Assign)
-                else [node.target]
-                if isinstance(node, ast.AnnAssign)
-                else []
-            )
+            assigns = isinstance(node, ast.Assign | ast.AnnAssign)
+            targets = getattr(node, "targets", None) or [node.target] if assigns else []  # type: ignore[attr-defined]
             for target in (item for each in targets for item in ast.walk(each) if isinstance(item, ast.Name)):
                 assert not other.search(target.id), f"{module_name(path)}.{target.id}: say MIN_ or MAX_"
     for settings in (kind for name in COMPONENTS for kind in (COMPONENTS[name].settings_type, node_settings(name))):
