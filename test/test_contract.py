@@ -68,6 +68,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "body.fit",
         "body.scans",
         "body.segmentation",
+        "body.track",
         "cli.batch",
         "draw",
         "evidence.image",

@@ -29,6 +29,7 @@ from flowing_puppet_ros.body.scans.scan_frame import (
 )
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.body.segmentation.up_axis import segment_people_unknown_up
+from flowing_puppet_ros.cli.fit_scene import fit_one_sided_scene
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -86,6 +87,14 @@ def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str
         person = _take_whole_scan(scan, fitter, options)
         return {"input": str(source)} | _fit_person(source, person, fitter, options, started, shown)
     fits = []
+    found = _find_one_sided(scan, fitter, options)
+    for number, fit in enumerate(found[1] if found else [], start=1):
+        assert found is not None
+        output = options.out / f"{source.stem}-{number}.npz"
+        seconds = (time.perf_counter() - started) / len(found[1])  # found together
+        fits.append(_finish(output, fitter.model, found[0], fit, "single", seconds))
+    if fits:
+        return {"input": str(source), "people": fits}
     for person in _segment_scene(scan, source, fitter, options):
         fits.append(_fit_person(source, person, fitter, options, started, shown))
         started = time.perf_counter()
@@ -116,6 +125,15 @@ def _take_whole_scan(scan: Scan, fitter: BodyFitter, options: FitOptions) -> Sca
     sensor = _locate_sensor(points, normals, scale, options.view)
     ups = propose_up_axes(points, sensor is not None) if options.up == "auto" else [parse_axis(options.up)]
     return ScanPerson("", points, normals, scale, _candidate_ups(points, ups, options), sensor)
+
+
+def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> tuple[ScanFrame, list[BodyFit]] | None:
+    """Return the people of a scene that was seen from the origin, None where it was not, or nobody is found so."""
+    if options.upright == "any" or scan.faces is not None:
+        return None
+    scale = UNITS["m" if options.unit == "auto" else options.unit]
+    ups = [parse_axis(name) for name in (("z", "y", "-y") if options.up == "auto" else (options.up,))]
+    return fit_one_sided_scene(fitter, scan.points, scale, ups, options.view, options.segmentation)
 
 
 def _segment_scene(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> list[ScanPerson]:
@@ -156,21 +174,28 @@ def _fit_person(
             sensor=person.sensor,
             progress=_progress_on(bar),
         )
-    seconds = time.perf_counter() - started
+    view = "full" if person.sensor is None else "single"
+    return _finish(output, fitter.model, frame, fit, view, time.perf_counter() - started)
+
+
+def _finish(
+    output: Path, model: StitchedPuppet, frame: ScanFrame, fit: BodyFit, view: str, seconds: float
+) -> dict[str, Any]:
+    """Write a fit and return its summary."""
     try:
-        _write_fit(output, fitter.model, frame, fit, seconds)
+        _write_fit(output, model, frame, fit, seconds)
     except OSError as error:
         raise PuppetError(f"{output} cannot be written: {error.strerror}") from error
     return {
         "output": str(output),
-        "model": fitter.model.name,
+        "model": model.name,
         "energy": fit.energy,
         "confidence": fit.confidence,
         "reliable": fit.reliable,
         "two_way_distance_m": fit.two_way_distance,
         "metres_per_unit": frame.scale,
         "up": np.round(frame.up, 6).tolist(),
-        "view": "full" if person.sensor is None else "single",
+        "view": view,
         "seconds": seconds,
     }
 

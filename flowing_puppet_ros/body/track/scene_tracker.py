@@ -168,10 +168,8 @@ class SceneTracker:
         Where nobody can be told from surroundings, a cloud of a person's size is the person.
         """
         extent = np.ptp(cloud.points, axis=0).max(initial=0.0) if len(cloud.points) else 0.0
-        if self._settings.scene and extent > MAX_HEIGHT_M and self._is_one_sided(cloud, remember=False):
-            found = self._find(cloud, (), None, remember=False)
-            fits = [(self._improve(body.person, body.fit, seed, progress), body.person.proven) for body in found]
-            proven = [fit for fit, is_proven in fits if is_proven or fit.reliable]
+        if self._settings.scene and self.is_one_sided_scene(cloud):
+            proven = self.fit_found(self.find_once(cloud), seed, progress)
             if not proven:
                 raise InputError(_NOBODY.format(len(cloud.points)))
             return [(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
@@ -182,6 +180,20 @@ class SceneTracker:
             raise InputError(_NOBODY.format(len(cloud.points)))
         people = self._with_viewpoint(cloud, people, remember=False)
         return [(f"b{number}", self._fit(person, seed, progress)) for number, person in enumerate(people, start=1)]
+
+    def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
+        """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
+        return self._find(cloud, (), None, remember=False)
+
+    def fit_found(self, found: Sequence[FoundBody], seed: int, progress: Progress | None = None) -> list[BodyFit]:
+        """Return the bodies of people found in a scene, fitted again where that may help, without the doubtful."""
+        fits = [(self._improve(body.person, body.fit, seed, progress), body.person.proven) for body in found]
+        return [fit for fit, proven in fits if proven or fit.reliable]
+
+    def is_one_sided_scene(self, cloud: SceneCloud) -> bool:
+        """Return whether a cloud shows people from one side, and more than one person alone."""
+        extent = np.ptp(cloud.points, axis=0).max(initial=0.0) if len(cloud.points) else 0.0
+        return bool(extent > MAX_HEIGHT_M) and self._is_one_sided(cloud, remember=False)
 
     def _is_one_sided(self, cloud: SceneCloud, remember: bool) -> bool:
         """Return whether people are seen from one side: known, set, decided before, or as the likeliest one looks."""

@@ -219,7 +219,7 @@ class PersonFinder:
             return None
         upright = self.upright.fit(cloud, candidate.floor)
         evidence = weigh_fit(upright, candidate, scene, rays, window, self._fitter.model.faces)
-        return PersonModel.load().combine(probability, evidence), upright
+        return 0.0 if evidence.between_others else PersonModel.load().combine(probability, evidence), upright
 
     def _reject(self, candidate: Candidate, probability: float, reason: str, stamp: int, remember: bool) -> None:
         self.last_rejected.append(_describe_rejected(candidate, probability, reason))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -14,7 +15,23 @@ WINDOW_M = (0.9, 0.9)  # to either side of a candidate, and above and below it
 UNKNOWN_STEP_RAD, UNKNOWN_STEP_M = np.radians(0.5), 0.04  # between places without rays, whichever is larger
 MAX_HIDING_POINTS = 3000
 MIN_CELL_RAD, CELL_M = np.radians(0.15), 0.025  # of the image of a body as the sensor would see it
+OUTLINE_CELLS, OUTLINE_M = 6, 0.25
+"""Cells to either side of a body, and distance behind it, in which rays that pass it show its outline."""
 SUPPORT_M = 0.12  # between a body and the end of a ray that confirms it
+
+
+class RayCount(NamedTuple):
+    """Numbers of rays by where they end.
+
+    `on` a body, `behind` it though it is in the way, `before` it; and of those that pass `beside` it, to its left and
+    right, the `free` ones, which end behind it.
+    """
+
+    on: int
+    behind: int
+    before: int
+    free: int
+    beside: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,8 +108,8 @@ class ScanRays:
             float(np.arctan2(z.max() + WINDOW_M[1], away)),
         )
 
-    def compare(self, window: np.ndarray, vertices: np.ndarray, normals: np.ndarray) -> tuple[int, int, int]:
-        """Count the rays that end on a body, that end behind it though it is in the way, and that end in front of it.
+    def compare(self, window: np.ndarray, vertices: np.ndarray, normals: np.ndarray) -> RayCount:
+        """Count the rays that end on a body, behind it though it is in the way, in front of it, and beside it.
 
         Args:
             window: (M,) rays around the body.
@@ -103,13 +120,14 @@ class ScanRays:
         local = vertices[facing] - self.viewpoint
         reach = np.linalg.norm(local, axis=1)
         if not len(local):
-            return 0, 0, 0
+            return RayCount(0, 0, 0, 0, 0)
         middle = float(np.arctan2(local[:, 1].mean(), local[:, 0].mean()))
         azimuth = (np.arctan2(local[:, 1], local[:, 0]) - middle + np.pi) % (2 * np.pi) - np.pi
         elevation = np.arctan2(local[:, 2], np.hypot(local[:, 0], local[:, 1]))
         ray_azimuth = (self.azimuth[window] - middle + np.pi) % (2 * np.pi) - np.pi
         cell = max(MIN_CELL_RAD, CELL_M / float(np.median(reach)))
-        return _compare_rays(azimuth, elevation, reach, ray_azimuth, self.elevation[window], self.range[window], cell)
+        own = self.elevation[window], self.range[window]
+        return RayCount(*_compare_rays(azimuth, elevation, reach, ray_azimuth, *own, cell))
 
 
 def _bin_of(azimuth: np.ndarray) -> np.ndarray:
@@ -118,17 +136,27 @@ def _bin_of(azimuth: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def _compare_rays(azimuth, elevation, reach, ray_azimuth, ray_elevation, ray_range, cell):  # type: ignore[no-untyped-def]
-    """Draw a body's facing vertices into an image of ranges and look the rays up in it."""
+    """Draw a body's facing vertices into an image of ranges and look the rays up in it; see `RayCount`."""
     left, low = azimuth.min(), elevation.min()
     width, height = int((azimuth.max() - left) / cell) + 1, int((elevation.max() - low) / cell) + 1
     image = np.full((width, height), np.inf)
     for k in range(len(azimuth)):
         i, j = int((azimuth[k] - left) / cell), int((elevation[k] - low) / cell)
         image[i, j] = min(image[i, j], reach[k])
-    on, through, blocked = 0, 0, 0
+    first, last, nearest = np.full(height, width), np.full(height, -1), np.full(height, np.inf)
+    for i in range(width):
+        for j in range(height):
+            if image[i, j] < np.inf:
+                first[j], last[j], nearest[j] = min(first[j], i), max(last[j], i), min(nearest[j], image[i, j])
+    on, through, blocked, free, beside = 0, 0, 0, 0, 0
     for k in range(len(ray_azimuth)):
         i, j = int(np.floor((ray_azimuth[k] - left) / cell)), int(np.floor((ray_elevation[k] - low) / cell))
-        if i < 0 or j < 0 or i >= width or j >= height or np.isinf(image[i, j]):
+        if j < 0 or j >= height:
+            continue
+        if last[j] < i <= last[j] + OUTLINE_CELLS or first[j] - OUTLINE_CELLS <= i < first[j]:
+            free += ray_range[k] > nearest[j] + OUTLINE_M
+            beside += 1
+        if i < 0 or i >= width or np.isinf(image[i, j]):
             continue
         gap = ray_range[k] - image[i, j]
         if gap > SUPPORT_M:
@@ -137,4 +165,4 @@ def _compare_rays(azimuth, elevation, reach, ray_azimuth, ray_elevation, ray_ran
             blocked += 1
         else:
             on += 1
-    return on, through, blocked
+    return on, through, blocked, free, beside

@@ -16,6 +16,8 @@ from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 EXPLAINED_M, FOREIGN_M = 0.08, 0.10
 """Distance from the body up to which a candidate's points are explained, and from which on those of a column are not
 its own."""
+MAX_HIDDEN, MIN_OUTLINE = 0.5, 0.2
+"""Share of a body that may be hidden where less of its outline is seen than this."""
 COLUMN_RADIUS_M, COLUMN_HEIGHT_M = 0.5, (0.25, 2.0)
 
 
@@ -31,6 +33,7 @@ class FitEvidence:
         hidden: share of the rays to the body that end in front of it.
         log_points: natural logarithm of the candidate's number of points.
         confidence: of the fit.
+        outline: share of the rays just left and right of the body that end behind it; not learned from.
     """
 
     cost: float
@@ -40,10 +43,16 @@ class FitEvidence:
     hidden: float
     log_points: float
     confidence: float
+    outline: float
+
+    @property
+    def between_others(self) -> bool:
+        """Whether most of the body is hidden and no outline is seen: a wall in the gap between two people, say."""
+        return self.hidden > MAX_HIDDEN and self.outline < MIN_OUTLINE
 
     def to_array(self) -> np.ndarray:
-        """Return the numbers (7,) in the order of the attributes."""
-        return np.array(astuple(self))
+        """Return the numbers (7,) that are learned from, in the order of the attributes."""
+        return np.array(astuple(self)[:-1])
 
 
 def weigh_fit(
@@ -51,7 +60,7 @@ def weigh_fit(
 ) -> FitEvidence:
     """Compare a body with the candidate, the column around it, and the rays of the scan in its `window` (M,)."""
     vertices = found.fit.vertices
-    on, through, blocked = rays.compare(window, vertices, vertex_normals(vertices, faces))
+    count = rays.compare(window, vertices, vertex_normals(vertices, faces))
     index = NearestPoints(vertices)
     distance = index.query(scene.points[candidate.rows])[0]
     middle = vertices[:, :2].mean(axis=0)
@@ -61,10 +70,11 @@ def weigh_fit(
     foreign = float((index.query(scene.points[near])[0] > FOREIGN_M).mean()) if len(near) else 0.0
     return FitEvidence(
         cost=found.cost,
-        supported=on / max(on + through, 1),
+        supported=count.on / max(count.on + count.behind, 1),
         explained=float((distance < EXPLAINED_M).mean()),
         foreign=foreign,
-        hidden=blocked / max(on + through + blocked, 1),
+        hidden=count.before / max(count.on + count.behind + count.before, 1),
         log_points=float(np.log(len(candidate.rows))),
         confidence=found.fit.confidence,
+        outline=count.free / max(count.beside, 1),
     )

@@ -23,7 +23,7 @@ MIN_POINTS, MAX_RANGE_M = 25, 30.0
 PERSON_M, NOBODY_M = 0.35, 0.7
 """Distance of a candidate from the next person up to which it is that person, and from which on it is none."""
 MIN_PERSON_SHARE = 0.4  # of a person's points that a candidate must have to be that person
-EVIDENCE = len(FitEvidence.__dataclass_fields__)
+EVIDENCE = len(FitEvidence.__dataclass_fields__) - 1  # all but the outline
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,14 +18,16 @@ def sheet(x: float, y: tuple[float, float], z: tuple[float, float], step: float 
 
 def test_rays_end_on_before_and_behind_a_body() -> None:
     body = sheet(5.0, (-0.3, 0.3), (-1, 0.6))
-    scan = np.concatenate([sheet(5.05, (-0.3, 0.0), (-1, 0.6)), sheet(8.0, (0.05, 0.4), (-1.6, 0.9))])
+    scan = np.concatenate([sheet(5.05, (-0.3, 0.0), (-1, 0.6)), sheet(8.0, (0.05, 1.0), (-1.6, 0.9))])
     rays = ScanRays.of(scan, np.zeros(3))
-    on, through, blocked = rays.compare(np.arange(len(scan)), body, np.tile([-1.0, 0, 0], (len(body), 1)))
-    assert on > 0.95 * 15 * 80 and through > 0.3 * on and blocked == 0
+    count = rays.compare(np.arange(len(scan)), body, np.tile([-1.0, 0, 0], (len(body), 1)))
+    assert count.on > 0.95 * 15 * 80 and count.behind > 0.3 * count.on and count.before == 0
+    assert count.free == count.beside > 50  # to the right, where the sheet behind goes on
     nearer = ScanRays.of(sheet(3.0, (-0.3, 0.3), (-1, 0.6)), np.zeros(3))
     window = np.arange(len(nearer.points))
-    on, through, blocked = nearer.compare(window, body, np.tile([-1.0, 0, 0], (len(body), 1)))
-    assert on == through == 0 and blocked > 100
+    count = nearer.compare(window, body, np.tile([-1.0, 0, 0], (len(body), 1)))
+    assert count.on == count.behind == 0 and count.before > 100
+    assert count.free == 0 and count.beside > 50
 
 
 def test_what_stands_before_a_candidate_and_below_all_rays_is_unknown() -> None:
