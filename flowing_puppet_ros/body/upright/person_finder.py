@@ -28,6 +28,8 @@ SHAPE_SHARE = 0.5  # of the filter's log odds that count beside the fit's
 MIN_ODDS, MAX_ODDS = 0.02, 0.98  # of the filter
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
 """Points, probability by shape, and score of what a full search is made for though no upright body explains it."""
+MIN_WORTHWHILE = 0.15
+"""Probability by the bank's best body from which on its other bodies are refined too."""
 SAME_PERSON_M = 0.35  # between the middles of two bodies that are one person
 
 
@@ -217,9 +219,19 @@ class PersonFinder:
             cloud = self.upright.make_cloud(points, rays.viewpoint, rays.find_unknown(points, window))
         except InputError:  # the sensor stands in it
             return None
-        upright = self.upright.fit(cloud, candidate.floor)
-        evidence = weigh_fit(upright, candidate, scene, rays, window, self._fitter.model.faces)
-        return 0.0 if evidence.between_others else PersonModel.load().combine(probability, evidence), upright
+
+        def weigh(found: UprightFit) -> float:
+            evidence = weigh_fit(found, candidate, scene, rays, window, self._fitter.model.faces)
+            return 0.0 if evidence.between_others else PersonModel.load().combine(probability, evidence)
+
+        starts = self.upright.find_rough(cloud, candidate.floor)
+        upright = self.upright.refine(starts[:1], cloud, candidate.floor)
+        likely = weigh(upright)
+        if likely >= MIN_WORTHWHILE and len(starts) > 1:
+            others = self.upright.refine(starts[1:], cloud, candidate.floor)
+            if others.cost < upright.cost:
+                upright, likely = others, weigh(others)
+        return likely, upright
 
     def _reject(self, candidate: Candidate, probability: float, reason: str, stamp: int, remember: bool) -> None:
         self.last_rejected.append(_describe_rejected(candidate, probability, reason))
