@@ -6,7 +6,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
 from flowing_puppet_ros.body.track.scene_tracker import SceneCloud, SceneSettings, SceneTracker
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank, measure_stature
@@ -44,21 +45,21 @@ def test_the_person_is_found_at_their_height_and_the_cupboard_is_not(
     scan: tuple[np.ndarray, np.ndarray, float],
 ) -> None:
     points, owner, stature = scan
-    found = []
+    found: list[tuple[PersonCloud, BodyFit]] = []
     for threads in (1, 2):
         fitter = BodyFitter(StitchedPuppet.load(), FitterSettings(threads=threads))
         finder = PersonFinder(fitter, PersonFinderSettings())
         (body,) = finder.find(points, None, ORIGIN, 0)
         assert body.fit is not None
-        found.append(body)
+        found.append((body.person, body.fit))
         assert len(finder.last_rejected) >= 1  # the cupboard, among others
-    person, fit = found[0].person, found[0].fit
+    person, fit = found[0]
     assert person.rows is not None and (owner[person.rows] == 0).mean() > 0.95
     assert np.linalg.norm(fit.vertices[:, :2].mean(axis=0) - PLACE) < 0.12
     assert abs(measure_stature(StitchedPuppet.load(), fit.state) - stature) < 0.08
     assert abs(fit.vertices[:, 2].min() + HEIGHT) < 0.05
     assert fit.confidence > 0.7
-    assert fit.vertices.tobytes() == found[1].fit.vertices.tobytes()
+    assert fit.vertices.tobytes() == found[1][1].vertices.tobytes()
 
 
 @LEARN
