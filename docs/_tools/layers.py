@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +13,7 @@ from types import ModuleType
 ROOT = Path(__file__).resolve().parent.parent.parent
 PACKAGE = ROOT / "flowing_puppet_ros"
 CONTRACT = ROOT / "test" / "test_contract.py"
+HELPERS = ROOT / "test" / "helpers"
 
 
 def pages(linked: Iterable[str]) -> Iterator[tuple[str, str]]:
@@ -34,7 +36,11 @@ def load_contract() -> ModuleType:
     spec = importlib.util.spec_from_file_location("contract", CONTRACT)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    sys.path.insert(0, str(HELPERS))
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(HELPERS))
     return module
 
 

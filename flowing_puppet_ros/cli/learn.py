@@ -15,6 +15,7 @@ MODULES = {
     "likelihood": "likelihood.command",
     "detector": "detector.command",
     "hands": "thesis_loop.hands_command",
+    "people": "people.command",
     "flowing": "thesis_loop.energy_weights_command",
 }
 

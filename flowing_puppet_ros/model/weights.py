@@ -10,7 +10,7 @@ import numpy as np
 
 from flowing_puppet_ros.errors import InputError
 
-Kind = Literal["sp", "ds", "likelihood", "detector", "hands"]
+Kind = Literal["sp", "ds", "likelihood", "detector", "hands", "people"]
 FOLDER = "weights"
 
 

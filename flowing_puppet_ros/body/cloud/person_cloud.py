@@ -22,6 +22,8 @@ class PersonCloud:
         rows: (N,) indices into the scene's points, ascending; None when the cloud is all of them.
         score: 0 to 1, how much size, shape and position are a person's.
         owner: index of the known body in these points, None for a new person.
+        floor: metres, z of the floor under the person, None where it is not known.
+        proven: whether it is known to be a person; else a reliable fit has to show it.
     """
 
     points: F64
@@ -31,6 +33,8 @@ class PersonCloud:
     rows: I64 | None = None
     score: float = 1.0
     owner: int | None = None
+    floor: float | None = None
+    proven: bool = True
 
     @property
     def middle(self) -> F64:

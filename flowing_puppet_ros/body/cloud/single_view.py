@@ -37,8 +37,10 @@ class SingleViewCloud(Cloud):
     depth_tolerance: float
 
     @classmethod
-    def seen_from(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray) -> SingleViewCloud:
-        """Index a cloud; the arguments are those of `Cloud`.
+    def seen_from(
+        cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray, unknown: np.ndarray | None = None
+    ) -> SingleViewCloud:
+        """Index a cloud; the arguments are those of `Cloud`, `unknown` that of `OneSidedView.build`.
 
         Raises:
             InputError: when part of the cloud lies behind the sensor.
@@ -51,7 +53,7 @@ class SingleViewCloud(Cloud):
             )
         near = points[cKDTree(points).query(points, k=min(NOISE_NEIGHBOURS, len(points)))[1]]
         noise = float(np.median(np.abs(((near - points[:, None]) * normals[:, None]).sum(axis=2)[:, 1:])))
-        view = OneSidedView.build(points, viewpoint)
+        view = OneSidedView.build(points, viewpoint, unknown)
         return cls(
             points,
             normals,

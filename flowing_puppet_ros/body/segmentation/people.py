@@ -36,7 +36,7 @@ FLOOR_GAP_LIMITS_M = (0.5, 1.2)
 class SegmentationSettings(Settings):
     """Settings of `segment_people`."""
 
-    max_people: int = setting(8, "maximum number of people taken from a cloud, by score", low=1, high=100)
+    max_people: int = setting(20, "maximum number of people taken from a cloud, by score", low=1, high=100)
     max_range: float = setting(
         30.0, "distance from the sensor beyond which points are dropped", unit="m", low=0.5, high=1000.0
     )
@@ -110,7 +110,7 @@ def segment_people(
             number for number, group in _group_by_label(label[voxel])
             if person_score(local[group], floor) >= settings.min_score
         }  # fmt: skip
-        label[free] = _assign_to_known(centres[free] + origin, label[free], known, whole)
+        label[free] = assign_to_known(centres[free] + origin, label[free], known, whole)
     people = []
     for number, group in _group_by_label(label[voxel]):
         owner = int(number - new_clusters) if number >= new_clusters else None
@@ -123,9 +123,7 @@ def segment_people(
     return people[: settings.max_people]
 
 
-def _assign_to_known(
-    centres: np.ndarray, label: np.ndarray, known: Sequence[np.ndarray], whole: Set[int]
-) -> np.ndarray:
+def assign_to_known(centres: np.ndarray, label: np.ndarray, known: Sequence[np.ndarray], whole: Set[int]) -> np.ndarray:
     """Return the labels (M,) of voxel centres (M, 3), those of the k-th known body as the first free label + k.
 
     A body takes a cluster that it explains for the most part, or that is a `whole` person even where its prediction

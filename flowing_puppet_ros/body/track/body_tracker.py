@@ -19,9 +19,11 @@ from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, check_cloud
-from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
+from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.upright.upright_fit import FEW_POINTS, MIN_MANY_POINTS, UprightFitter, floor_term
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
@@ -93,12 +95,16 @@ class _TrackState:
 
 
 class _Prepared(NamedTuple):
-    """A cloud that is ready to be tracked to; `oriented`: its normals were turned outwards by the predicted body."""
+    """A cloud that is ready to be tracked to; `oriented`: its normals were turned outwards by the predicted body.
+
+    `floor`: z of the floor in metres where few points leave the body to it, else None.
+    """
 
     cloud: Cloud
     stamp: int
     occluded: bool
     oriented: bool
+    floor: float | None
 
 
 class BodyTracker:
@@ -109,6 +115,7 @@ class BodyTracker:
         self._fitter = fitter
         self._settings = settings
         self._no_joints = JointTargets.none(fitter.model)
+        self._upright = UprightFitter(fitter)
         self.counters: Counter[str] = Counter()
         self._quick = False
         self.reset()
@@ -133,6 +140,11 @@ class BodyTracker:
         made._quick = quick
         made.counters = self.counters.copy()
         return made
+
+    def start(self, person: PersonCloud, fit: BodyFit) -> None:
+        """Start from a body that was found in the person's cloud."""
+        seen = _Observation(fit, person.stamp, person.points.mean(axis=0))
+        self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
 
     def accept(self) -> None:
         """Take the last body for the best there is: a full fit has found none that is closer."""
@@ -176,8 +188,9 @@ class BodyTracker:
         return self._record(fit, lost, prepared)
 
     def _prepare(self, person: PersonCloud) -> _Prepared:
-        points, normals = check_cloud(person.points, person.normals)
         stamp, viewpoint = person.stamp, person.viewpoint
+        on_floor = person.floor is not None and viewpoint is not None and len(person.points) < MIN_MANY_POINTS
+        points, normals = (person.points, person.normals) if on_floor else check_cloud(person.points, person.normals)
         if viewpoint is None:
             points, normals = downsample(points, normals, self._settings.max_points)
         if self._state.last is not None and stamp <= self._state.last.stamp:
@@ -188,7 +201,11 @@ class BodyTracker:
         if oriented and last is not None:
             vertices = self._fitter.model.vertices(self._predict(last, points.mean(axis=0), stamp))
             normals = estimate_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
-        return _Prepared(self._fitter.prepare_cloud(points, normals, viewpoint), stamp, occluded, oriented)
+        if on_floor and viewpoint is not None:
+            cloud: Cloud = self._upright.make_cloud(points, viewpoint, np.empty((0, 3)))
+        else:
+            cloud = self._fitter.prepare_cloud(points, normals, viewpoint)
+        return _Prepared(cloud, stamp, occluded, oriented, person.floor if on_floor else None)
 
     def _track(self, prepared: _Prepared) -> tuple[BodyFit | None, bool]:
         """Return the last body after a few steps on the new cloud, and whether it is lost.
@@ -201,7 +218,7 @@ class BodyTracker:
             return self._fitter.assess(self._translate(last, prepared.stamp), cloud), False
         if last is None:
             return None, True
-        fit = self._step(self._predict(last, cloud.points.mean(axis=0), prepared.stamp), cloud)
+        fit = self._step(self._predict(last, cloud.points.mean(axis=0), prepared.stamp), cloud, prepared.floor)
         return fit, self._is_lost(fit)
 
     def _record(self, fit: BodyFit, lost: bool, prepared: _Prepared) -> BodyFit:
@@ -212,14 +229,14 @@ class BodyTracker:
         self._state = replace(state, before=state.last, last=seen, best=best, frames=frames, lost=lost)
         return fit
 
-    def _step(self, start: BodyState, cloud: Cloud) -> BodyFit:
+    def _step(self, start: BodyState, cloud: Cloud, floor: float | None) -> BodyFit:
         """Take a few steps from where the person should be; if they fail, more steps with a wider kernel."""
-        fit = self._refine(start, cloud, NARROW_WIDTHS_M, self._settings.gauss_newton_steps)
+        fit = self._refine(start, cloud, NARROW_WIDTHS_M, self._settings.gauss_newton_steps, floor)
         if not self._is_lost(fit):
             self.counters["tracked"] += 1
             return fit
         self.counters["widened"] += 1
-        wide = self._refine(start, cloud, WIDE_WIDTHS_M, WIDE_STEPS)
+        wide = self._refine(start, cloud, WIDE_WIDTHS_M, WIDE_STEPS, floor)
         return min(fit, wide, key=lambda found: found.two_way_distance)
 
     def _refit(
@@ -228,6 +245,9 @@ class BodyTracker:
         """Return the full fit, unless the tracked body is closer to the cloud; its distance is the new best."""
         self.counters["searched"] += 1
         cloud = prepared.cloud
+        if prepared.floor is not None and isinstance(cloud, SingleViewCloud):
+            fit = self._upright.fit(cloud, prepared.floor).fit
+            return self._keep_closer(tracked, fit)
         # Normals that were turned by a body that is lost would mislead the search.
         normals = None if prepared.oriented else cloud.normals
         # On the model's surface: vertices refined beyond it would come and go with the full fits.
@@ -240,6 +260,9 @@ class BodyTracker:
             nonrigid=False,
             quick=self._quick,
         )
+        return self._keep_closer(tracked, fit)
+
+    def _keep_closer(self, tracked: BodyFit | None, fit: BodyFit) -> BodyFit:
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
             fit = tracked
         else:
@@ -282,13 +305,20 @@ class BodyTracker:
         self._state = replace(state, visible=visible)
         return seen < MIN_VISIBLE * visible
 
-    def _refine(self, start: BodyState, cloud: Cloud, widths: tuple[float, float], steps: int) -> BodyFit:
+    def _refine(
+        self, start: BodyState, cloud: Cloud, widths: tuple[float, float], steps: int, floor: float | None
+    ) -> BodyFit:
         weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps)
+        terms: list[SurfaceTerm] = []
+        if floor is not None:
+            weights = replace(FEW_POINTS, sigma_start=widths[0], iterations=steps)
+            terms.append(lambda vertices, _: floor_term(vertices, floor))
         learned = SHAPE_WEIGHT_PER_FRAME * min(self._state.frames, MAX_SHAPE_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
         # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
         facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint)
-        return self._fitter.assess(self._fitter.gauss_newton.run(start, facing, self._no_joints, weights), cloud)
+        body = self._fitter.gauss_newton.run(start, facing, self._no_joints, weights, terms)
+        return self._fitter.assess(body, cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
         return fit.two_way_distance > self._settings.lost_ratio * self._state.best + self._settings.lost_distance

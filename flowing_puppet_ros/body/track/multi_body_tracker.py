@@ -7,9 +7,10 @@ fit, one at a time, while everybody else is tracked on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -47,7 +48,7 @@ class _BodyTrack:
     """One person.
 
     The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, the number of full fits
-    and the stamp of the last.
+    and the stamp of the last, and whether it is `proven` to be a person.
     """
 
     id: str
@@ -58,10 +59,16 @@ class _BodyTrack:
     velocity: F64 = field(default_factory=lambda: np.zeros(3))
     fits: int = 0
     fitted: int = 0
+    proven: bool = True
 
     def predict_middle(self, stamp: int) -> F64:
         """Return where the middle should be at a later time in nanoseconds."""
         return np.asarray(self.middle + self.velocity * 1e-9 * (stamp - self.stamp))
+
+    def prove(self, fit: BodyFit) -> bool:
+        """Return whether it is known to be a person, as a reliable body shows from then on."""
+        self.proven = self.proven or fit.reliable
+        return self.proven
 
     def update(self, middle: F64, stamp: int) -> None:
         """Take where the person is now."""
@@ -118,7 +125,12 @@ class MultiBodyTracker:
         return found
 
     def step(
-        self, people: Sequence[PersonCloud], stamp: int, seed: int, executor: Executor | None = None
+        self,
+        people: Sequence[PersonCloud],
+        stamp: int,
+        seed: int,
+        executor: Executor | None = None,
+        first: Mapping[int, BodyFit] = MappingProxyType({}),
     ) -> list[tuple[str, BodyFit]]:
         """Track everybody to the people of the next cloud.
 
@@ -127,6 +139,7 @@ class MultiBodyTracker:
             stamp: of the cloud in nanoseconds; one before the last restarts the tracker.
             seed: of what is random in this cloud.
             executor: where full fits run; None: in line.
+            first: bodies of new people that are known already, by their index in `people`.
 
         Returns:
             (id, fit) of everybody who is seen and has a body.
@@ -136,6 +149,11 @@ class MultiBodyTracker:
         self._stamp = stamp
         self._adopt_finished_fit()
         matched = self._associate(people, stamp)
+        for track, person in matched:
+            known = next((fit for index, fit in first.items() if people[index] is person), None)
+            if known is not None and track.tracker.last is None:
+                track.tracker.start(person, known)
+                track.fitted = stamp
         fitted = parallel_map(_track, [(track.tracker, person) for track, person in matched], self._threads)
         fits: list[tuple[str, BodyFit]] = []
         waiting: list[tuple[_BodyTrack, SeededCloud]] = []
@@ -143,7 +161,7 @@ class MultiBodyTracker:
             if isinstance(fit, InputError):
                 self._report.count_unusable(fit)
                 continue
-            if fit is not None:
+            if fit is not None and track.prove(fit):
                 fits.append((track.id, fit))
             unreliable = fit is not None and not fit.reliable and stamp - track.fitted >= REFIT_INTERVAL_NS
             cloud = SeededCloud(person, _person_seed(seed, track.number))
@@ -185,7 +203,7 @@ class MultiBodyTracker:
         self._background_fit.start(track.number, track.tracker.fork(quick), cloud, executor)
         self._adopt_finished_fit()
         fit = track.tracker.last
-        return [(track.id, fit)] if known is None and fit is not None else []
+        return [(track.id, fit)] if known is None and fit is not None and track.prove(fit) else []
 
     def _adopt_finished_fit(self) -> None:
         """Take over the tracker that a full fit has led to, unless the track's own is closer by now."""
@@ -220,13 +238,14 @@ class MultiBodyTracker:
             if column in matched:
                 matched[column].update(middle, stamp)
             elif people[column].owner is None:
-                matched[column] = self._start_track(middle, stamp)
+                matched[column] = self._start_track(middle, stamp, people[column].proven)
         return [(matched[column], person) for column, person in enumerate(people) if column in matched]
 
-    def _start_track(self, middle: F64, stamp: int) -> _BodyTrack:
+    def _start_track(self, middle: F64, stamp: int, proven: bool) -> _BodyTrack:
         self._started += 1
         tracker = BodyTracker(self._fitter, self._settings)
-        self._tracks.append(_BodyTrack(f"{self._prefix}{self._started}", self._started, middle, stamp, tracker))
+        name = f"{self._prefix}{self._started}"
+        self._tracks.append(_BodyTrack(name, self._started, middle, stamp, tracker, proven=proven))
         return self._tracks[-1]
 
     def _drop_lost(self, stamp: int) -> None:

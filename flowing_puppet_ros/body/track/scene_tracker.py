@@ -10,13 +10,16 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.body.cloud.coverage import is_single_view
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
+from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
+from flowing_puppet_ros.body.upright.person_finder import FoundBody, PersonFinder, PersonFinderSettings
+from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings, nested, setting
@@ -24,6 +27,11 @@ from flowing_puppet_ros.settings import Settings, nested, setting
 _MAX_COORDINATE = 10_000.0
 MAX_HEIGHT_M = 2.6
 """A cloud that is no wider is a person, when nobody can be told from their surroundings in it."""
+_NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
+MAX_NEW_PEOPLE = 3
+"""New people whose bodies are fitted in a cloud of a stream; the others come with the next."""
+MIN_DECIDING_POINTS = 60
+"""Points of a person from which on they tell whether people are seen from one side."""
 ONLY_ID = "b1"
 """Id of the person when all of a cloud is one person."""
 
@@ -61,6 +69,7 @@ class SceneSettings(Settings):
         " one person",
     )
     segmentation: SegmentationSettings = nested(SegmentationSettings)
+    people: PersonFinderSettings = nested(PersonFinderSettings)
     tracker: MultiBodyTrackerSettings = nested(MultiBodyTrackerSettings)
 
 
@@ -99,18 +108,21 @@ class SceneTracker:
         self._tracker = MultiBodyTracker(fitter, settings.tracker, fitter.settings.seed, report)
         self._single_view: bool | None = None
         self._planes = PlaneCache()
+        self._finder = PersonFinder(fitter, settings.people)
 
     def warm_up(self) -> None:
         """Do beforehand what the first cloud would wait for."""
         self._fitter.warm_up()
         standing = self._fitter.model.vertices(self._fitter.model.rest_state())
         segment_people(standing, None, self._settings.segmentation)
+        self._finder.warm_up()
 
     def reset(self) -> None:
         """Forget everybody."""
         self._tracker.reset()
         self._single_view = None
         self._planes = PlaneCache()
+        self._finder.reset()
 
     def step(
         self, cloud: SceneCloud, seed: int, executor: Executor | None = None
@@ -124,6 +136,8 @@ class SceneTracker:
             off   | on    | the one person is tracked
             on    | off   | people are segmented and named, a full fit of each
             on    | on    | people are segmented with the help of the known bodies, and tracked
+
+        In single views a new person has an upright body at once, which is refined by a full fit where it is doubtful.
         """
         settings = self._settings
         self._check(cloud)
@@ -133,6 +147,15 @@ class SceneTracker:
                 return [(ONLY_ID, self._fit(person, seed))], []
             return self._tracker.step_one(person, seed, executor), []
         known = self._tracker.predict_bodies(cloud.stamp) if settings.track else ()
+        if self._is_one_sided(cloud, remember=True):
+            found = self._find(cloud, known, MAX_NEW_PEOPLE if settings.track else None, settings.track)
+            if not settings.track:
+                fits = {id(body.person): body.fit for body in found}
+                named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
+                return [(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
+            first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
+            seen = [body.person for body in found]
+            return self._tracker.step(seen, cloud.stamp, seed, executor, first), self._tracker.occluded_ids
         people = self._with_viewpoint(cloud, self._segment(cloud, known, self._planes))
         if settings.track:
             return self._tracker.step(people, cloud.stamp, seed, executor), self._tracker.occluded_ids
@@ -144,16 +167,74 @@ class SceneTracker:
 
         Where nobody can be told from surroundings, a cloud of a person's size is the person.
         """
-        people = self._segment(cloud) if self._settings.scene else []
         extent = np.ptp(cloud.points, axis=0).max(initial=0.0) if len(cloud.points) else 0.0
+        if self._settings.scene and self.is_one_sided_scene(cloud):
+            proven = self.fit_found(self.find_once(cloud), seed, progress)
+            if not proven:
+                raise InputError(_NOBODY.format(len(cloud.points)))
+            return [(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
+        people = self._segment(cloud) if self._settings.scene else []
         if not people and (not self._settings.scene or extent <= MAX_HEIGHT_M):
             people = [cloud.whole]
         if not people:
-            raise InputError(
-                f"there is nobody in the cloud of {len(cloud.points)} points; turn scene off to fit it all"
-            )
+            raise InputError(_NOBODY.format(len(cloud.points)))
         people = self._with_viewpoint(cloud, people, remember=False)
         return [(f"b{number}", self._fit(person, seed, progress)) for number, person in enumerate(people, start=1)]
+
+    def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
+        """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
+        return self._find(cloud, (), None, remember=False)
+
+    def fit_found(self, found: Sequence[FoundBody], seed: int, progress: Progress | None = None) -> list[BodyFit]:
+        """Return the bodies of people found in a scene, fitted again where that may help, without the doubtful."""
+        fits = [(self._improve(body.person, body.fit, seed, progress), body.person.proven) for body in found]
+        return [fit for fit, proven in fits if proven or fit.reliable]
+
+    def is_one_sided_scene(self, cloud: SceneCloud) -> bool:
+        """Return whether a cloud shows people from one side, and more than one person alone."""
+        extent = np.ptp(cloud.points, axis=0).max(initial=0.0) if len(cloud.points) else 0.0
+        return bool(extent > MAX_HEIGHT_M) and self._is_one_sided(cloud, remember=False)
+
+    def _is_one_sided(self, cloud: SceneCloud, remember: bool) -> bool:
+        """Return whether people are seen from one side: known, set, decided before, or as the likeliest one looks."""
+        if cloud.single_view or self._settings.view == "single":
+            return True
+        if self._settings.view == "full" or self._single_view is not None:
+            return bool(self._single_view) and self._settings.view != "full"
+        points = self._in_range(cloud)[1]
+        candidates = (
+            find_candidates(SceneHeights.of(points), np.zeros(3), MIN_DECIDING_POINTS)[0] if len(points) else []
+        )
+        if not candidates:
+            return False
+        single = is_single_view(points[max(candidates, key=lambda candidate: len(candidate.rows)).rows])
+        if remember:
+            self._single_view = single
+        return single
+
+    def _in_range(self, cloud: SceneCloud) -> tuple[I64, F64]:
+        """Return the rows of the points that are finite and in range of the sensor at the origin, and the points."""
+        near = np.linalg.norm(cloud.points, axis=1) < self._settings.segmentation.max_range
+        rows = np.flatnonzero(near)
+        return rows, np.asarray(cloud.points[rows], dtype=np.float64)
+
+    def _find(self, cloud: SceneCloud, known: Sequence[F64], max_fits: int | None, remember: bool) -> list[FoundBody]:
+        """Find the people of a single view; the known ones first."""
+        rows, points = self._in_range(cloud)
+        normals = None if cloud.normals is None else cloud.normals[rows]
+        found = self._finder.find(points, normals, np.zeros(3), cloud.stamp, known, max_fits, remember)
+        moved = [FoundBody(replace(body.person, rows=rows[body.person.rows]), body.fit) for body in found]
+        return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
+
+    def _improve(
+        self, person: PersonCloud, fit: BodyFit | None, seed: int, progress: Progress | None = None
+    ) -> BodyFit:
+        """Return the body, or that of a full fit where many points are there and it is closer to them."""
+        if fit is None or (not fit.reliable and len(person.points) >= MIN_MANY_POINTS):
+            full = self._fit(person, seed, progress)
+            if fit is None or full.two_way_distance < fit.two_way_distance:
+                return full if fit is None else replace(full, confidence=fit.confidence)
+        return fit
 
     def _segment(
         self, cloud: SceneCloud, known: Sequence[F64] = (), planes: PlaneCache | None = None

@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import argparse
 
-from flowing_puppet_ros.cli.evaluate import bag, bodies, correspondence, hands, joints, likelihood, pcp, video
+from flowing_puppet_ros.cli.evaluate import bag, bodies, correspondence, hands, joints, likelihood, pcp, scenes, video
 
 KINDS = {
     "pcp": pcp,
     "joints": joints,
     "video": video,
     "bodies": bodies,
+    "scenes": scenes,
     "correspondence": correspondence,
     "bag": bag,
     "likelihood": likelihood,

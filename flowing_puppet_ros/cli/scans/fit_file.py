@@ -15,10 +15,12 @@ import numpy as np
 from tqdm import tqdm
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
-from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame
-from flowing_puppet_ros.body.scans.scan import read_scan, to_smallest_float, write_ply
-from flowing_puppet_ros.body.scans.unit import GUESS, has_size_of_person
-from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson, find_people
+from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame, measure_stature
+from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
+from flowing_puppet_ros.body.scans.scan_frame import parse_axis
+from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit, has_size_of_person
+from flowing_puppet_ros.cli.scans.fit_people import SCENE_UPS, FitOptions, ScanPerson, find_people
+from flowing_puppet_ros.cli.scans.fit_scene import fit_one_sided_scene
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -34,7 +36,16 @@ def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str
     started = time.perf_counter()
     fitter = _make_fitter(options.model, options.settings)
     _refuse_overwriting(source, options)
-    people = find_people(read_scan(source), source, fitter, options)
+    scan = read_scan(source)
+    seen = _find_one_sided(scan, fitter, options) if options.scene else []
+    if seen:
+        each = (time.perf_counter() - started) / len(seen)  # found together
+        fits = [
+            _finish(options.out / f"{source.stem}-{number}.npz", fitter.model, found, "single", (), each)
+            for number, found in enumerate(seen, start=1)
+        ]
+        return {"input": str(source), "people": fits}
+    people = find_people(scan, source, fitter, options)
     if not people[0].suffix:
         return {"input": str(source)} | _fit_person(source, people[0], fitter, options, started, shown)
     fits = []
@@ -76,15 +87,36 @@ def _fit_person(
             progress=_progress_on(bar),
         )
     _refuse_no_person(person, found)
-    seconds = time.perf_counter() - started
+    view = "full" if person.sensor is None else "single"
+    return _finish(output, fitter.model, found, view, person.notes, time.perf_counter() - started)
+
+
+def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list[FrameFit]:
+    """Return the people of a scene that was seen from the origin; none where it was not, or nobody is found so."""
+    moved = options.viewpoint is not None or (scan.viewpoint is not None and np.any(scan.viewpoint))
+    if options.upright == "any" or scan.faces is not None or moved:
+        return []
+    unit = ScanUnit.named("m" if options.unit == "auto" else options.unit)
+    ups = [parse_axis(name) for name in (SCENE_UPS if options.up == "auto" else (options.up,))]
+    found = fit_one_sided_scene(fitter, scan.points, unit.metres, ups, options.view, options.segmentation)
+    if found is None:
+        return []
+    frame, fits = found
+    return [FrameFit(frame, unit, fit, True, True, measure_stature(fitter.model, fit.joints)) for fit in fits]
+
+
+def _finish(
+    output: Path, model: StitchedPuppet, found: FrameFit, view: str, notes: tuple[str, ...], seconds: float
+) -> dict[str, Any]:
+    """Write a fit and return its summary."""
     try:
-        _write_fit(output, fitter.model, found, seconds)
+        _write_fit(output, model, found, seconds)
     except OSError as error:
         raise PuppetError(f"{output} cannot be written: {error.strerror}") from error
     fit, unit = found.fit, found.unit
     return {
         "output": str(output),
-        "model": fitter.model.name,
+        "model": model.name,
         "energy": fit.energy,
         "confidence": fit.confidence,
         "reliable": fit.reliable,
@@ -95,8 +127,8 @@ def _fit_person(
         "child": found.is_child,
         "up": np.round(found.frame.up, 6).tolist(),
         "up_clear": found.up_clear,
-        "view": "full" if person.sensor is None else "single",
-        "notes": [*person.notes, *_describe_frame(found)],
+        "view": view,
+        "notes": [*notes, *_describe_frame(found)],
         "seconds": seconds,
     }
 

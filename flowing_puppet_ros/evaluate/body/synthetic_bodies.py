@@ -30,11 +30,13 @@ class TrueBody:
         vertices: (A, 3) m of Anny, z up; the soles are near z = 0 and the hips near x = y = 0.
         joints: (J, 3) m, named by `BodySource.joint_names`.
         hard: whether the pose was drawn from joint limits alone, not from motion capture.
+        stature: m, of the person standing.
     """
 
     vertices: np.ndarray
     joints: np.ndarray
     hard: bool
+    stature: float
 
     def template_vertices(self, model_name: str) -> np.ndarray:
         """Return the true positions (V, 3) m of the vertices of the shipped Stitched Puppet `model_name`."""
@@ -99,7 +101,9 @@ class BodySource:
     def _pose(self, rest: RestBody, pose: np.ndarray, place: np.ndarray, hard: bool) -> TrueBody:
         vertices, bones = self._anny.pose(rest, pose)
         named = self._anny.locate_landmarks(vertices, bones)
-        return TrueBody(vertices + place, np.stack([named[name] for name in self.joint_names]) + place, hard)
+        return TrueBody(
+            vertices + place, np.stack([named[name] for name in self.joint_names]) + place, hard, rest.stature
+        )
 
     def _draw_sequence(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Draw bone rotations (count, B, 3, 3), pelvis included, and positions (count, 3) m of a moving person."""

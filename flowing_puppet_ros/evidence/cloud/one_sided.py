@@ -33,7 +33,7 @@ class OneSidedView:
         viewpoint: (3,) metres.
         axes: (3, 3), rows right, down and forward, forward towards the middle of the cloud.
         directions: (N, 2) right and down over forward of the cloud's points.
-        depth: (N,) metres along forward.
+        depth: (N,) metres along forward; negative for directions in which nothing is known.
         tolerance: distance between directions beyond which one is beside the silhouette.
         low: (2,) centre of the first cell, as directions.
         cell: edge of a cell, as directions.
@@ -50,8 +50,11 @@ class OneSidedView:
     nearest: np.ndarray
 
     @classmethod
-    def build(cls, points: np.ndarray, viewpoint: np.ndarray) -> OneSidedView:
-        """Index a cloud `points` (N, 3) m, seen from `viewpoint` (3,) m, which lies outside of it."""
+    def build(cls, points: np.ndarray, viewpoint: np.ndarray, unknown: np.ndarray | None = None) -> OneSidedView:
+        """Index a cloud `points` (N, 3) m, seen from `viewpoint` (3,) m, which lies outside of it.
+
+        `unknown` (K, 3) m are places in whose directions the sensor saw nothing of what lies behind them.
+        """
         axes = _axes(points.mean(axis=0) - viewpoint)
         directions, depth = _project(points, viewpoint, axes)
         tree = cKDTree(directions)
@@ -61,6 +64,10 @@ class OneSidedView:
         cell = max(spacing / 2, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
         shape = np.ceil((high - low) / cell).astype(np.int64) + 1
         centres = np.stack(np.meshgrid(*(low[k] + cell * np.arange(shape[k]) for k in (0, 1)), indexing="ij"), axis=-1)
+        if unknown is not None and len(unknown):
+            directions = np.concatenate([directions, _project(unknown, viewpoint, axes)[0]])
+            depth = np.concatenate([depth, np.full(len(unknown), -1.0)])
+            tree = cKDTree(directions)
         nearest = tree.query(centres.reshape(-1, 2))[1].astype(np.int32).reshape(shape)
         tolerance = TOLERANCE_SPACINGS * spacing
         return cls(viewpoint, axes, directions, depth, tolerance, low, cell, np.ascontiguousarray(nearest))
@@ -70,7 +77,8 @@ class OneSidedView:
 
         Returns:
             (N, 3) vectors in metres, at a right angle to the ray, by which points are beside the silhouette, zero
-            inside of it; and (N,) metres along forward by which they are behind the surface, negative in front of it.
+            inside of it; and (N,) metres along forward by which they are behind the surface, negative in front of it,
+            infinite where nothing is known.
         """
         beside, behind = _compare(np.ascontiguousarray(points, dtype=np.float64), *self._arrays())
         return beside, behind
@@ -149,6 +157,9 @@ def _compare(points, viewpoint, axes, directions, seen, tolerance, low, cell, ne
         found, depth, dx, dy = _look_up(
             points[k, 0], points[k, 1], points[k, 2], viewpoint, axes, directions, tolerance, low, cell, nearest
         )
+        if seen[found] < 0:
+            behind[k] = np.inf
+            continue
         behind[k] = depth - seen[found]
         for axis in range(3):
             beside[k, axis] = dx * axes[0, axis] + dy * axes[1, axis]
@@ -166,6 +177,8 @@ def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, 
             for axis in range(3):
                 toward += (viewpoint[axis] - points[p, k, axis]) * normals[p, k, axis]
             facing[p, k] = toward > 0
+            if seen[found] < 0:
+                continue
             behind = depth - seen[found]
             beside = np.sqrt(dx * dx + dy * dy)
             if beside > 0:

@@ -138,4 +138,4 @@ def test_unusable_numbers_are_named(flags: list[str], capsys: pytest.CaptureFixt
 
 def test_truth_needs_a_shipped_model() -> None:
     with pytest.raises(Exception, match="nobody"):
-        TrueBody(np.zeros((3, 3)), np.zeros((1, 3)), False).template_vertices("nobody")
+        TrueBody(np.zeros((3, 3)), np.zeros((1, 3)), False, 1.7).template_vertices("nobody")

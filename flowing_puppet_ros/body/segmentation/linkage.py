@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Single linkage of points whose spacing grows with the distance from the sensor, as between the rings of a LiDAR."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+GAP_M, GAP_PER_M, GAP_LIMITS_M = 0.10, 0.012, (0.15, 0.40)
+"""Gap between points of one thing: at the sensor, more of it for each metre of distance, and its limits."""
+HEIGHT_SCALE = 0.4  # of vertical distances, which joins the rings
+VOXEL_M = (0.07, 0.10)  # edge across and up; points of one voxel are taken for one
+
+
+def thin_points(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the means (M, 3) of the points (N, 3) m in each voxel, and the voxel (N,) of each point."""
+    if not len(points):
+        return np.empty((0, 3)), np.empty(0, dtype=np.int64)
+    low = points.min(axis=0)
+    cell = ((points - low) / np.array([VOXEL_M[0], VOXEL_M[0], VOXEL_M[1]])).astype(np.int64)
+    wide = cell.max(axis=0) + 1
+    key = (cell[:, 0] * wide[1] + cell[:, 1]) * wide[2] + cell[:, 2]
+    voxel = np.unique(key, return_inverse=True)[1]
+    count = np.bincount(voxel)
+    return np.stack([np.bincount(voxel, column) / count for column in points.T], axis=1), voxel
+
+
+def link_points(points: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Return the cluster (N,) of each point; points nearer than the gap at their distance belong together.
+
+    Args:
+        points: (N, 3) m, thinned.
+        distance: (N,) m from the sensor.
+    """
+    if not len(points):
+        return np.empty(0, dtype=np.int64)
+    gap = np.clip(GAP_M + GAP_PER_M * distance, *GAP_LIMITS_M)
+    scaled = np.ascontiguousarray(points * np.array([1.0, 1.0, HEIGHT_SCALE]))
+    low = scaled[:, :2].min(axis=0)
+    cell = ((scaled[:, :2] - low) / GAP_LIMITS_M[1]).astype(np.int64)
+    deep = int(cell[:, 1].max()) + 2
+    key = cell[:, 0] * deep + cell[:, 1]
+    order = np.argsort(key, kind="stable")
+    root = _link(scaled[order], gap[order], key[order], deep)
+    label = np.empty(len(points), dtype=np.int64)
+    label[order] = root
+    return np.unique(label, return_inverse=True)[1]
+
+
+@njit(cache=True, nogil=True)
+def _find_root(parent: np.ndarray, row: int) -> int:
+    while parent[row] != row:
+        parent[row] = parent[parent[row]]
+        row = parent[row]
+    return row
+
+
+@njit(cache=True, nogil=True)
+def _link(points: np.ndarray, gap: np.ndarray, key: np.ndarray, deep: int) -> np.ndarray:
+    """Join points, sorted by the `key` of their cell, with those of their own cell and of the neighbours ahead."""
+    count = len(points)
+    parent = np.arange(count)
+    ahead = np.array([0, 1, deep - 1, deep, deep + 1])
+    for row in range(count):
+        for other_cell in range(5):
+            wanted = key[row] + ahead[other_cell]
+            first = row + 1 if other_cell == 0 else np.searchsorted(key, wanted)
+            for other in range(first, count):
+                if key[other] != wanted:
+                    break
+                limit = max(gap[row], gap[other])
+                dx = points[row, 0] - points[other, 0]
+                dy = points[row, 1] - points[other, 1]
+                dz = points[row, 2] - points[other, 2]
+                if dx * dx + dy * dy + dz * dz < limit * limit:
+                    a, b = _find_root(parent, row), _find_root(parent, other)
+                    if a != b:
+                        parent[max(a, b)] = min(a, b)
+    for row in range(count):
+        parent[row] = _find_root(parent, row)
+    return parent

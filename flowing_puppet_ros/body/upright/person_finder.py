@@ -1,0 +1,267 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The people in a scan of a scene: candidates, a cheap filter, an upright body for each that passes, and its proof."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights, find_candidates
+from flowing_puppet_ros.body.segmentation.people import person_score
+from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
+from flowing_puppet_ros.body.upright.decision_trees import DecisionTrees
+from flowing_puppet_ros.body.upright.rejected_places import RejectedPlaces
+from flowing_puppet_ros.body.upright.scan_rays import ScanRays
+from flowing_puppet_ros.body.upright.upright_fit import UprightFit, UprightFitter
+from flowing_puppet_ros.body.upright.verification import FitEvidence, weigh_fit
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.model import weights
+from flowing_puppet_ros.settings import Settings, setting
+
+MODEL = "clouds"  # name of the learned filter
+SHAPE_SHARE = 0.5  # of the filter's log odds that count beside the fit's
+MIN_ODDS, MAX_ODDS = 0.02, 0.98  # of the filter
+MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
+"""Points, probability by shape, and score of what a full search is made for though no upright body explains it."""
+MIN_WORTHWHILE = 0.15
+"""Probability by the bank's best body from which on its other bodies are refined too."""
+SAME_PERSON_M = 0.35  # between the middles of two bodies that are one person
+
+
+@dataclass(frozen=True)
+class PersonFinderSettings(Settings):
+    """Settings of `PersonFinder`."""
+
+    min_points: int = setting(25, "minimum number of points of a person", low=15, high=100000)
+    min_probability: float = setting(0.5, "minimum probability of a body to be a person", low=0.0, high=1.0)
+    min_filter: float = setting(
+        0.3, "minimum probability, by its shape alone, of what is fitted", low=0.0, high=1.0, advanced=True
+    )
+    max_fits: int = setting(40, "maximum number of bodies fitted in a scan", low=1, high=1000, advanced=True)
+    rejected_time: float = setting(
+        10.0,
+        "time for which what is no person is not fitted again at its place",
+        unit="s",
+        low=0.0,
+        high=3600.0,
+        advanced=True,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PersonModel:
+    """What was learned.
+
+    Attributes:
+        trees: of the filter.
+        mean, scale: (7,) of the fit's evidence.
+        weight: (8,) of the evidence less `mean`, over `scale`, and a constant, in log odds of a person.
+    """
+
+    trees: DecisionTrees
+    mean: np.ndarray
+    scale: np.ndarray
+    weight: np.ndarray
+
+    @classmethod
+    @lru_cache(maxsize=1)
+    def load(cls) -> PersonModel:
+        """Load the shipped model."""
+        return cls.from_arrays(weights.load("people", MODEL))
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PersonModel:
+        """Take the arrays of a file."""
+        return cls(DecisionTrees.from_arrays(arrays), *(arrays[f"fit_{name}"] for name in ("mean", "scale", "weight")))
+
+    def combine(self, shape_probability: float, evidence: FitEvidence) -> float:
+        """Return the probability of a person by the filter and the fit's evidence."""
+        scaled = (evidence.to_array() - self.mean) / self.scale
+        odds = np.clip(shape_probability, MIN_ODDS, MAX_ODDS)
+        total = SHAPE_SHARE * np.log(odds / (1 - odds)) + self.weight[:-1] @ scaled + self.weight[-1]
+        return float(1 / (1 + np.exp(-total)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundBody:
+    """A person and the first body; without one, a person who is known already."""
+
+    person: PersonCloud
+    fit: BodyFit | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RejectedCandidate:
+    """What is no person: its place (3,) m, its probability to be one, and why it was rejected."""
+
+    place: np.ndarray
+    probability: float
+    reason: str
+
+
+class PersonFinder:
+    """Finds the people in the scans of one sensor, and remembers what was none."""
+
+    def __init__(self, fitter: BodyFitter, settings: PersonFinderSettings) -> None:
+        """Fit with the model of `fitter`."""
+        self._fitter = fitter
+        self._settings = settings
+        self.upright = UprightFitter(fitter)
+        self._rejected = RejectedPlaces(settings.rejected_time)
+        self.last_rejected: list[RejectedCandidate] = []
+
+    def warm_up(self) -> None:
+        """Do beforehand what the first scan would wait for."""
+        self.upright.warm_up()
+        PersonModel.load()
+
+    def reset(self) -> None:
+        """Forget what was no person."""
+        self._rejected.clear()
+
+    def find(
+        self,
+        points: np.ndarray,
+        normals: np.ndarray | None,
+        viewpoint: np.ndarray,
+        stamp: int,
+        known: Sequence[np.ndarray] = (),
+        max_fits: int | None = None,
+        remember: bool = True,
+    ) -> list[FoundBody]:
+        """Find the people in a scan; the same scans give the same answer.
+
+        Args:
+            points: (N, 3) m, z up, within the range in which people are searched for.
+            normals: (N, 3) or None; only passed on.
+            viewpoint: (3,) position of the sensor, metres.
+            stamp: of the scan in nanoseconds.
+            known: points (K, 3) in metres on each body that is expected in the scan, at its predicted position.
+            max_fits: bodies that are fitted at most, the likeliest first; None: as set.
+            remember: whether what is no person is remembered, and what was none is left out.
+        """
+        self.last_rejected = []
+        if len(points) < self._settings.min_points:
+            return []
+        scene = SceneHeights.of(points)
+        candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
+        people = [
+            FoundBody(self._make_person(points, normals, rows, scene, viewpoint, stamp, owner=owner), None)
+            for owner, rows in owned.items()
+            if len(rows) >= self._settings.min_points
+        ]
+        probability = PersonModel.load().trees.predict(describe_candidates(candidates, scene, viewpoint))
+        chosen = self._choose(candidates, probability, stamp, remember)
+        if not chosen:
+            return people
+        rays = ScanRays.of(points, viewpoint)
+        taken = [np.asarray(body)[:, :2].mean(axis=0) for body in known if len(body)]
+        found: list[tuple[float, Candidate, UprightFit]] = []
+        bent: list[Candidate] = []
+        limit = self._settings.max_fits if max_fits is None else max_fits
+        for number in chosen[:limit]:
+            candidate = candidates[number]
+            judged = self._judge(candidate, float(probability[number]), scene, rays)
+            if judged is None:
+                continue
+            if judged[0] >= self._settings.min_probability:
+                found.append((judged[0], candidate, judged[1]))
+                continue
+            self._reject(candidate, judged[0], "no upright body explains it", stamp, remember)
+            if self._may_be_bent(candidate, scene, float(probability[number])):
+                bent.append(candidate)
+        for likely, candidate, upright in sorted(found, key=lambda each: -each[0]):
+            middle = upright.fit.vertices[:, :2].mean(axis=0)
+            if all(np.hypot(*(middle - other)) > SAME_PERSON_M for other in taken):
+                taken.append(middle)
+                person = self._make_person(points, normals, candidate.rows, scene, viewpoint, stamp, score=likely)
+                people.append(FoundBody(person, replace(upright.fit, confidence=likely)))
+        for candidate in bent:
+            if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
+                taken.append(candidate.middle)
+                person = self._make_person(points, normals, candidate.rows, scene, viewpoint, stamp, score=0.0)
+                people.append(FoundBody(replace(person, proven=False), None))
+        return people
+
+    def _may_be_bent(self, candidate: Candidate, scene: SceneHeights, probability: float) -> bool:
+        """Return whether a candidate may be a person who sits, bends or lifts the arms, for a full search to show."""
+        if len(candidate.rows) < MIN_BENT_POINTS or probability < MIN_BENT_PROBABILITY or not candidate.whole:
+            return False
+        return person_score(scene.points[candidate.rows], None) >= MIN_BENT_SCORE
+
+    def _choose(self, candidates: list[Candidate], probability: np.ndarray, stamp: int, remember: bool) -> list[int]:
+        """Return the candidates that are worth a fit, the likeliest first."""
+        chosen = []
+        for number in np.argsort(-probability, kind="stable"):
+            candidate = candidates[number]
+            if probability[number] < self._settings.min_filter:
+                self.last_rejected.append(
+                    _describe_rejected(candidate, probability[number], "its shape is no person's")
+                )
+            elif remember and self._rejected.contains(candidate, stamp):
+                self.last_rejected.append(_describe_rejected(candidate, probability[number], "rejected before"))
+            else:
+                chosen.append(int(number))
+        return chosen
+
+    def _judge(
+        self, candidate: Candidate, probability: float, scene: SceneHeights, rays: ScanRays
+    ) -> tuple[float, UprightFit] | None:
+        """Return the probability of a person and the body; None where no body can be fitted."""
+        points = scene.points[candidate.rows]
+        window = rays.find_window(points)
+        try:
+            cloud = self.upright.make_cloud(points, rays.viewpoint, rays.find_unknown(points, window))
+        except InputError:  # the sensor stands in it
+            return None
+
+        def weigh(found: UprightFit) -> float:
+            evidence = weigh_fit(found, candidate, scene, rays, window, self._fitter.model.faces)
+            return 0.0 if evidence.between_others else PersonModel.load().combine(probability, evidence)
+
+        starts = self.upright.find_rough(cloud, candidate.floor)
+        upright = self.upright.refine(starts[:1], cloud, candidate.floor)
+        likely = weigh(upright)
+        if likely >= MIN_WORTHWHILE and len(starts) > 1:
+            others = self.upright.refine(starts[1:], cloud, candidate.floor)
+            if others.cost < upright.cost:
+                upright, likely = others, weigh(others)
+        return likely, upright
+
+    def _reject(self, candidate: Candidate, probability: float, reason: str, stamp: int, remember: bool) -> None:
+        self.last_rejected.append(_describe_rejected(candidate, probability, reason))
+        if remember:
+            self._rejected.add(candidate, stamp)
+
+    def _make_person(
+        self,
+        points: np.ndarray,
+        normals: np.ndarray | None,
+        rows: np.ndarray,
+        scene: SceneHeights,
+        viewpoint: np.ndarray,
+        stamp: int,
+        score: float = 1.0,
+        owner: int | None = None,
+    ) -> PersonCloud:
+        middle = np.median(points[rows, :2], axis=0)
+        return PersonCloud(
+            points[rows],
+            None if normals is None else normals[rows],
+            stamp,
+            viewpoint,
+            rows,
+            score,
+            owner,
+            scene.floor.locate(*middle),
+        )
+
+
+def _describe_rejected(candidate: Candidate, probability: float, reason: str) -> RejectedCandidate:
+    place = np.array([*candidate.middle, candidate.floor])
+    return RejectedCandidate(place, float(probability), reason)

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The rays of a whole scan: what hides a candidate from the sensor, and where the sensor did not look."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+BINS = 360  # of azimuth, in which the lowest ray is looked up
+HIDING_DISTANCE_M = 0.3  # in front of a candidate, from which on something else hides what is behind it
+WINDOW_M = (0.9, 0.9)  # to either side of a candidate, and above and below it
+UNKNOWN_STEP_RAD, UNKNOWN_STEP_M = np.radians(0.5), 0.04  # between places without rays, whichever is larger
+MAX_HIDING_POINTS = 3000
+MIN_CELL_RAD, CELL_M = np.radians(0.15), 0.025  # of the image of a body as the sensor would see it
+OUTLINE_CELLS, OUTLINE_M = 6, 0.25
+"""Cells to either side of a body, and distance behind it, in which rays that pass it show its outline."""
+SUPPORT_M = 0.12  # between a body and the end of a ray that confirms it
+
+
+class RayCount(NamedTuple):
+    """Numbers of rays by where they end.
+
+    `on` a body, `behind` it though it is in the way, `before` it; and of those that pass `beside` it, to its left and
+    right, the `free` ones, which end behind it.
+    """
+
+    on: int
+    behind: int
+    before: int
+    free: int
+    beside: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanRays:
+    """The rays of a scan as seen from its sensor.
+
+    Attributes:
+        points: (N, 3) metres.
+        viewpoint: (3,) metres.
+        azimuth, elevation: (N,) radians.
+        range: (N,) metres.
+        lowest: (BINS,) radians, elevation of the lowest ray by azimuth, NaN where there is none.
+        highest: radians, elevation of the highest ray.
+    """
+
+    points: np.ndarray
+    viewpoint: np.ndarray
+    azimuth: np.ndarray
+    elevation: np.ndarray
+    range: np.ndarray
+    lowest: np.ndarray
+    highest: float
+
+    @classmethod
+    def of(cls, points: np.ndarray, viewpoint: np.ndarray) -> ScanRays:
+        """Look at the rays of a scan with N > 0 finite points."""
+        local = points - viewpoint
+        flat = np.hypot(local[:, 0], local[:, 1])
+        azimuth, elevation = np.arctan2(local[:, 1], local[:, 0]), np.arctan2(local[:, 2], flat)
+        number = _bin_of(azimuth)
+        lowest = np.full(BINS, np.inf)
+        np.minimum.at(lowest, number, elevation)
+        lowest[np.isinf(lowest)] = np.nan
+        reach = np.hypot(flat, local[:, 2])
+        return cls(points, viewpoint, azimuth, elevation, reach, lowest, float(elevation.max()))
+
+    def find_window(self, points: np.ndarray) -> np.ndarray:
+        """Return the indices (M,) of the rays around a candidate with points (K, 3) m."""
+        local = points - self.viewpoint
+        away = max(float(np.hypot(local[:, 0], local[:, 1]).min()), 0.3)
+        middle = float(np.arctan2(local[:, 1].mean(), local[:, 0].mean()))
+        turn = np.abs((self.azimuth - middle + np.pi) % (2 * np.pi) - np.pi)
+        low, high = self._limit_elevation(points, away)
+        return np.flatnonzero((turn < np.arctan(WINDOW_M[0] / away)) & (self.elevation > low) & (self.elevation < high))
+
+    def find_unknown(self, points: np.ndarray, window: np.ndarray) -> np.ndarray:
+        """Return places (K, 3) m in whose directions nothing is known about a candidate with points (N, 3) m.
+
+        These are what stands in front of it, and directions below, beside and above all rays of the scan.
+        """
+        own = np.linalg.norm(points - self.viewpoint, axis=1)
+        hiding = window[self.range[window] < np.percentile(own, 5) - HIDING_DISTANCE_M]
+        hiding = hiding[:: 1 + len(hiding) // MAX_HIDING_POINTS]
+        return np.concatenate([self.points[hiding], self._find_unscanned(points)])
+
+    def _find_unscanned(self, points: np.ndarray) -> np.ndarray:
+        local = points - self.viewpoint
+        away = max(float(np.hypot(local[:, 0], local[:, 1]).min()), 0.3)
+        middle, half = float(np.arctan2(local[:, 1].mean(), local[:, 0].mean())), np.arctan(WINDOW_M[0] / away)
+        low, high = self._limit_elevation(points, away)
+        step = max(UNKNOWN_STEP_RAD, UNKNOWN_STEP_M / away)
+        azimuth = middle + np.arange(-half, half, step)
+        elevation = np.arange(low, high, step)
+        a, e = (grid.ravel() for grid in np.meshgrid(azimuth, elevation, indexing="ij"))
+        lowest = self.lowest[_bin_of(a)]
+        outside = np.isnan(lowest) | (e < lowest - step) | (e > self.highest + step)
+        a, e = a[outside], e[outside]
+        return self.viewpoint + np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1)
+
+    def _limit_elevation(self, points: np.ndarray, away: float) -> tuple[float, float]:
+        z = points[:, 2] - self.viewpoint[2]
+        return (
+            float(np.arctan2(z.min() - 2 * WINDOW_M[1], away)),
+            float(np.arctan2(z.max() + WINDOW_M[1], away)),
+        )
+
+    def compare(self, window: np.ndarray, vertices: np.ndarray, normals: np.ndarray) -> RayCount:
+        """Count the rays that end on a body, behind it though it is in the way, in front of it, and beside it.
+
+        Args:
+            window: (M,) rays around the body.
+            vertices: (V, 3) m of the body.
+            normals: (V, 3).
+        """
+        facing = ((self.viewpoint - vertices) * normals).sum(axis=1) > 0
+        local = vertices[facing] - self.viewpoint
+        reach = np.linalg.norm(local, axis=1)
+        if not len(local):
+            return RayCount(0, 0, 0, 0, 0)
+        middle = float(np.arctan2(local[:, 1].mean(), local[:, 0].mean()))
+        azimuth = (np.arctan2(local[:, 1], local[:, 0]) - middle + np.pi) % (2 * np.pi) - np.pi
+        elevation = np.arctan2(local[:, 2], np.hypot(local[:, 0], local[:, 1]))
+        ray_azimuth = (self.azimuth[window] - middle + np.pi) % (2 * np.pi) - np.pi
+        cell = max(MIN_CELL_RAD, CELL_M / float(np.median(reach)))
+        own = self.elevation[window], self.range[window]
+        return RayCount(*_compare_rays(azimuth, elevation, reach, ray_azimuth, *own, cell))
+
+
+def _bin_of(azimuth: np.ndarray) -> np.ndarray:
+    return np.floor((azimuth + np.pi) / (2 * np.pi) * BINS).astype(np.int64) % BINS
+
+
+@njit(cache=True, nogil=True)
+def _compare_rays(azimuth, elevation, reach, ray_azimuth, ray_elevation, ray_range, cell):  # type: ignore[no-untyped-def]
+    """Draw a body's facing vertices into an image of ranges and look the rays up in it; see `RayCount`."""
+    left, low = azimuth.min(), elevation.min()
+    width, height = int((azimuth.max() - left) / cell) + 1, int((elevation.max() - low) / cell) + 1
+    image = np.full((width, height), np.inf)
+    for k in range(len(azimuth)):
+        i, j = int((azimuth[k] - left) / cell), int((elevation[k] - low) / cell)
+        image[i, j] = min(image[i, j], reach[k])
+    first, last, nearest = np.full(height, width), np.full(height, -1), np.full(height, np.inf)
+    for i in range(width):
+        for j in range(height):
+            if image[i, j] < np.inf:
+                first[j], last[j], nearest[j] = min(first[j], i), max(last[j], i), min(nearest[j], image[i, j])
+    on, through, blocked, free, beside = 0, 0, 0, 0, 0
+    for k in range(len(ray_azimuth)):
+        i, j = int(np.floor((ray_azimuth[k] - left) / cell)), int(np.floor((ray_elevation[k] - low) / cell))
+        if j < 0 or j >= height:
+            continue
+        if last[j] < i <= last[j] + OUTLINE_CELLS or first[j] - OUTLINE_CELLS <= i < first[j]:
+            free += ray_range[k] > nearest[j] + OUTLINE_M
+            beside += 1
+        if i < 0 or i >= width or np.isinf(image[i, j]):
+            continue
+        gap = ray_range[k] - image[i, j]
+        if gap > SUPPORT_M:
+            through += 1
+        elif gap < -SUPPORT_M:
+            blocked += 1
+        else:
+            on += 1
+    return on, through, blocked, free, beside

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bank of people who stand, walk and turn, drawn from the model, and how well each explains a candidate.
+
+The soles are on the floor, so only the place and the yaw are free. What a few dozen points leave open, above all the
+height, comes from the floor and from the bank, not from the points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from flowing_puppet_ros.body.cloud.mesh_geometry import farthest_points, vertex_normals
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
+from flowing_puppet_ros.evidence.cloud.one_sided import distances
+from flowing_puppet_ros.model import rotation as so3
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+
+POSES, YAWS, SHAPE_SCALE = 120, 16, 0.7
+MIN_STRAIGHT_KNEE_RAD, MIN_OTHER_KNEE_RAD = np.radians(150.0), np.radians(95.0)
+MAX_TRUNK_TILT_RAD, MAX_STRIDE_M = np.radians(22.0), 0.35
+"""What makes a drawn body upright: knees, tilt of the trunk, distance of the ankles before each other; hands below the
+neck."""
+MEAN_STATURE_M, STATURE_DEVIATION_M, STATURE_COST_M = 1.72, 0.1, 0.002
+"""Statures of people, and the mean distance that one squared deviation from them is worth."""
+ROUGH_POINTS, FINE_POINTS = 90, 300  # surface points of a body
+ROUGH_TARGETS, FINE_TARGETS = 60, 250  # of the cloud
+FINE_BODIES, MAX_SAME_YAW = 64, 2
+SEEN_MARGIN_M = 0.08  # above and below a cloud within which a body's surface is taken for seen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UprightBank:
+    """Upright bodies of one model; row = yaw * POSES + pose.
+
+    Attributes:
+        states: POSES bodies that face along x, hips at x = y = 0, soles at z = 0.
+        turns: (YAWS, 3, 3).
+        points: (YAWS * POSES, FINE_POINTS, 3) m, so ordered that the first are spread evenly.
+        normals: (YAWS * POSES, FINE_POINTS, 3).
+        stature: (POSES,) metres.
+    """
+
+    states: list[BodyState]
+    turns: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    stature: np.ndarray
+
+    def find_best(self, cloud: SingleViewCloud, floor: float, count: int) -> list[tuple[float, BodyState]]:
+        """Return the `count` best bodies on a cloud with their costs in metres, at most two of a yaw.
+
+        `floor` is z of the floor, metres.
+        """
+        rows = np.arange(len(self.points))
+        targets = cloud.points[farthest_points(cloud.points, FINE_TARGETS)]
+        rough, _ = self._judge(cloud, floor, rows, targets[:ROUGH_TARGETS], ROUGH_POINTS)
+        rows = np.argsort(rough, kind="stable")[:FINE_BODIES]
+        cost, shift = self._judge(cloud, floor, rows, targets, FINE_POINTS)
+        best: list[tuple[float, BodyState]] = []
+        yaws: list[int] = []
+        for k in np.argsort(cost, kind="stable"):
+            yaw, pose = divmod(int(rows[k]), POSES)
+            if yaws.count(yaw) < MAX_SAME_YAW and len(best) < count:
+                yaws.append(yaw)
+                best.append((float(cost[k]), _place(self.states[pose], self.turns[yaw], shift[k])))
+        return best
+
+    def _judge(
+        self, cloud: SingleViewCloud, floor: float, rows: np.ndarray, targets: np.ndarray, surface: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the costs (P,) m of bodies moved to the cloud, and by how much (P, 3) m they were moved."""
+        points, normals = self.points[rows, :surface], self.normals[rows, :surface]
+        middle = targets.mean(axis=0)
+        low, high = targets[:, 2].min() - floor - SEEN_MARGIN_M, targets[:, 2].max() - floor + SEEN_MARGIN_M
+        seen = (normals @ (middle - cloud.view.viewpoint) < 0) & (points[:, :, 2] > low) & (points[:, :, 2] < high)
+        sums = (points[:, :, :2] * seen[:, :, None]).sum(axis=1)
+        shift = np.full((len(rows), 3), floor)
+        shift[:, :2] = middle[:2] - sums / np.maximum(seen.sum(axis=1), 1)[:, None]
+        moved = points + shift[:, None, :]
+        misfit, facing = cloud.view.misfit(moved, normals)
+        cost = distances(targets, moved, facing).mean(axis=1) + misfit
+        return cost + stature_cost(self.stature)[rows % POSES], shift
+
+
+def stature_cost(stature: np.ndarray) -> np.ndarray:
+    """Return the cost (P,) m of statures (P,) m."""
+    return STATURE_COST_M * ((stature - MEAN_STATURE_M) / STATURE_DEVIATION_M) ** 2
+
+
+def measure_stature(model: StitchedPuppet, state: BodyState) -> float:
+    """Return the height of the person when standing, in metres: the rest pose, stitched in the person's shape."""
+    rest = model.rest_state()
+    rest.shape[:] = state.shape
+    for number, (parent, child) in enumerate(model.tree.edges):
+        interface = model.interfaces[number]
+        target, own = (
+            model.local_vertices(part, rest.pose[part], rest.shape[part])[index]
+            for part, index in ((parent, interface.parent_index), (child, interface.child_index))
+        )
+        rest.center[child] = rest.center[parent] + np.average(target - own, axis=0, weights=interface.weight)
+    return float(np.ptp(model.vertices(rest)[:, 2]))
+
+
+@lru_cache(maxsize=3)
+def make_upright_bank(model: StitchedPuppet) -> UprightBank:
+    """Draw the bank; made once for a model."""
+    rng = np.random.default_rng(0)
+    rows = farthest_points(model.vertices(model.rest_state()), FINE_POINTS)
+    states: list[BodyState] = []
+    points, normals, statures = [], [], []
+    while len(states) < POSES:
+        state = model.sample(rng, shape_scale=SHAPE_SCALE)
+        vertices = model.vertices(state)
+        joints = dict(zip(model.joint_names, model.joints(vertices), strict=True))
+        if not _is_upright(joints):
+            continue
+        hips = (joints["left_hip"] + joints["right_hip"]) / 2
+        down = np.array([-hips[0], -hips[1], -vertices[:, 2].min()])
+        states.append(BodyState(state.center + down, state.rotation, state.pose, state.shape))
+        points.append((vertices + down)[rows])
+        normals.append(vertex_normals(vertices, model.faces)[rows])
+        statures.append(measure_stature(model, state))
+    turns = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
+    turned = [np.concatenate([np.stack(each) @ turn.T for turn in turns]) for each in (points, normals)]
+    return UprightBank(states, turns, turned[0], turned[1], np.array(statures))
+
+
+def _is_upright(joints: dict[str, np.ndarray]) -> bool:
+    hips = (joints["left_hip"] + joints["right_hip"]) / 2
+    neck = (joints["left_shoulder"] + joints["right_shoulder"]) / 2
+    trunk = neck - hips
+    knees = sorted(
+        _bend(*(joints[f"{side}_{name}"] for name in ("hip", "knee", "ankle"))) for side in ("left", "right")
+    )
+    # The drawn body's torso faces along x, but its trunk need not be upright.
+    stride = abs(joints["left_ankle"][0] - joints["right_ankle"][0])
+    hands = max(joints["left_wrist"][2], joints["right_wrist"][2])
+    return bool(
+        trunk[2] > np.cos(MAX_TRUNK_TILT_RAD) * np.linalg.norm(trunk)
+        and knees[0] > MIN_OTHER_KNEE_RAD
+        and knees[1] > MIN_STRAIGHT_KNEE_RAD
+        and stride < MAX_STRIDE_M
+        and hands < neck[2]
+    )
+
+
+def _bend(above: np.ndarray, joint: np.ndarray, below: np.ndarray) -> float:
+    """Return the angle at a joint, pi where it is straight."""
+    a, b = above - joint, below - joint
+    return float(np.arccos(np.clip(a @ b / (np.linalg.norm(a) * np.linalg.norm(b)), -1, 1)))
+
+
+def _place(state: BodyState, turn: np.ndarray, shift: np.ndarray) -> BodyState:
+    return BodyState(state.center @ turn.T + shift, turn @ state.rotation, state.pose.copy(), state.shape.copy())

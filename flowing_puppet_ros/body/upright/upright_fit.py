@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first body of a candidate: the best of the upright bank after a few Gauss-Newton steps, soles on the floor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
+from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
+from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
+from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.upright.upright_bank import (
+    make_upright_bank,
+    measure_stature,
+    stature_cost,
+)
+from flowing_puppet_ros.model.sp import BodyState
+from flowing_puppet_ros.threads import parallel_map, usable_threads
+
+STARTS = 4  # bodies of the bank that are refined
+FEW_POINTS = RefineWeights(pose=1e-5, shape=3e-5, pairwise=5e-7, sigma_start=0.12, sigma_end=0.05, iterations=8)
+MANY_POINTS = RefineWeights(pose=1e-6, shape=5e-6, pairwise=1e-7, sigma_start=0.08, sigma_end=0.04, iterations=8)
+MIN_MANY_POINTS = 400
+"""Points from which on they tell more about a body than the priors do."""
+FLOOR_WEIGHT, SOLE_VERTICES = 0.3, 25
+"""Weight of the floor against that of the cloud, and the lowest vertices that are on it."""
+MAX_FIT_POINTS = 1500
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UprightFit:
+    """The best upright body on a candidate.
+
+    Attributes:
+        fit: the body.
+        cost: metres, how far body and cloud are from each other, with the prior of the stature.
+        stature: metres.
+    """
+
+    fit: BodyFit
+    cost: float
+    stature: float
+
+
+class UprightFitter:
+    """The upright first answer of one model."""
+
+    def __init__(self, fitter: BodyFitter) -> None:
+        self._fitter = fitter
+        self._none = JointTargets.none(fitter.model)
+        self._threads = usable_threads(fitter.settings.threads)
+
+    def warm_up(self) -> None:
+        """Make the bank beforehand."""
+        make_upright_bank(self._fitter.model)
+
+    def make_cloud(self, points: np.ndarray, viewpoint: np.ndarray, unknown: np.ndarray) -> SingleViewCloud:
+        """Return the cloud of a candidate; InputError when part of it lies behind the sensor.
+
+        Args:
+            points: (N, 3) metres.
+            viewpoint: (3,) position of the sensor, metres.
+            unknown: (K, 3) m, see `ScanRays.find_unknown`.
+        """
+        points = downsample(points, None, MAX_FIT_POINTS)[0]
+        return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, unknown)
+
+    def find_rough(self, cloud: SingleViewCloud, floor: float) -> list[tuple[float, BodyState]]:
+        """Return the bank's best bodies with their costs in metres."""
+        return make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS)
+
+    def fit(self, cloud: SingleViewCloud, floor: float) -> UprightFit:
+        """Fit the best upright body to a cloud; `floor` is z of the floor, metres."""
+        return self.refine(self.find_rough(cloud, floor), cloud, floor)
+
+    def refine(self, starts: list[tuple[float, BodyState]], cloud: SingleViewCloud, floor: float) -> UprightFit:
+        """Refine bodies and return the best; `floor` is z of the floor, metres."""
+        coarse = CoarseCloud.of(cloud)
+        many = len(cloud.points) >= MIN_MANY_POINTS
+
+        def improve(start: tuple[float, BodyState]) -> tuple[float, BodyState, float]:
+            terms = [cloud.free_space_term, lambda vertices, _: floor_term(vertices, floor)]
+            center = start[1].shape[0]
+            weights = replace(FEW_POINTS, shape_center=center)
+            body = self._fitter.gauss_newton.run(start[1], cloud, self._none, weights, terms)
+            if many:
+                body = self._fitter.gauss_newton.run(body, cloud, self._none, MANY_POINTS, terms)
+            stature = measure_stature(self._fitter.model, body)
+            cost = self._fitter.hypotheses.pose_bank.cost(body, coarse) + float(stature_cost(np.array(stature)))
+            return cost, body, stature
+
+        found = parallel_map(improve, starts, self._threads)
+        cost, body, stature = min(found, key=lambda each: each[0])
+        return UprightFit(self._fitter.assess(body, cloud), cost, stature)
+
+
+def floor_term(vertices: np.ndarray, floor: float) -> VertexQuadratic:
+    """Return the quadratic that puts the lowest of the vertices (V, 3) m on the floor, and all that are below it."""
+    chosen = np.zeros(len(vertices), dtype=bool)
+    chosen[np.argpartition(vertices[:, 2], SOLE_VERTICES)[:SOLE_VERTICES]] = True
+    chosen |= vertices[:, 2] < floor
+    weight = np.where(chosen, FLOOR_WEIGHT / SOLE_VERTICES, 0.0)
+    matrix, vector = np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3))
+    matrix[:, 2, 2], vector[:, 2] = weight, weight * (vertices[:, 2] - floor)
+    return VertexQuadratic(matrix, vector)

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic scenes with known people: rooms, streets and halls, seen by scanners of several kinds.
+
+Metres, z up. The people are Anny bodies, which no puppet model generated. What stands around them is made of boxes and
+prisms that are as large as people, or as thin, or as close together, because those are what is taken for people.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
+from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, MAKERS, MAX_TRIES, Disc, Mesh
+
+PLACES = ("room", "street", "hall")
+SCANNERS = ("spinning-32", "spinning-64", "solid-state", "depth")
+SENSOR_HEIGHT_M = {"room": (0.5, 2.2), "street": (1.5, 2.2), "hall": (0.6, 3.0)}
+DISTANCE_M = {"room": (2.0, 8.0), "street": (3.0, 20.0), "hall": (3.0, 16.0)}  # of the people
+MIN_PERSON_GAP_M = 0.55  # between the middles of two people
+MAX_RANGE_M = 60.0  # of the scanners
+MAX_TRUNK_TILT_RAD, MIN_UPRIGHT_SHARE = np.radians(35.0), 0.85
+"""Tilt of the trunk, and height over the stature, of people who stand or walk."""
+
+MAX_BEARING_RAD = 0.5  # of people before scanners that look ahead only
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SyntheticScene:
+    """A scan of a scene in the sensor's frame, z up, the sensor at the origin.
+
+    Attributes:
+        points: (N, 3) metres.
+        owner: (N,) index of the person whom the point is on, -1 for the surroundings.
+        people: the bodies.
+        floor: metres, z of the floor.
+    """
+
+    points: np.ndarray
+    owner: np.ndarray
+    people: list[TrueBody]
+    floor: float
+
+
+def draw_scene(source: BodySource, rng: np.random.Generator, place: str, scanner: str, people: int) -> SyntheticScene:
+    """Draw a scene with `people` standing or walking people and scan it; as many as find a free place are in it."""
+    height = float(rng.uniform(*SENSOR_HEIGHT_M[place]))
+    meshes, blocked = MAKERS[place](rng)
+    view = np.pi if scanner.startswith("spinning") else MAX_BEARING_RAD
+    bodies = place_people(source, rng, place, people, blocked, view)
+    points, owner = scan_scene(meshes, [(body.vertices, source.triangles) for body in bodies], rng, scanner, height)
+    down = np.array([0.0, 0.0, -height])
+    return SyntheticScene(points, owner, [body.translate(down) for body in bodies], -height)
+
+
+def place_people(
+    source: BodySource, rng: np.random.Generator, place: str, count: int, blocked: Sequence[Disc], view: float
+) -> list[TrueBody]:
+    """Draw people who stand or walk, at free places, `view` radians to either side of x; `blocked` are taken places."""
+    taken = list(blocked)
+    bodies: list[TrueBody] = []
+    half, distance = HALF_SIZE_M[place], DISTANCE_M[place]
+    for _ in range(MAX_TRIES):
+        if len(bodies) == count:
+            break
+        away, angle = rng.uniform(*distance), rng.uniform(-view, view)
+        x, y = away * np.cos(angle), away * np.sin(angle)
+        if bodies and rng.random() < 0.3:  # a group
+            x, y = bodies[-1].joints.mean(axis=0)[:2] + rng.uniform(0.55, 0.9) * np.array(
+                [np.cos(angle), np.sin(angle)]
+            )
+        if abs(x) > half[0] - 0.4 or abs(y) > half[1] - 0.4 or np.hypot(x, y) < 1.5:
+            continue
+        if any(np.hypot(x - a, y - b) < radius for a, b, radius in taken):
+            continue
+        bodies.append(draw_upright(source, rng).translate(np.array([x, y, 0.0])))
+        taken.append((x, y, MIN_PERSON_GAP_M))
+    return bodies
+
+
+def draw_upright(source: BodySource, rng: np.random.Generator) -> TrueBody:
+    """Draw a person who stands or walks, hips at x = y = 0."""
+    names = list(source.joint_names)
+    while True:
+        body = source.draw_body(rng, hard=False)
+        joint = dict(zip(names, body.joints, strict=True))
+        hips = (joint["left_hip"] + joint["right_hip"]) / 2
+        neck = (joint["left_shoulder"] + joint["right_shoulder"]) / 2
+        trunk = neck - hips
+        legs = [
+            np.linalg.norm(joint[f"{side}_hip"] - joint[f"{side}_knee"])
+            + np.linalg.norm(joint[f"{side}_knee"] - joint[f"{side}_ankle"])
+            for side in ("left", "right")
+        ]
+        stretched = (hips[2] - min(joint["left_ankle"][2], joint["right_ankle"][2])) / max(legs)
+        if trunk[2] / np.linalg.norm(trunk) > np.cos(MAX_TRUNK_TILT_RAD) and stretched > MIN_UPRIGHT_SHARE:
+            return body
+
+
+def scan_scene(
+    meshes: Sequence[Mesh], people: Sequence[Mesh], rng: np.random.Generator, scanner: str, height: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Scan meshes from (0, 0, `height`) m; return points (N, 3) in the sensor's frame and whose they are (N,)."""
+    import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    for vertices, triangles in (*people, *meshes):
+        scene.add_triangles(
+            o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, dtype=np.float32)),
+            o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, dtype=np.uint32)),
+        )
+    directions, noise = make_rays(rng, scanner)
+    origins = np.broadcast_to(np.array([0.0, 0.0, height]), directions.shape)
+    rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
+    hits = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
+    distance, geometry = hits["t_hit"].numpy().astype(np.float64), hits["geometry_ids"].numpy().astype(np.int64)
+    seen = np.isfinite(distance) & (distance < MAX_RANGE_M)
+    ranged = distance[seen]
+    deviation = noise if scanner != "depth" else 0.0012 * ranged**2
+    ranged = ranged + deviation * rng.standard_normal(len(ranged))
+    if scanner == "depth":
+        near = ranged < 8.0
+        ranged, seen = ranged[near], np.flatnonzero(seen)[near]
+    owner = geometry[seen]
+    return directions[seen] * ranged[:, None], np.where(owner < len(people), owner, -1)
+
+
+def make_rays(rng: np.random.Generator, scanner: str) -> tuple[np.ndarray, float]:
+    """Return the unit directions (N, 3) of a scanner's rays in the order of the scan, and its range noise in metres."""
+    if scanner.startswith("spinning"):
+        rings = int(scanner.rpartition("-")[2])
+        low, high = (-25.0, 15.0) if rings == 32 else (-24.0, 8.0)
+        azimuth = np.radians(np.arange(0, 360, 0.2)) + rng.uniform(0, 0.003)
+        elevation = np.radians(np.linspace(low, high, rings))
+        a, e = (grid.ravel() for grid in np.meshgrid(azimuth, elevation, indexing="ij"))
+        noise = 0.02
+    elif scanner == "solid-state":
+        # A rosette: two prisms turn at different speeds.
+        turn = np.linspace(0, 2 * np.pi, 60_000) + rng.uniform(0, 2 * np.pi)
+        radius = np.radians(35.0) * np.cos(977.31 * turn)
+        a, e = radius * np.cos(411.7 * turn), radius * np.sin(411.7 * turn)
+        noise = 0.02
+    else:
+        u, v = np.meshgrid((np.arange(0, 640, 2) - 320) / 525, (np.arange(0, 480, 2) - 240) / 525)
+        rays = np.stack([np.ones(u.size), -u.ravel(), -v.ravel() - 0.1], axis=1)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True), 0.005
+    return np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], axis=1), noise

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The floor as a grid, linkage that widens with distance, and candidates where people stand."""
+
+import numpy as np
+
+from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
+from flowing_puppet_ros.body.segmentation.floor_grid import FloorGrid
+from flowing_puppet_ros.body.segmentation.linkage import link_points
+
+SENSOR = np.array([0.0, 0.0, 1.6])
+
+
+def ground(rng: np.random.Generator, count: int = 60_000) -> np.ndarray:
+    """A street that falls by 2 %, with a pavement 15 cm higher from y = 4 on."""
+    xy = rng.uniform(-15, 15, (count, 2))
+    z = -0.02 * xy[:, 0] + 0.15 * (xy[:, 1] > 4)
+    return np.column_stack([xy, z]) + rng.normal(0, 0.01, (count, 3)) * [0, 0, 1]
+
+
+def figure(x: float, y: float, z: float, rng: np.random.Generator, count: int = 400, height: float = 1.7) -> np.ndarray:
+    """A trunk 0.45 by 0.25 m on legs, and a head, as an ellipse at each height."""
+    up = rng.uniform(0, height, count)
+    wide = np.interp(up / height, [0, 0.5, 0.55, 0.8, 0.84, 0.88, 1.0], [0.1, 0.12, 0.2, 0.24, 0.08, 0.09, 0.05])
+    angle = rng.uniform(0, 2 * np.pi, count)
+    return np.column_stack([x + wide * np.cos(angle), y + 0.6 * wide * np.sin(angle), z + up])
+
+
+def test_the_floor_follows_slopes_and_pavements_and_not_cars() -> None:
+    rng = np.random.default_rng(0)
+    car = rng.uniform([-9, -2, 0.3], [-5, -0.2, 1.4], (4000, 3))
+    points = ground(rng)
+    hidden = (points[:, 0] > -9.2) & (points[:, 0] < -4.8) & (points[:, 1] > -2.2) & (points[:, 1] < 0)
+    floor = FloorGrid.find(np.concatenate([points[~hidden], car]))
+    for x, y, z in ((0.0, 0.0, 0.0), (10.0, 0.0, -0.2), (-10.0, 8.0, 0.35), (-7.0, -1.0, 0.14)):
+        assert abs(floor.locate(x, y) - z) < 0.06
+    np.testing.assert_allclose(floor.height(np.array([[10.0, 0.0, 1.0]])), 1.2, atol=0.06)
+
+
+def test_a_floor_that_was_cut_away_is_where_the_legs_end() -> None:
+    rng = np.random.default_rng(1)
+    people = [figure(x, y, 0.0, rng) for x, y in ((3, 0), (5, 2), (6, -3), (8, 1))]
+    floor = FloorGrid.find(np.concatenate(people))
+    assert abs(floor.locate(5, 2)) < 0.15
+
+
+def test_the_gap_grows_with_the_distance_and_is_larger_upwards() -> None:
+    line = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.3, 0.0, 0.6]])
+    near = link_points(line, np.full(3, 3.0))
+    far = link_points(line, np.full(3, 20.0))
+    assert near[0] != near[1] and near[1] != near[2]
+    assert far[0] == far[1] == far[2]
+
+
+def test_everybody_in_a_group_is_a_candidate_and_a_wall_is_none() -> None:
+    rng = np.random.default_rng(2)
+    places = [(6.0, 0.0), (6.1, 0.5), (6.0, -0.45), (3.0, 3.0)]
+    people = [figure(x, y, -0.02 * x, rng) for x, y in places]
+    wall = np.column_stack([rng.uniform(-5, 5, 8000), np.full(8000, -6.0), rng.uniform(0, 3, 8000)])
+    scene = SceneHeights.of(np.concatenate([ground(rng), wall, *people]))
+    found, owned = find_candidates(scene, SENSOR, 25)
+    assert not owned
+    middles = np.array([candidate.middle for candidate in found])
+    for place in places:
+        assert np.linalg.norm(middles - place, axis=1).min() < 0.2
+    assert len(found) <= 6 and not (middles[:, 1] < -5).any()
+    assert all(1.5 < candidate.top < 1.85 for candidate in found)
+
+
+def test_known_people_keep_their_points_and_are_no_candidates() -> None:
+    rng = np.random.default_rng(3)
+    people = [figure(x, y, -0.02 * x, rng) for x, y in ((6.0, 0.0), (6.0, 2.0))]
+    start = 60_000
+    scene = SceneHeights.of(np.concatenate([ground(rng), *people]))
+    found, owned = find_candidates(scene, SENSOR, 25, [people[1]])
+    assert len(found) == 1 and abs(found[0].middle[1]) < 0.2
+    assert set(owned) == {0}
+    assert (owned[0] >= start + 400).all() and len(owned[0]) > 350
+
+
+def test_no_points_above_the_floor_give_no_candidates() -> None:
+    scene = SceneHeights.of(ground(np.random.default_rng(4), 2000))
+    assert find_candidates(scene, SENSOR, 25) == ([], {})

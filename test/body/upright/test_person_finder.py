@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A person whom no puppet model made is found in a scan, at their height, and furniture is not."""
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.track.scene_tracker import SceneCloud, SceneSettings, SceneTracker
+from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
+from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank, measure_stature
+from flowing_puppet_ros.evaluate.body.synthetic_scans import make_box
+from flowing_puppet_ros.evaluate.scene.synthetic_scenes import scan_scene
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+pytestmark = pytest.mark.slow
+LEARN = pytest.mark.skipif(not (find_spec("anny") and find_spec("body_models")), reason="needs the extra learn")
+PLACE, HEIGHT = np.array([7.0, 1.0]), 1.8
+ORIGIN = np.zeros(3)
+
+
+@pytest.fixture(scope="module")
+def scan() -> tuple[np.ndarray, np.ndarray, float]:
+    """A floor, a wall, a cupboard and an Anny body in the rest pose; points, who they are of, the stature."""
+    from flowing_puppet_ros.learn.anny.body import AnnyBody
+
+    anny = AnnyBody("neutral")
+    rest = anny.make_rest_body(anny.mean_phenotype())
+    turned = rest.vertices - [*rest.vertices[:, :2].mean(axis=0), rest.vertices[:, 2].min()] + [*PLACE, 0.0]
+    level = np.eye(3)
+    around = [
+        make_box(np.array([0, 0, -0.05]), np.array([40, 40, 0.1]), level),
+        make_box(np.array([12.0, 0, 1.5]), np.array([0.2, 40, 3]), level),
+        make_box(np.array([6.0, -3.0, 0.85]), np.array([0.6, 0.5, 1.7]), level),
+    ]
+    people = [(turned, anny.triangles)]
+    points, owner = scan_scene(around, people, np.random.default_rng(0), "spinning-64", HEIGHT)
+    return points, owner, rest.stature
+
+
+@LEARN
+def test_the_person_is_found_at_their_height_and_the_cupboard_is_not(
+    scan: tuple[np.ndarray, np.ndarray, float],
+) -> None:
+    points, owner, stature = scan
+    found: list[tuple[PersonCloud, BodyFit]] = []
+    for threads in (1, 2):
+        fitter = BodyFitter(StitchedPuppet.load(), FitterSettings(threads=threads))
+        finder = PersonFinder(fitter, PersonFinderSettings())
+        (body,) = finder.find(points, None, ORIGIN, 0)
+        assert body.fit is not None
+        found.append((body.person, body.fit))
+        assert len(finder.last_rejected) >= 1  # the cupboard, among others
+    person, fit = found[0]
+    assert person.rows is not None and (owner[person.rows] == 0).mean() > 0.95
+    assert np.linalg.norm(fit.vertices[:, :2].mean(axis=0) - PLACE) < 0.12
+    assert abs(measure_stature(StitchedPuppet.load(), fit.state) - stature) < 0.08
+    assert abs(fit.vertices[:, 2].min() + HEIGHT) < 0.05
+    assert fit.confidence > 0.7
+    assert fit.vertices.tobytes() == found[1][1].vertices.tobytes()
+
+
+@LEARN
+def test_a_new_person_has_a_body_in_the_first_scan_and_keeps_the_id(
+    scan: tuple[np.ndarray, np.ndarray, float],
+) -> None:
+    points, owner, _ = scan
+    tracker = SceneTracker(BodyFitter(StitchedPuppet.load(), FitterSettings()), SceneSettings())
+    for step in range(4):
+        moved = points + np.where(owner[:, None] == 0, [0.0, 0.1 * step, 0.0], 0.0)
+        ((identity, fit),) = tracker.step(SceneCloud(moved, None, (step + 1) * 100_000_000), step)[0]
+        assert identity == "b1"
+        assert np.linalg.norm(fit.vertices[:, :2].mean(axis=0) - PLACE - [0, 0.1 * step]) < 0.15
+    empty = points[owner != 0]
+    assert tracker.step(SceneCloud(empty, None, 500_000_000), 9) == ([], ["b1"])
+
+
+def test_the_bank_stands_on_the_floor_and_is_of_many_statures() -> None:
+    bank = make_upright_bank(StitchedPuppet.load())
+    model = StitchedPuppet.load()
+    for state in bank.states[::20]:
+        assert abs(model.vertices(state)[:, 2].min()) < 1e-9
+    assert 0.05 < bank.stature.std() < 0.12 and 1.6 < bank.stature.mean() < 1.8
