@@ -34,7 +34,8 @@ NARROW_WIDTHS_M, WIDE_WIDTHS_M = (0.10, 0.03), (0.25, 0.03)
 WIDE_STEPS = 20
 SHAPE_WEIGHT_PER_FRAME = 1e-6  # that each frame adds to `RefineWeights.shape` for the shape of the frames before
 MAX_SHAPE_FRAMES = 30  # that count for the shape: with more, a first mistake would stay
-MIN_VISIBLE = 0.4  # visible fraction, relative to normal, below which the person counts as occluded
+MIN_VISIBLE = 0.4  # visible fraction, relative to normal, below which the person counts as occluded ...
+MIN_VISIBLE_OF_FEW = 0.75  # ... and where few points show the person, and half of them bends the body more
 VISIBLE_HALF_LIFE_S = 2.0  # in which the normal visible surface falls to half where less is seen
 MAX_STRETCH = 2.0  # frames by which a motion is extrapolated at most
 
@@ -91,6 +92,7 @@ class _TrackState:
     best: float = np.inf
     frames: int = 0
     visible: float = 0.0
+    hidden: bool = False
     lost: bool = True
 
 
@@ -146,6 +148,11 @@ class BodyTracker:
         seen = _Observation(fit, person.stamp, person.points.mean(axis=0))
         self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
 
+    @property
+    def hidden(self) -> bool:
+        """Whether much less of the person was seen in the last cloud than normally."""
+        return self._state.hidden
+
     def accept(self) -> None:
         """Take the last body for the best there is: a full fit has found none that is closer."""
         if self._state.last is not None:
@@ -195,7 +202,9 @@ class BodyTracker:
             points, normals = downsample(points, normals, self._settings.max_points)
         if self._state.last is not None and stamp <= self._state.last.stamp:
             self.reset()
-        occluded = viewpoint is not None and self._update_visible(points, stamp, viewpoint)
+        occluded = viewpoint is not None and self._update_visible(
+            points, stamp, viewpoint, MIN_VISIBLE_OF_FEW if on_floor else MIN_VISIBLE
+        )
         last = self._state.last
         oriented = normals is None and viewpoint is None and last is not None
         if oriented and last is not None:
@@ -266,7 +275,10 @@ class BodyTracker:
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
             fit = tracked
         else:
+            # How much of the person is normally seen does not depend on the body.
+            visible = self._state.visible
             self.reset()
+            self._state = replace(self._state, visible=visible)
         self._state = replace(self._state, best=fit.two_way_distance)
         return fit
 
@@ -296,14 +308,15 @@ class BodyTracker:
         moved = state.center[0] - before.fit.state.center[0]
         return replace(state, center=state.center + _stretch(before, last, stamp) * moved)
 
-    def _update_visible(self, points: F64, stamp: int, viewpoint: F64) -> bool:
-        """Return whether much less of the person is seen than normally; what is normal follows what is seen."""
+    def _update_visible(self, points: F64, stamp: int, viewpoint: F64, min_visible: float) -> bool:
+        """Return whether less than a share of the person is seen than normally; what is normal follows what is seen."""
         state = self._state
         seen = len(points) * float(((points - viewpoint) ** 2).sum(axis=1).mean())
         passed = 0.0 if state.last is None else 1e-9 * (stamp - state.last.stamp)
         visible = max(seen, state.visible * 0.5 ** (passed / VISIBLE_HALF_LIFE_S))
-        self._state = replace(state, visible=visible)
-        return seen < MIN_VISIBLE * visible
+        hidden = seen < min_visible * visible
+        self._state = replace(state, visible=visible, hidden=hidden)
+        return hidden
 
     def _refine(
         self, start: BodyState, cloud: Cloud, widths: tuple[float, float], steps: int, floor: float | None

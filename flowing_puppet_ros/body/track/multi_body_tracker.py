@@ -163,7 +163,9 @@ class MultiBodyTracker:
                 continue
             if fit is not None and track.prove(fit):
                 fits.append((track.id, fit))
-            unreliable = fit is not None and not fit.reliable and stamp - track.fitted >= REFIT_INTERVAL_NS
+            # A full fit to the little that is seen of a hidden person would bend the body.
+            unreliable = fit is not None and not fit.reliable and not track.tracker.hidden
+            unreliable = unreliable and stamp - track.fitted >= REFIT_INTERVAL_NS
             cloud = SeededCloud(person, _person_seed(seed, track.number))
             if not self._background_fit.add(track.number, cloud) and (track.tracker.lost or unreliable):
                 waiting.append((track, cloud))

@@ -13,9 +13,13 @@ class NetworkTimingSettings(Settings):
     """When keypoint networks run on the images of a stream."""
 
     looks: float = setting(
-        30.0, "close looks at tracked people, one person each, that the machine has time for", unit="1/s", low=0.1,
+        30.0,
+        "close looks at the tracked person that the machine has time for; half as many where several are tracked, which"
+        " takes longer too, one of them at a time",
+        unit="1/s",
+        low=0.1,
         high=1e6,
-    )  # fmt: skip
+    )
     min_wait: float = setting(
         0.05,
         "time between images from which on each waits for the look at itself; in faster streams the next one uses it",
@@ -25,7 +29,7 @@ class NetworkTimingSettings(Settings):
         advanced=True,
     )
     everybody_interval: float = setting(
-        0.5, "time between searches for everybody while people are tracked", unit="s", low=0.0, high=3600.0
+        1.0, "time between searches for everybody while people are tracked", unit="s", low=0.0, high=3600.0
     )
     search_interval: float = setting(
         0.1, "time between searches while nobody is tracked", unit="s", low=0.0, high=3600.0, advanced=True
