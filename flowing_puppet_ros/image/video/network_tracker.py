@@ -36,7 +36,7 @@ from flowing_puppet_ros.images import as_image
 from flowing_puppet_ros.units import NANOSECONDS
 
 SEVERAL_SHARE = 0.5
-"""Of the looks at one tracked person: those that there is time for in a fast stream where several are tracked."""
+"""Of the looks at one tracked person: those that there is time for where several are tracked."""
 
 
 def known_keypoints(names: Sequence[str], joints: F64, confidence: F64) -> Keypoints:
@@ -164,10 +164,10 @@ class NetworkTracker:
     def _start_run(self, image: Image, stamp_ns: int, passed_ns: int, executor: Executor | None) -> _Run | None:
         """Start a run on the next image: a search for everybody, or as many looks as there is time for."""
         settings, tracks = self._settings, self._tracker.tracks
+        waits = passed_ns >= to_ns(settings.min_wait)
         # Only an image that waits for them can take all looks and a search besides.
         most = max(1.0, len(tracks) + waits)
-        waits = passed_ns >= to_ns(settings.min_wait)
-        rate = settings.looks if waits or len(tracks) < 2 else SEVERAL_SHARE * settings.looks
+        rate = settings.looks if len(tracks) < 2 else SEVERAL_SHARE * settings.looks
         self._looks = min(self._looks + rate * passed_ns / NANOSECONDS, most)
         interval = settings.everybody_interval if tracks else settings.search_interval
         everybody = self._everybody_ns is None or self._clock.now_ns - self._everybody_ns >= to_ns(interval)

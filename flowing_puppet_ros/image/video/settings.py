@@ -21,7 +21,7 @@ class NetworkTimingSettings(Settings):
         high=1e6,
     )
     min_wait: float = setting(
-        0.05,
+        0.07,
         "time between images from which on each waits for the look at itself; in faster streams the next one uses it",
         unit="s",
         low=0.0,

@@ -129,7 +129,7 @@ def test_two_people_are_looked_at_in_turn_in_a_fast_stream_and_both_in_each_imag
     sides = [necks[0] < 160 for _, necks, _ in seer.looks if necks]
     assert all(one != other for one, other in pairwise(sides)), "the two in turn"
     assert not any(track.missed for track in live._tracker.tracks), "who is not looked at is not missed"
-    live, seer = tracking(everybody_interval=100.0)
+    live, seer = tracking(everybody_interval=100.0, looks=60.0)
     play(live, range(6), "two", rate=10.0)
     assert seer.counts == [0] + [2] * 5
     live, seer = tracking(everybody_interval=100.0)
