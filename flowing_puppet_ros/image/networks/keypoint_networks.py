@@ -133,15 +133,12 @@ class KeypointNetworks:
         ]
 
     def _look_again(self, image: Image, expected: NetworkPose, candidates: list[NetworkPose]) -> list[NetworkPose]:
-        """Return the poses of a known person: of the `candidates` in the whole image, or by a look at the square."""
+        """Return the pose of a known person: in the square, or else one of the `candidates`, who is then taken."""
         own = [pose for pose in candidates if pose_distance(pose, expected) <= MAX_MOVE and pose.score >= MIN_SCORE]
         best = min(own, key=lambda pose: pose_distance(pose, expected), default=None)
-        if best is not None:
-            candidates[:] = [pose for pose in candidates if pose is not best]
-            if not self.thorough and not _is_small(best, image, self.side):
-                return [best]
+        candidates[:] = [pose for pose in candidates if pose is not best]
         again = self._find_in_square(image, expected, MAX_KNOWN_MOVE)
-        return [pose for pose in (best, again) if pose is not None]
+        return [pose for pose in (again, best) if pose is not None][:1]
 
     def _confirm(self, image: Image, pose: NetworkPose) -> list[NetworkPose]:
         """Return a person of the whole image, with another look where one is needed; nothing if it is nobody."""

@@ -96,7 +96,7 @@ EVERY_IMAGE = LiveDetectionSettings(
     full_frame_delay=0.0,
     roi_interval=0.0,
     roi_delay=0.0,
-    networks=NetworkTimingSettings(looks=1e6, min_wait=0.0, everybody_interval=0.0, search_interval=0.0),
+    networks=NetworkTimingSettings(looks=1e6, min_wait=0.0, everybody_interval=0.33, search_interval=0.0),
 )
 """For recordings, where the detector takes the time it needs: people are re-detected in every image."""
 

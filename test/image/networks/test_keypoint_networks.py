@@ -162,12 +162,16 @@ def test_known_people_who_are_gone_are_not_found() -> None:
     assert find(Seeing([], [pose(100)]), [without_hips], everybody=False) == []
 
 
-def test_a_known_person_who_is_seen_in_the_whole_image_too_is_one_person_by_both_looks() -> None:
-    found = find(Seeing([pose(296, 0.9)], [pose(304, 0.8)], shifts={"left_wrist": 0.2 * WIDTH - 4}), [known(300)])
-    # MoveNet's two poses have their mean at 300. The landmarks are about its last one, at 304, and count 1 to 1.6;
-    # their wrist is a fifth of the shoulder width away.
-    assert necks(found) == [round(300 + 4 / 2.6)] and found[0].score == 0.9
+def test_a_known_person_who_is_seen_in_the_whole_image_too_is_one_person_by_the_closer_look() -> None:
+    found = find(Seeing([pose(296, 0.9)], [pose(304, 0.8)], shifts={"left_wrist": 0.2 * WIDTH}), [known(300)])
+    # The landmarks' wrist is a fifth of the shoulder width away from MoveNet's.
+    assert necks(found) == [304] and found[0].score == 0.8
     assert at(found[0], "left_wrist")[1] == pytest.approx(0.7)
+
+
+def test_a_known_person_whom_the_closer_look_misses_is_taken_from_the_whole_image() -> None:
+    found = find(Seeing([pose(296, 0.9), pose(500, 0.7)], []), [known(300)])
+    assert necks(found) == [296, 500]
 
 
 def test_two_known_people_in_one_place_are_one_the_one_who_is_nearer_to_where_expected() -> None:
