@@ -288,7 +288,7 @@ def test_compressed_folders_need_no_metadata(mode: CompressionMode, plugin: Stor
         (b"PK\x03\x04" + bytes(20), "is a zip archive, which is not a readable ROS 2 bag: unpack it"),
         (bytes(257) + b"ustar" + bytes(300), "is a tar archive, .*: unpack it"),
         (b"#ROSBAG V1.2\n", "is a bag of the old format 1: `rosbag fix`"),
-        (gzip.compress(b"hello"), "is not a readable ROS 2 bag"),
+        (gzip.compress(b"hello", mtime=0), "is not a readable ROS 2 bag"),
     ],
 )
 def test_other_files_are_named_for_what_they_are(head: bytes, sentence: str, tmp_path: Path) -> None:
