@@ -52,31 +52,19 @@ class FloorGrid:
         return -float(self.height(np.array([[x, y, 0.0]]))[0])
 
 
-@njit(cache=True, nogil=True)
 def _find_lowest(points: np.ndarray, low: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Return a low percentile (W, D) of z in each cell, NaN where too few points are."""
-    count = np.zeros(shape[0] * shape[1] + 1, np.int64)
-    number = np.full(len(points), -1, np.int64)
-    for row in range(len(points)):
-        i, j = int(np.floor((points[row, 0] - low[0]) / CELL_M)), int(np.floor((points[row, 1] - low[1]) / CELL_M))
-        if 0 <= i < shape[0] and 0 <= j < shape[1]:
-            number[row] = i * shape[1] + j
-            count[number[row] + 1] += 1
-    for cell in range(1, len(count)):
-        count[cell] += count[cell - 1]
-    filled, heights = count[:-1].copy(), np.empty(count[-1])
-    for row in range(len(points)):
-        if number[row] >= 0:
-            heights[filled[number[row]]] = points[row, 2]
-            filled[number[row]] += 1
-    lowest = np.full((shape[0], shape[1]), np.nan)
-    for i in range(shape[0]):
-        for j in range(shape[1]):
-            own = heights[count[i * shape[1] + j] : count[i * shape[1] + j + 1]]
-            if len(own) >= MIN_CELL_POINTS:
-                own.sort()
-                lowest[i, j] = own[int(LOW_SHARE * len(own))]
-    return lowest
+    place = np.floor((points[:, :2] - low) / CELL_M).astype(np.int64)
+    inside = ((place >= 0) & (place < shape)).all(axis=1)
+    number, z = (place[inside, 0] * shape[1] + place[inside, 1]), points[inside, 2]
+    # Sorted by NumPy: the order within a cell decides, and must not depend on how a kernel was compiled.
+    z = z[np.lexsort((z, number))]
+    count = np.bincount(number, minlength=int(shape[0] * shape[1]))
+    first = np.cumsum(count) - count
+    enough = count >= MIN_CELL_POINTS
+    lowest = np.full(len(count), np.nan)
+    lowest[enough] = z[first[enough] + (LOW_SHARE * count[enough]).astype(np.int64)]
+    return lowest.reshape(int(shape[0]), int(shape[1]))
 
 
 def _fit_plane(lowest: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray) -> np.ndarray:
