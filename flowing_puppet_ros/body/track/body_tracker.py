@@ -273,13 +273,10 @@ class BodyTracker:
 
     def _keep_closer(self, tracked: BodyFit | None, fit: BodyFit) -> BodyFit:
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
-            fit = tracked
-        else:
-            # How much of the person is normally seen does not depend on the body.
-            visible = self._state.visible
-            self.reset()
-            self._state = replace(self._state, visible=visible)
-        self._state = replace(self._state, best=fit.two_way_distance)
+            self._state = replace(self._state, best=tracked.two_way_distance)
+            return tracked
+        # How much of the person is normally seen does not depend on the body.
+        self._state = _TrackState(best=fit.two_way_distance, visible=self._state.visible)
         return fit
 
     def _predict(self, last: _Observation, middle: F64, stamp: int) -> BodyState:

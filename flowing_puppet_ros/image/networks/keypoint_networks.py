@@ -21,18 +21,17 @@ from flowing_puppet_ros.image.formats.skeletons import COCO_17
 from flowing_puppet_ros.image.networks.agreement import combine, turn_sides
 from flowing_puppet_ros.image.networks.pose_networks import EXTRA, BlazePose, Landmarks, MoveNet
 from flowing_puppet_ros.image.networks.poses import (
-    HIPS,
-    MAX_SAME_DISTANCE,
     NetworkPose,
     as_pose,
     drop_duplicates,
+    drop_repeated,
+    find_square,
     pose_distance,
 )
 from flowing_puppet_ros.images import as_rgb
 
 SQUARE_SIDE_PX = 192  # of MoveNet's input for one person: larger ones are no better
 TRUNK_REACH, JOINT_REACH = 1.9, 1.2  # half side of a person's square: trunks, distances of the farthest joint
-MIN_REACH_SCORE = 0.2  # of a joint that the square has to contain
 MIN_HALF_SIDE_PX = 8.0
 SMALL_TRUNK_PX = 30.0  # of a trunk in the reduced image, below which the square sees more
 
@@ -128,9 +127,10 @@ class KeypointNetworks:
             people.append(_Person(self._look_again(image, expected, candidates), expected))
         for pose in candidates:
             people.append(_Person(self._confirm(image, pose), None))
-        return [
-            FoundPerson(self._finish(image, person), person.score) for person in _drop_repeated(people)[:max_people]
-        ]
+        # Of two in one place the one who is nearer to where expected.
+        ranked = sorted((person for person in people if person.poses), key=lambda person: person.rank)
+        kept = drop_repeated(ranked, lambda person: person.poses[-1])[:max_people]
+        return [FoundPerson(self._finish(image, person), person.score) for person in kept]
 
     def _look_again(self, image: Image, expected: NetworkPose, candidates: list[NetworkPose]) -> list[NetworkPose]:
         """Return the pose of a known person: in the square, or else one of the `candidates`, who is then taken."""
@@ -152,10 +152,9 @@ class KeypointNetworks:
 
     def _find_in_square(self, image: Image, pose: NetworkPose, max_move: float) -> NetworkPose | None:
         """Return a person again, by a look at the square around them; None when nobody or somebody else is there."""
-        found = [
-            one for one in self.movenet.detect_in_square(image, *_find_square(pose), SQUARE_SIDE_PX)
-            if one.score >= MIN_CANDIDATE_SCORE
-        ]  # fmt: skip
+        square = find_square(pose, TRUNK_REACH, JOINT_REACH, MIN_HALF_SIDE_PX)
+        seen = self.movenet.detect_in_square(image, *square, SQUARE_SIDE_PX)
+        found = [one for one in seen if one.score >= MIN_CANDIDATE_SCORE]
         if not found:
             return None
         nearest = min(found, key=lambda one: pose_distance(one, pose))
@@ -189,26 +188,9 @@ class KeypointNetworks:
         return [] if same is None else [same.mirror(width)], landmarks.pose.mirror(width)
 
 
-def _drop_repeated(people: Sequence[_Person]) -> list[_Person]:
-    """Return the people who were found, each once: of two in one place the one who is nearer to where expected."""
-    kept: list[_Person] = []
-    for person in sorted((person for person in people if person.poses), key=lambda person: person.rank):
-        if all(pose_distance(person.poses[-1], other.poses[-1]) >= MAX_SAME_DISTANCE for other in kept):
-            kept.append(person)
-    return kept
-
-
 def _is_small(pose: NetworkPose, image: Image, side: int) -> bool:
     """Return whether a person is small in the reduced image."""
     return pose.trunk * side / max(image.shape[:2]) < SMALL_TRUNK_PX
-
-
-def _find_square(pose: NetworkPose) -> tuple[F64, float]:
-    """Return the centre (2,) px and half the side px of the square that MoveNet looks at for a person."""
-    center = pose.joints[list(HIPS)].mean(axis=0)
-    away = np.hypot(*(pose.joints - center).T)
-    farthest = float(away[pose.scores > MIN_REACH_SCORE].max(initial=0.0))
-    return center, max(TRUNK_REACH * pose.trunk, JOINT_REACH * farthest, MIN_HALF_SIDE_PX)
 
 
 def _place_extremities(

@@ -21,6 +21,7 @@ from flowing_puppet_ros.image.networks.poses import (
     NetworkPose,
     Warp,
     cut_square,
+    find_square,
     fit_to_canvas,
 )
 from flowing_puppet_ros.image.networks.runtime import LiteRtNetwork, Network
@@ -34,7 +35,7 @@ EXTRA = {"left_hand": 19, "right_hand": 20, "left_heel": 29, "right_heel": 30, "
 
 MARGIN = 1.5  # of the square around the person
 TRUNK_REACH, JOINT_REACH = 1.2, 1.1  # of the square's half side: trunks, and distances of the farthest joint
-MIN_REACH_SCORE = 0.2  # of a joint that the square has to contain
+MIN_HALF_PX = 1.0
 
 
 class MoveNet:
@@ -88,20 +89,13 @@ class BlazePose:
 
     def locate(self, image: Image, pose: NetworkPose) -> Landmarks:
         """Return the landmarks of the person of a `pose` in an image (H, W, 3) RGB."""
-        square, warp = cut_square(image, *find_square(pose), SIDE_PX, angle=find_angle(pose))
+        center, half = find_square(pose, TRUNK_REACH, JOINT_REACH, MIN_HALF_PX)
+        square, warp = cut_square(image, center, MARGIN * half, SIDE_PX, angle=find_angle(pose))
         outputs = self._network.run(square[None].astype(np.float32) / 255)
         values = np.asarray(outputs[0], np.float64).reshape(-1, 5)[:LANDMARKS]
         return Landmarks(
             warp.to_image(values[:, :2] - 0.5), _sigmoid(values[:, 3]), float(np.asarray(outputs[1]).ravel()[0])
         )
-
-
-def find_square(pose: NetworkPose) -> tuple[F64, float]:
-    """Return the centre (2,) px and half the side px of the square that shows all of a person."""
-    center = pose.joints[list(HIPS)].mean(axis=0)
-    away = np.hypot(*(pose.joints - center).T)
-    farthest = float(away[pose.scores > MIN_REACH_SCORE].max(initial=0.0))
-    return center, MARGIN * max(TRUNK_REACH * pose.trunk, JOINT_REACH * farthest, 1.0)
 
 
 def find_angle(pose: NetworkPose) -> float:

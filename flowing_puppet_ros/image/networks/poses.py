@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +17,7 @@ OTHER_SIDE: I64 = np.array([0, *(row + (1 if row % 2 else -1) for row in range(1
 """For each joint the one of the other side."""
 SHOULDERS, HIPS = (5, 6), (11, 12)
 STRIDE = 32  # the sides of a network's input are multiples of it
+MIN_REACH_SCORE = 0.2  # of a joint that a square around a person has to contain
 MAX_SAME_DISTANCE = 0.5  # median distance of joints, in shoulder widths, within which two poses are one person's
 MIN_SHOULDER_SHARE = (
     0.45  # of the trunk, that a person's shoulder width has at least: from the side it is foreshortened
@@ -138,13 +139,30 @@ def pose_distance(one: NetworkPose, other: NetworkPose) -> float:
     return float(np.nanmedian(away)) / max(one.size, other.size)
 
 
+def find_square(pose: NetworkPose, trunk_reach: float, joint_reach: float, min_half: float) -> tuple[F64, float]:
+    """Return the centre (2,) px and half the side px of a square about a person's hips.
+
+    Half the side is so many lengths of the trunk, or distances of the farthest joint that is seen, or at least
+    `min_half` px.
+    """
+    center = pose.joints[list(HIPS)].mean(axis=0)
+    away = np.hypot(*(pose.joints - center).T)
+    farthest = float(away[pose.scores > MIN_REACH_SCORE].max(initial=0.0))
+    return center, max(trunk_reach * pose.trunk, joint_reach * farthest, min_half)
+
+
+def drop_repeated[Item](items: Iterable[Item], pose_of: Callable[[Item], NetworkPose]) -> list[Item]:
+    """Return the items, in their order, without those whose pose is that of a person who is there already."""
+    kept: list[Item] = []
+    for item in items:
+        if all(pose_distance(pose_of(item), pose_of(other)) >= MAX_SAME_DISTANCE for other in kept):
+            kept.append(item)
+    return kept
+
+
 def drop_duplicates(poses: Sequence[NetworkPose]) -> list[NetworkPose]:
     """Return the poses, most certain first, without those of a person who is there already."""
-    kept: list[NetworkPose] = []
-    for pose in sorted(poses, key=lambda pose: -pose.score):
-        if all(pose_distance(pose, other) >= MAX_SAME_DISTANCE for other in kept):
-            kept.append(pose)
-    return kept
+    return drop_repeated(sorted(poses, key=lambda pose: -pose.score), lambda pose: pose)
 
 
 def as_pose(person: Keypoints) -> NetworkPose | None:

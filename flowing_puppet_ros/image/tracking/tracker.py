@@ -40,12 +40,11 @@ HIDDEN_CONFIDENCE = 0.3  # share of the confidence that a joint behind a nearer 
 OUTSIDE_CONFIDENCE = 0.1  # ... and one outside of the image
 
 
-type DetectInTracks = Callable[
-    [Sequence[Track], FlowPair | None], tuple[Sequence[Keypoints] | None, Collection[str] | None]
-]
-"""From the tracks in an image, and the flow at working scale from the image before, to the people detected there and
-the ids that were searched. None for the flow: there is no image before, or nobody was tracked in it. None for the
-people: no detector ran."""
+type DetectedInTracks = tuple[Sequence[Keypoints] | None, Collection[str] | None]
+"""The people detected in an image, None where no detector ran, and the ids that were searched."""
+type DetectInTracks = Callable[[Sequence[Track], FlowPair | None], DetectedInTracks]
+"""From the tracks in an image, and the flow at working scale from the image before, to who is detected there. None for
+the flow: there is no image before, or nobody was tracked in it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

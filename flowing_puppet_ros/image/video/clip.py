@@ -216,13 +216,11 @@ class _ClipRun:
     def track_keypoints(self, progress: Progress) -> Iterator[tuple[VideoFrame, TrackResult, Any]]:
         """Track the people who come with the frames."""
         tracker = self.make_tracker()
-        likelihood = PartLikelihood.load() if self.method == "thesis" else None
+        likelihood = self._load_likelihood()
 
         def step(frame: VideoFrame, keypoints: Sequence[Keypoints] | None) -> tuple[TrackResult, Any]:
             result = tracker.step(frame.image, frame.stamp_ns, keypoints, self._flow(frame))
-            if likelihood is None:
-                return result, None
-            return result, evidence_from_keypoints(self.model, likelihood, frame.image, result, keypoints)
+            return result, self._extract_evidence(likelihood, frame, result, keypoints)
 
         yield from self.step_through(progress(self.clip.frames, "track"), step)
 
@@ -230,15 +228,12 @@ class _ClipRun:
         self, networks: KeypointSource, progress: Progress
     ) -> Iterator[tuple[VideoFrame, TrackResult, Any]]:
         """Track the people whom the networks find in each frame, with a close look at where the tracks lead."""
-        tracker = self.make_tracker()
-        live = NetworkTracker(tracker, EVERY_IMAGE, networks)
-        likelihood = PartLikelihood.load() if self.method == "thesis" else None
+        live = NetworkTracker(self.make_tracker(), EVERY_IMAGE, networks)
+        likelihood = self._load_likelihood()
 
         def step(frame: VideoFrame, _: Sequence[Keypoints] | None) -> tuple[TrackResult, Any]:
             result = live.step(frame.image, frame.stamp_ns, self._flow(frame))
-            if likelihood is None:
-                return result, None
-            return result, evidence_from_keypoints(self.model, likelihood, frame.image, result, live.people)
+            return result, self._extract_evidence(likelihood, frame, result, live.people)
 
         yield from self.step_through(progress(self.clip.frames, "track"), step)
 
@@ -292,6 +287,21 @@ class _ClipRun:
     def make_tracker(self) -> FlowingPuppetTracker:
         """Return a tracker that has seen nothing."""
         return FlowingPuppetTracker(self.model, self.settings.tracker, self.settings.flow)
+
+    def _load_likelihood(self) -> PartLikelihood | None:
+        return PartLikelihood.load() if self.method == "thesis" else None
+
+    def _extract_evidence(
+        self,
+        likelihood: PartLikelihood | None,
+        frame: VideoFrame,
+        result: TrackResult,
+        people: Sequence[Keypoints] | None,
+    ) -> Any:
+        """Return what the loop of the thesis takes of a frame; None where it is not what is run."""
+        if likelihood is None:
+            return None
+        return evidence_from_keypoints(self.model, likelihood, frame.image, result, people)
 
     def _flow(self, frame: VideoFrame) -> FlowPair | None:
         return None if self.flow_of is None else self.flow_of(frame)

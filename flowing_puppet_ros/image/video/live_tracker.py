@@ -10,7 +10,7 @@ alone: a replay, where each run finishes at once, gives the same puppets as the 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,10 +24,14 @@ from flowing_puppet_ros.image.arms.hypotheses import ArmFilter
 from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
 from flowing_puppet_ros.image.detector.detection import PersonCandidate, PersonDetection
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
-from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.networks.choice import load_networks
 from flowing_puppet_ros.image.tracking.track import Track
-from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
+from flowing_puppet_ros.image.tracking.tracker import (
+    DetectedInTracks,
+    FlowingPuppetTracker,
+    TrackedPuppet,
+    TrackResult,
+)
 from flowing_puppet_ros.image.video.detection_worker import DetectedPerson, DetectionWorker, match_to_tracks
 from flowing_puppet_ros.image.video.known_people import KnownPeople
 from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
@@ -105,6 +109,9 @@ class LiveTracker:
     def reset(self) -> None:
         """Forget the images; the detector runs on the next one."""
         self._clock = StreamClock()
+        self._forget_stream()
+
+    def _forget_stream(self) -> None:
         self._full_frames = 0
         self._previous: tuple[int, Image] | None = None
         self._forget_people()
@@ -137,8 +144,7 @@ class LiveTracker:
             no             |                | track, with the ROI re-detection that is due, if any
         """
         if not self._clock.advance(image, stamp_ns):
-            self.reset()
-            self._clock.advance(image, stamp_ns)
+            self._forget_stream()
         full_frame, roi = self._take_due_full_frame(), self._roi if self._is_due(self._roi) else None
         if full_frame is not None and not self._tracker.tracks:
             result = self._start_tracks(full_frame, image, stamp_ns)
@@ -225,9 +231,7 @@ class LiveTracker:
         """Track an image, with an ROI re-detection in it where the tracks lead."""
         seen: list[DetectedPerson] = []
 
-        def detect(
-            tracks: Sequence[Track], _: FlowPair | None
-        ) -> tuple[list[Keypoints] | None, Collection[str] | None]:
+        def detect(tracks: Sequence[Track], _: FlowPair | None) -> DetectedInTracks:
             rois = self._take_rois({track.id: track.mean for track in tracks}) if tracks else {}
             if not rois:
                 return None, None

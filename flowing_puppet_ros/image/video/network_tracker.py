@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -22,9 +22,13 @@ from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.networks.agreement import calibrate
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.tracking.track import Track
-from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
+from flowing_puppet_ros.image.tracking.tracker import (
+    DetectedInTracks,
+    FlowingPuppetTracker,
+    TrackedPuppet,
+    TrackResult,
+)
 from flowing_puppet_ros.image.video.pending_detection import (
-    PendingDetection,
     StreamClock,
     propagate_points,
     reduce_flow,
@@ -44,11 +48,14 @@ def known_keypoints(names: Sequence[str], joints: F64, confidence: F64) -> Keypo
     return Keypoints(tuple(names), joints, np.maximum(confidence, 1e-3))
 
 
-@dataclass(slots=True, eq=False)
-class _Run(PendingDetection[Keypoints]):
-    """A run of the networks; `searched` are the ids of the people looked at, None where everybody was."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """A run of the networks on an image; `searched` are the ids of the people looked at, None where everybody was."""
 
-    searched: Collection[str] | None = None
+    image: Image
+    stamp_ns: int
+    people: Future[list[Keypoints]]
+    searched: Collection[str] | None
 
 
 class NetworkTracker:
@@ -83,7 +90,9 @@ class NetworkTracker:
     def reset(self) -> None:
         """Forget the images; everybody is looked for in the next one."""
         self._clock = StreamClock()
-        self._previous_ns: int | None = None
+        self._forget_stream()
+
+    def _forget_stream(self) -> None:
         self._run: _Run | None = None
         self._everybody_ns: int | None = None
         self._looked_ns: dict[str, int] = {}
@@ -100,16 +109,13 @@ class NetworkTracker:
         """
         image = as_image(image, MIN_SIDE_PX)
         if not self._clock.advance(image, stamp_ns):
-            self.reset()
-            self._clock.advance(image, stamp_ns)
-        before = self._previous_ns
-        passed = to_ns(self._settings.min_wait) if before is None else self._clock.now_ns - before
+            self._forget_stream()
+        passed = to_ns(self._settings.min_wait) if self._clock.passed_ns is None else self._clock.passed_ns
         due, self._run = self._run, self._start_run(image, stamp_ns, passed, executor)
         if passed >= to_ns(self._settings.min_wait):
             result = self._track_here(image, stamp_ns, flow)
         else:
             result = self._track(due, image, stamp_ns, flow)
-        self._previous_ns = self._clock.now_ns
         # The tracker weighs joints by their raw confidence; what is told is a probability.
         told = [
             replace(one, confidence=calibrate(one.confidence / one.visible) * one.visible) for one in result.puppets
@@ -120,9 +126,7 @@ class NetworkTracker:
         """Track an image with what the run on itself finds."""
         run, self._run, self.people = self._run, None, None
 
-        def detect(
-            tracks: Sequence[Track], flow: FlowPair | None
-        ) -> tuple[list[Keypoints] | None, Collection[str] | None]:
+        def detect(tracks: Sequence[Track], _: FlowPair | None) -> DetectedInTracks:
             if run is None:
                 return None, None
             self.people = run.people.result()
@@ -136,12 +140,10 @@ class NetworkTracker:
         if run is not None and not self._tracker.tracks:
             return self._start_tracks(run, image, stamp_ns, flow)
 
-        def detect(
-            tracks: Sequence[Track], flow: FlowPair | None
-        ) -> tuple[list[Keypoints] | None, Collection[str] | None]:
-            if run is None or flow is None:
+        def detect(tracks: Sequence[Track], between: FlowPair | None) -> DetectedInTracks:
+            if run is None or between is None:
                 return None, None  # after a cut the people of the image before are not there
-            move = partial(propagate_points, flows=[reduce_flow(flow[0])], size=(image.shape[1], image.shape[0]))
+            move = partial(propagate_points, flows=[reduce_flow(between[0])], size=(image.shape[1], image.shape[0]))
             return [replace(person, xy=move(person.xy)) for person in run.people.result()], run.searched
 
         return self._forget_after_cut(self._tracker.step(image, stamp_ns, flow=flow, detect=detect))
@@ -183,7 +185,7 @@ class NetworkTracker:
         self._counters["close looks"] += len(known)
         people = submit(partial(self._look, image, known, everybody), executor)
         searched = None if everybody else frozenset(track.id for track in chosen)
-        return _Run(image, stamp_ns, self._clock.now_ns, people, searched=searched)
+        return _Run(image, stamp_ns, people, searched)
 
     def _choose(self, tracks: Sequence[Track], everybody: bool) -> list[Track]:
         """Return whom to look at: those whom nobody has looked at for longest, as many as there is time for.

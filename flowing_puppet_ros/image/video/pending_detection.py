@@ -43,9 +43,10 @@ class PendingDetection[Found]:
 
 @dataclass(slots=True)
 class StreamClock:
-    """The time `now_ns` that has passed in a stream of images, by their stamps."""
+    """Time in a stream of images by their stamps: `now_ns` since the first, `passed_ns` since the last (None: none)."""
 
     now_ns: int = 0
+    passed_ns: int | None = None
     _previous: tuple[int, tuple[int, ...]] | None = None
 
     def advance(self, image: Image, stamp_ns: int) -> bool:
@@ -54,10 +55,11 @@ class StreamClock:
         if previous is None:
             return True
         if stamp_ns < previous[0] or image.shape != previous[1]:
-            self.now_ns = 0
+            self.now_ns, self.passed_ns = 0, None
             return False
         passed = stamp_ns - previous[0]
-        self.now_ns += min(passed, MAX_GAP_NS) if passed > 0 else FRAME_NS
+        self.passed_ns = min(passed, MAX_GAP_NS) if passed > 0 else FRAME_NS
+        self.now_ns += self.passed_ns
         return True
 
 
