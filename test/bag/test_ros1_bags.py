@@ -32,6 +32,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
     POINT_CLOUD,
     TRANSFORMS,
 )
+from test.helpers.definitions import HEADER
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 OLD_TRANSFORMS = "tf/msg/tfMessage"
@@ -212,22 +213,17 @@ def test_names_that_are_no_ros_types_stay() -> None:
 
 def test_messages_of_another_version_are_read_by_the_definition_in_the_file(tmp_path: Path) -> None:
     # Another order, a field more, and one less (step).
-    text = """std_msgs/Header header
+    text = (
+        """std_msgs/Header header
 string encoding
 uint32 width
 uint32 height
 float64 exposure
 uint8[] data
 uint8 is_bigendian
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
 """
+        + HEADER
+    )
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, IMAGE))
     types: Any = store.types

@@ -24,6 +24,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image, encode_jpeg
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
+from test.helpers.definitions import HEADER
 
 FACTORY = BagMessageFactory()
 COUNT = 8
@@ -157,7 +158,8 @@ def test_other_images_are_untouched_even_in_a_frame_named_like_a_codec(tmp_path:
 def test_packets_of_other_schemas_are_decoded(tmp_path: Path) -> None:
     data = packets("libx264")
     name = "ffmpeg_image_transport_msgs/msg/FFMPEGPacket"
-    text = """std_msgs/Header header
+    text = (
+        """std_msgs/Header header
 int32 width
 int32 height
 string encoding
@@ -165,15 +167,9 @@ uint64 pts
 uint8 flags
 bool is_bigendian
 uint8[] data
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
 """
+        + HEADER
+    )
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(text, name))
     types: Any = store.types

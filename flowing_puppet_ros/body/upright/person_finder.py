@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -150,8 +150,9 @@ class PersonFinder:
             return []
         scene = SceneHeights.of(points)
         candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
+        make = partial(_make_person, points, normals, scene, viewpoint, stamp)
         people = [
-            FoundBody(self._make_person(points, normals, rows, scene, viewpoint, stamp, owner=owner), None)
+            FoundBody(make(rows, owner=owner), None)
             for owner, rows in owned.items()
             if len(rows) >= self._settings.min_points
         ]
@@ -179,13 +180,12 @@ class PersonFinder:
             middle = upright.fit.vertices[:, :2].mean(axis=0)
             if all(np.hypot(*(middle - other)) > SAME_PERSON_M for other in taken):
                 taken.append(middle)
-                person = self._make_person(points, normals, candidate.rows, scene, viewpoint, stamp, score=likely)
+                person = make(candidate.rows, score=likely)
                 people.append(FoundBody(person, replace(upright.fit, confidence=likely)))
         for candidate in bent:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
                 taken.append(candidate.middle)
-                person = self._make_person(points, normals, candidate.rows, scene, viewpoint, stamp, score=0.0)
-                people.append(FoundBody(replace(person, proven=False), None))
+                people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
         return people
 
     def _may_be_bent(self, candidate: Candidate, scene: SceneHeights, probability: float) -> bool:
@@ -238,28 +238,27 @@ class PersonFinder:
         if remember:
             self._rejected.add(candidate, stamp)
 
-    def _make_person(
-        self,
-        points: np.ndarray,
-        normals: np.ndarray | None,
-        rows: np.ndarray,
-        scene: SceneHeights,
-        viewpoint: np.ndarray,
-        stamp: int,
-        score: float = 1.0,
-        owner: int | None = None,
-    ) -> PersonCloud:
-        middle = np.median(points[rows, :2], axis=0)
-        return PersonCloud(
-            points[rows],
-            None if normals is None else normals[rows],
-            stamp,
-            viewpoint,
-            rows,
-            score,
-            owner,
-            scene.floor.locate(*middle),
-        )
+
+def _make_person(
+    points: np.ndarray,
+    normals: np.ndarray | None,
+    scene: SceneHeights,
+    viewpoint: np.ndarray,
+    stamp: int,
+    rows: np.ndarray,
+    score: float = 1.0,
+    owner: int | None = None,
+) -> PersonCloud:
+    return PersonCloud(
+        points[rows],
+        None if normals is None else normals[rows],
+        stamp,
+        viewpoint,
+        rows,
+        score,
+        owner,
+        scene.floor.locate(*np.median(points[rows, :2], axis=0)),
+    )
 
 
 def _describe_rejected(candidate: Candidate, probability: float, reason: str) -> RejectedCandidate:

@@ -17,9 +17,8 @@ from tqdm import tqdm
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame, measure_stature
 from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
-from flowing_puppet_ros.body.scans.scan_frame import parse_axis
 from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit, has_size_of_person
-from flowing_puppet_ros.cli.scans.fit_people import SCENE_UPS, FitOptions, ScanPerson, find_people
+from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson, find_people, list_scene_ups
 from flowing_puppet_ros.cli.scans.fit_scene import fit_one_sided_scene
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
@@ -97,7 +96,7 @@ def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list
     if options.upright == "any" or scan.faces is not None or moved:
         return []
     unit = ScanUnit.named("m" if options.unit == "auto" else options.unit)
-    ups = [parse_axis(name) for name in (SCENE_UPS if options.up == "auto" else (options.up,))]
+    ups = list_scene_ups(options)
     found = fit_one_sided_scene(fitter, scan.points, unit.metres, ups, options.view, options.segmentation)
     if found is None:
         return []

@@ -81,6 +81,11 @@ class FitOptions:
     segmentation: SegmentationSettings
 
 
+def list_scene_ups(options: FitOptions) -> list[np.ndarray]:
+    """Return the directions (3,) that may be up in a scene: those that are tried first, or the one that was named."""
+    return [parse_axis(name) for name in (SCENE_UPS if options.up == "auto" else (options.up,))]
+
+
 def find_people(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> list[ScanPerson]:
     """Return the people of a scan: those in a scene, several who stand apart, or the only one.
 
@@ -183,7 +188,7 @@ def _group_scene_units(points: np.ndarray) -> list[list[ScanUnit]]:
 def _segment_scene(scan: Scan, path: Path, fitter: BodyFitter, options: FitOptions) -> list[ScanPerson]:
     """Segment the people in the cloud of a scene; PuppetError if there is none."""
     points, normals = scan.sample_surface(MAX_SCENE_POINTS, np.random.default_rng(fitter.settings.seed))
-    ups = [parse_axis(name) for name in (SCENE_UPS if options.up == "auto" else (options.up,))]
+    ups = list_scene_ups(options)
     sensor = None if options.view == "full" else _place_scene_sensor(scan, options)
     groups = _group_scene_units(points) if options.unit == "auto" else [[ScanUnit.named(options.unit)]]
     found: list[PersonCloud] = []
