@@ -34,6 +34,10 @@ DISTANCE_M, EYE_HEIGHT_M = (2.3, 3.5), (0.9, 1.6)  # of the camera
 TABLE_DISTANCE_M, TABLE_DEPTH_M, TABLE_WIDTH_M = (0.3, 0.5), 0.6, 2.4  # from the person; of the counter
 WALL_DISTANCE_M = (0.5, 2.0)  # behind the person
 PEOPLE_GAP_M = (0.55, 0.85)  # between the middles of neighbours
+NOISE_FOCAL_PX = 525.0
+"""Focal length of the image that keypoints' noise is given for: in others, it is the same angle."""
+
+MAX_CLEAN_ERROR_M = 0.05
 IMAGE_GRAIN = 4.0  # standard deviation of the colour image's noise, of 255
 MAX_TRUNK_ROLL_RAD = np.radians(3.0)  # of the camera
 
@@ -106,6 +110,11 @@ class RgbdFrame:
     seen: list[SeenKeypoints]
     person: np.ndarray
     true_depth: F64
+
+    def clean(self, person: int) -> np.ndarray:
+        """Return the pixels (H, W) bool that show a person, the flying ones at the edges left out."""
+        with np.errstate(invalid="ignore"):
+            return np.asarray((self.person == person) & (np.abs(self.depth - self.true_depth) < MAX_CLEAN_ERROR_M))
 
     @property
     def points(self) -> F64:
@@ -208,21 +217,24 @@ class RgbdStudio:
         colour_bodies: Sequence[TrueBody] | None = None,
     ) -> RgbdFrame:
         """Sense `bodies` in a `room` by both cameras; `colour_bodies` are the people at the colour image's time."""
+        # The errors of one part do not depend on the size of another's image.
+        for_depth, for_image, for_keypoints = rng.spawn(3)
         meshes = [*(self._wardrobe.dress(body, k) for k, body in enumerate(bodies)), *room]
         view = self._render(self._depth_rays, cameras.depth, meshes)
-        depth = sense_depth(view.depth, view.cosine, cameras.depth.focal, self.sensor, rng)
+        depth = sense_depth(view.depth, view.cosine, cameras.depth.focal, self.sensor, for_depth)
         later = bodies if colour_bodies is None else colour_bodies
         colour = view
         if not self.cameras.registered or colour_bodies is not None:
             clothed = [*(self._wardrobe.dress(body, k) for k, body in enumerate(later)), *room]
             colour = self._render(self._colour_rays, cameras.colour, clothed)
-        rgb = colour.rgb + IMAGE_GRAIN * rng.standard_normal(colour.rgb.shape)
+        rgb = colour.rgb + IMAGE_GRAIN * for_image.standard_normal(colour.rgb.shape)
         joints = np.stack([body.joints[self._limbs] for body in bodies])
+        scaled = noise * cameras.colour.focal / NOISE_FOCAL_PX
         keypoints, seen = [], []
         for k, body in enumerate(later):
             there = body.joints[self._limbs]
             flags = find_visible(there, cameras.colour, colour, k)
-            keypoints.append(draw_keypoints(rng, there, cameras.colour, *flags, noise))
+            keypoints.append(draw_keypoints(for_keypoints, there, cameras.colour, *flags, scaled))
             seen.append(self._see_exactly(joints[k], cameras.depth, view, k))
         return RgbdFrame(
             depth, np.clip(np.rint(rgb), 0, 255).astype(np.uint8), cameras, list(bodies), joints, keypoints, seen,
