@@ -39,7 +39,7 @@ COLOUR_LAG_FRAMES = 1  # of the fine rate, by which the colour image is later
 START_NS = 1_700_000_000 * geometry.NANOSECONDS
 DETECTOR_DELAY_NS, DETECTOR_NOISE_PX = 8_000_000, 5.0
 EYE_M, PITCH_RAD = np.array([0.0, 0.0, 1.25]), 0.12
-CAST = {"walking": (3.3, 1.0, -0.45), "waving": (3.1, 0.05, 0.15), "seated": (2.9, -1.0, 0.5)}
+CAST = {"walking": (3.6, 0.95, -0.15), "waving": (3.1, 0.05, 0.15), "seated": (2.9, -1.0, 0.5)}
 """Motion of each person: x and y of their place in metres, and by how much, rad, they turn from the camera."""
 
 SEED = 11
