@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from flowing_puppet_ros.arrays import F32, F64, I64, Bools
-from flowing_puppet_ros.evidence.cloud.sensor_field import ANGULAR, PINHOLE, Projection, SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_field import ANGULAR, PINHOLE, SensorField, SensorProjection
 
 # Frames of organised clouds, as rows right, down and forward: optical, and x forward with z up (REP-103).
 CAMERA_AXES = (np.eye(3), np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]))
@@ -41,14 +41,14 @@ class RangeImage:
         estimated: whether the scan was drawn into an image whose field of view is not known.
     """
 
-    projection: Projection
+    projection: SensorProjection
     bounds: F64
     depth: F32
     pixel: I64
     estimated: bool = False
 
     @classmethod
-    def of_camera(cls, projection: Projection, points: F64, pixel: I64, shape: tuple[int, int]) -> RangeImage:
+    def of_camera(cls, projection: SensorProjection, points: F64, pixel: I64, shape: tuple[int, int]) -> RangeImage:
         """Take a depth image of `shape` (H, W) with the pixels (N,) and places (N, 3) m of its valid depths, N > 0."""
         depth = np.full(shape, np.inf, dtype=np.float32)
         depth.reshape(-1)[pixel] = (points - projection.viewpoint) @ projection.axes[2]
@@ -88,7 +88,7 @@ class RangeImage:
         kind = ANGULAR if axes is None else PINHOLE
         if axes is None:
             axes = _find_lidar_axes(local, azimuth)
-        plain = Projection(viewpoint, axes, np.ones(2), np.zeros(2), kind)
+        plain = SensorProjection(viewpoint, axes, np.ones(2), np.zeros(2), kind)
         coordinates, depth = plain.project(points)
         low, high = coordinates.min(axis=0), coordinates.max(axis=0)
         size = max(POINT_SPACINGS * float(np.sqrt(np.prod(high - low) / len(points))), MIN_PIXEL)
@@ -155,7 +155,7 @@ def _find_border(valid: Bools) -> F64:
     return bounds
 
 
-def _calibrate(local: F64, pixels: F64, axes: F64) -> Projection | None:
+def _calibrate(local: F64, pixels: F64, axes: F64) -> SensorProjection | None:
     """Return the pinhole camera that sees places (K, 3) m, right, down and forward, at pixels (K, 2), or None."""
     if not (local[:, 2] > 0).all():
         return None
@@ -167,7 +167,7 @@ def _calibrate(local: F64, pixels: F64, axes: F64) -> Projection | None:
         if solution[0] <= 0 or np.percentile(error, 99) > MAX_PIXEL_ERROR:
             return None
         scale[axis], offset[axis] = solution
-    return Projection(np.zeros(3), axes, scale, offset, PINHOLE)
+    return SensorProjection(np.zeros(3), axes, scale, offset, PINHOLE)
 
 
 def _find_camera_axes(local: F64) -> F64 | None:
@@ -197,7 +197,7 @@ def _find_lidar_axes(local: F64, azimuth: tuple[float, float] | None) -> F64:
 
 
 def _take_given(
-    projection: Projection, azimuth: tuple[float, float] | None, elevation: tuple[float, float] | None
+    projection: SensorProjection, azimuth: tuple[float, float] | None, elevation: tuple[float, float] | None
 ) -> F64:
     """Return the bounds in pixels of the given angles in radians."""
     bounds = np.array([-np.inf, -np.inf, np.inf, np.inf])

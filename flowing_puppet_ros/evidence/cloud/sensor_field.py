@@ -27,7 +27,7 @@ NO_FIELD: FieldArrays = (
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Projection:
+class SensorProjection:
     """How places become pixels: pixel = scale * coordinates + offset.
 
     Coordinates are right and down over forward in a pinhole image, and in an angular one the azimuth to the right of
@@ -49,11 +49,11 @@ class Projection:
     kind: int
 
     @classmethod
-    def pinhole(cls, fx: float, fy: float, cx: float, cy: float) -> Projection:
+    def pinhole(cls, fx: float, fy: float, cx: float, cy: float) -> SensorProjection:
         """Return that of a rectified image in its camera's optical frame (REP-103); all in pixels."""
         return cls(np.zeros(3), np.eye(3), np.array([fx, fy]), np.array([cx, cy]), PINHOLE)
 
-    def turn(self, rotation: F64) -> Projection:
+    def turn(self, rotation: F64) -> SensorProjection:
         """Return the projection of the same places in a frame that `rotation` (3, 3) leads to."""
         return replace(self, viewpoint=rotation @ self.viewpoint, axes=np.ascontiguousarray(self.axes @ rotation.T))
 
@@ -73,7 +73,7 @@ class SensorField:
         limit: (H, W) depth of what is nearest and not the person, metres; infinite where nothing else is.
     """
 
-    projection: Projection
+    projection: SensorProjection
     bounds: F64
     limit: F32
 
