@@ -17,23 +17,28 @@ from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
+from flowing_puppet_ros.body.fit.partial_view import measure_unknown_share, strengthen_priors
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.fusion.lift import LiftedJoints
-from flowing_puppet_ros.fusion.puppet_joints import find_other_sides
+from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-PULLED = RefineWeights(pose=1e-7, pairwise=1e-7, shape=2e-6, sigma_start=0.2, sigma_end=0.03, iterations=20)
+PULLED = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=20)
 """With joints, from far away."""
-FREE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=2e-6, sigma_start=0.06, sigma_end=0.03, iterations=8)
+FREE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.06, sigma_end=0.03, iterations=8)
 """Without joints, at the end."""
 MAX_FIT_POINTS = 4000
+MAX_SWAP_RATIO = 0.9
+"""Cost of the body with exchanged sides, in costs of the other, below which it is kept: networks are mostly right."""
 HIDDEN_SHARE = 0.25
 """Of the weight, for joints that the puppet itself hides."""
-MIN_START_CONFIDENCE = 0.1
-"""Of any joint in a start: a puppet places doubtful joints as the rest of the body suggests."""
+MIN_START_CONFIDENCE, MIN_LIMB_CONFIDENCE = 0.1, 0.3
+"""In a start: what joints of trunk and head count at least, since a puppet places them as the rest of the body suggests,
+and below which those of limbs do not count, since a hanging arm is a better guess."""
 SPINE_M = 0.5
 """From the shoulders to the pelvis of a person of whom no more than shoulders and head are seen."""
 
@@ -46,21 +51,28 @@ class JointFitter:
         self.fitter = fitter
         self.model = fitter.model
         self._strength = strength
+        self._is_limb = np.ones(len(self.model.joint_names), dtype=bool)
+        self._is_limb[trunk_rows(self.model)] = False
 
     def start(self, joints: LiftedJoints) -> BodyState:
         """Return the body that the joints describe; InputError when they describe none."""
-        weight = np.where(joints.found, np.sqrt(np.maximum(joints.confidence, MIN_START_CONFIDENCE)), 0.0)
-        weight = np.where(joints.hidden, HIDDEN_SHARE * weight, weight)
-        named = {
-            name: (*point, float(sure))
-            for name, point, sure in zip(self.model.joint_names, joints.points, weight, strict=True)
+        floor = np.where(self._is_limb, 0.0, MIN_START_CONFIDENCE)
+        weight = np.where(joints.found, np.sqrt(np.maximum(joints.confidence, floor)), 0.0)
+        weight[self._is_limb & (joints.confidence < MIN_LIMB_CONFIDENCE)] = 0.0
+        certain = np.where(joints.hidden, 0.0, weight)
+        try:
+            targets = make_joint_targets(self.model, self._name(joints, certain))
+        except InputError:
+            targets = make_joint_targets(self.model, _add_pelvis(self._name(joints, weight)))
+        return body_from_joints(self.model, self.fitter.gauss_newton, targets)
+
+    def _name(self, joints: LiftedJoints, weight: F64) -> dict[str, tuple[float, float, float, float]]:
+        """Return the joints that have a weight (J,), as name -> (x, y, z, weight)."""
+        return {
+            name: (float(x), float(y), float(z), float(sure))
+            for name, (x, y, z), sure in zip(self.model.joint_names, joints.points, weight, strict=True)
             if sure > 0
         }
-        try:
-            targets = make_joint_targets(self.model, named)
-        except InputError:
-            targets = make_joint_targets(self.model, _add_pelvis(named))
-        return body_from_joints(self.model, self.fitter.gauss_newton, targets)
 
     def make_targets(self, joints: LiftedJoints) -> JointTargets:
         """Return the pull of the joints across their rays; doubtful ones pull by their confidence squared."""
@@ -69,29 +81,31 @@ class JointFitter:
         points, rays = np.nan_to_num(joints.points), np.nan_to_num(joints.rays)
         return JointTargets(points, self._strength * weight, rays)
 
-    def make_cloud(self, points: F64, unknown: F64) -> SingleViewCloud:
-        """Return the person's points (N, 3) m of a sensor at the origin; `unknown` as in `OneSidedView.build`."""
+    def make_cloud(self, points: F64, field: SensorField | None) -> SingleViewCloud:
+        """Return the person's points (N, 3) m of a sensor at the origin, and what that can know of the person."""
         points = downsample(points, None, MAX_FIT_POINTS)[0]
         viewpoint = np.zeros(3)
-        return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, unknown)
+        return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, field=field)
 
     def fit(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
         """Fit a body to the person's points, from `start` and with the sides exchanged, whichever is better."""
         coarse = CoarseCloud.of(cloud)
         targets = self.make_targets(joints)
-        best, lowest = start, np.inf
+        found = []
         for body, pull in ((start, targets), (self.start(swap_lifted(self.model, joints)), self._swap(targets))):
-            body = self.refine(cloud, body, pull)
-            cost = self.fitter.hypotheses.pose_bank.cost(body, coarse)
-            if cost < lowest:
-                best, lowest = body, cost
-        return self.fitter.assess(best, cloud)
+            fit = self.fitter.assess(self.refine(cloud, body, pull), cloud)
+            cost = self.fitter.hypotheses.pose_bank.cost(fit.state, coarse) * (2 - fit.confidence)
+            found.append((cost, fit))
+        (cost, fit), (swapped_cost, swapped) = found
+        return swapped if swapped_cost < MAX_SWAP_RATIO * cost else fit
 
     def refine(self, cloud: SingleViewCloud, start: BodyState, pull: JointTargets) -> BodyState:
         """Return a body after the steps with joints and those without."""
         terms = [cloud.free_space_term]
-        body = self.fitter.gauss_newton.run(start, cloud, pull, PULLED, terms)
-        return self.fitter.gauss_newton.run(body, cloud, JointTargets.none(self.model), FREE, terms)
+        unknown = measure_unknown_share(self.model, start, cloud)
+        body = self.fitter.gauss_newton.run(start, cloud, pull, strengthen_priors(PULLED, unknown), terms)
+        free = strengthen_priors(FREE, unknown)
+        return self.fitter.gauss_newton.run(body, cloud, JointTargets.none(self.model), free, terms)
 
     def _swap(self, targets: JointTargets) -> JointTargets:
         other = list(find_other_sides(self.model.joint_names))

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.arrays import F64, Bools
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, trunk_rows
@@ -25,8 +26,21 @@ BEHIND_SURFACE_M = {
 RADIUS_M, MIN_RADIUS_PX = 0.04, 2.5
 """Around a joint, within which the person's points give its depth."""
 MIN_POINTS = 3
+PATH_POINTS, PATH_RADIUS_M = 5, 0.02
+"""Points around a place on a limb whose median depth is the surface there, and how far they may be."""
+BONES = {
+    "face": "neck", "belly": "neck", "shoulder": "neck", "hip": "belly", "elbow": "shoulder", "wrist": "elbow",
+    "hand": "wrist", "knee": "hip", "ankle": "knee", "foot": "ankle",
+}  # fmt: skip
+"""The joint from which a limb leads to each joint."""
+BONE_STEPS = 8  # between the joints of a limb, at which the surface is looked up
+MAX_JUMP_M = 0.09
+"""From one step to the next, beyond which the surface along a limb is not that of one limb."""
 MAX_TRUNK_DEPTH_M, MAX_LIMB_DEPTH_M = 0.45, 0.8
 """From the trunk's depth, within which the joints of trunk and limbs are."""
+
+
+_MIDDLE = ("neck", "belly")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +51,7 @@ class LiftedJoints:
         points: (J, 3) metres, NaN where there is no depth.
         rays: (J, 3) unit vectors from the camera to the joints, NaN where unknown.
         confidence: (J,) 0 to 1, that of the puppet, 0 without a depth.
-        hidden: (J,) whether the puppet's own parts hide the joint.
+        hidden: (J,) whether the joint is probably not on the surface that is seen at its pixel.
         depth: median depth of the trunk in metres along the camera's axis, NaN without any.
     """
 
@@ -81,7 +95,38 @@ def lift_joints(
     along = surface / (rays @ axis) + offsets
     points = cloud.camera.centre + rays * along[:, None]
     found = np.isfinite(points).all(axis=1)
-    return LiftedJoints(points, rays, np.where(found, puppet.confidence, 0.0), puppet.hidden, depth)
+    hidden = puppet.hidden | _find_broken(model, puppet, cloud, rows, surface)
+    return LiftedJoints(points, rays, np.where(found, puppet.confidence, 0.0), hidden, depth)
+
+
+def _find_broken(
+    model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray, surface: F64
+) -> Bools:
+    """Return the joints (J,) on the way to which the surface along the limb falls back to something behind it.
+
+    Along a limb that is seen the surface goes on. Where it falls back, the pixel has missed the limb, and what is seen
+    there is a neighbour or a wall. It may come nearer, as a hand does that points at the camera.
+    """
+    broken = np.zeros(len(model.joint_names), dtype=bool)
+    if not len(rows):
+        return broken
+    tree = cKDTree(cloud.pixels[rows])
+    depth = cloud.depth[rows]
+    share = np.linspace(0, 1, BONE_STEPS + 1)[:, None]
+    for joint, name in enumerate(model.joint_names):
+        kind = _kind(name)
+        above = BONES.get(kind, "")
+        if not above or not np.isfinite(surface[joint]):
+            continue
+        start = model.joint_names.index(above if above in _MIDDLE else name.replace(kind, above))
+        if not (puppet.known[start] and np.isfinite(surface[start])):
+            continue
+        path = puppet.pixels[start] + share * (puppet.pixels[joint] - puppet.pixels[start])
+        near, index = tree.query(path, k=PATH_POINTS, distance_upper_bound=PATH_RADIUS_M * cloud.camera.focal / surface[joint] + MIN_RADIUS_PX)
+        found = np.isfinite(near).all(axis=1)
+        along = np.median(depth[index[found]], axis=1)
+        broken[joint] = bool(len(along) > 1 and np.diff(along).max() > MAX_JUMP_M)
+    return broken
 
 
 def _collect_samples(puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray) -> dict[int, F64]:

@@ -7,26 +7,42 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
+from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.arrays import F64, I32
 
-MAX_RADII = 2.0
-"""Distance from the axis of a limb, in its radii, within which a point may be the person's."""
+MAX_RADII, MAX_GROWN_RADII = 2.0, 3.2
+"""Distance from the axis of a limb, in its radii, within which a point may be the person's, and within which it is
+where the person's surface goes on up to it: joints are sometimes beside their limb."""
+GROWTH_STEP_M, MAX_GROWTH_STEPS = 0.03, 6
 
 
-def assign_points(points: F64, people: Sequence[F64], max_radii: float = MAX_RADII) -> I32:
+def assign_points(points: F64, people: Sequence[F64]) -> I32:
     """Return the index of the person to whom each point belongs, (N,), -1 for those of nobody.
 
     Args:
         points: (N, 3) metres.
         people: (C, 8) of each person: two ends and two radii of each capsule, metres (`list_capsules`).
-        max_radii: distance in radii within which points belong to anybody.
     """
-    best, owner = np.full(len(points), max_radii), np.full(len(points), -1, dtype=np.int32)
     points = np.ascontiguousarray(points)
+    best, owner = np.full(len(points), MAX_GROWN_RADII), np.full(len(points), -1, dtype=np.int32)
     for number, capsules in enumerate(people):
         if len(capsules):
             _claim(points, capsules, number, best, owner)
+    sure = (owner >= 0) & (best < MAX_RADII)
+    maybe = np.flatnonzero((owner >= 0) & ~sure)
+    for _ in range(MAX_GROWTH_STEPS):
+        if not len(maybe) or not sure.any():
+            break
+        rows = np.flatnonzero(sure)
+        near, index = cKDTree(points[rows]).query(points[maybe], distance_upper_bound=GROWTH_STEP_M)
+        grown = np.isfinite(near)
+        grown[grown] = owner[rows[index[grown]]] == owner[maybe[grown]]
+        if not grown.any():
+            break
+        sure[maybe[grown]] = True
+        maybe = maybe[~grown]
+    owner[~sure] = -1
     return owner
 
 

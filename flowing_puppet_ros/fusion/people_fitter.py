@@ -13,19 +13,19 @@ from flowing_puppet_ros.body.cloud.limb_crop import list_capsules
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.segmentation.planes import find_planes, is_clear_of_planes
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.fusion.joint_fit import JointFitter
+from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
+from flowing_puppet_ros.fusion.joint_fit import MIN_LIMB_CONFIDENCE, JointFitter
 from flowing_puppet_ros.fusion.lift import LiftedJoints, lift_joints
 from flowing_puppet_ros.fusion.ownership import assign_points
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
-from flowing_puppet_ros.fusion.view_field import ViewField
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.threads import one_blas_thread, parallel_map, usable_threads
 
 
-MIN_LIMB_CONFIDENCE, MAX_LIMB_M = 0.3, 0.6
-"""Of both joints of a limb that takes points by itself, and its length."""
+MAX_LIMB_M = 0.6
+"""Length of a limb that takes points by itself."""
 CLAIM_ROUNDS = 2
 """In the first, joints that a neighbour hides are lifted onto the neighbour."""
 
@@ -66,13 +66,13 @@ class PeopleFitter:
         self._threads = usable_threads(fitter.settings.threads)
 
     def fit_people(
-        self, cloud: SeenCloud, puppets: Sequence[PuppetJoints], field: ViewField | None
+        self, cloud: SeenCloud, puppets: Sequence[PuppetJoints], image: RangeImage | None
     ) -> list[tuple[str, BodyFit]]:
         """Return (id, body) of the puppets that have enough points; the same for any number of threads."""
         with one_blas_thread():
             clear, floor = self.find_clear(cloud.points)
             claims = self.claim(cloud, puppets, clear)
-            found = parallel_map(lambda claim: self._fit(cloud, claim, field, floor), claims, self._threads)
+            found = parallel_map(lambda claim: self._fit(cloud, claim, image, floor), claims, self._threads)
         return [(claim.puppet.id, fit) for claim, fit in zip(claims, found, strict=True) if fit is not None]
 
     def find_clear(self, points: F64) -> tuple[Bools, Bools]:
@@ -118,10 +118,11 @@ class PeopleFitter:
         limbs = limbs[np.linalg.norm(limbs[:, :3] - limbs[:, 3:6], axis=1) < MAX_LIMB_M]
         return np.concatenate([list_capsules(dict(zip(names, body, strict=True))), limbs])
 
-    def _fit(self, cloud: SeenCloud, claim: Claim, field: ViewField | None, floor: Bools) -> BodyFit | None:
-        unknown = np.empty((0, 3)) if field is None else field.find_unknown(cloud.points, claim.own, floor)
+    def _fit(self, cloud: SeenCloud, claim: Claim, image: RangeImage | None, floor: Bools) -> BodyFit | None:
+        # The floor hides nobody: whoever stood below it would be hidden by it, and longer legs would cost nothing.
+        field = None if image is None else image.make_field(claim.own | floor)
         try:
-            seen = self.joint_fitter.make_cloud(cloud.points[claim.own], unknown)
+            seen = self.joint_fitter.make_cloud(cloud.points[claim.own], field)
             return self.joint_fitter.fit(seen, claim.start, claim.joints)
         except InputError:
             return None
