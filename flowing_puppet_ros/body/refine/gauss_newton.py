@@ -16,7 +16,7 @@ from scipy.linalg import solve
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic, geman_mcclure
 from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, PosedPoints, System
-from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.search.energy import RAY_SHARE, JointTargets
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -130,13 +130,18 @@ class GaussNewton:
         if not len(chosen):
             return
         gap = self._regressor[chosen] @ posed.vertices - targets.points[chosen]
+        squeeze = np.tile(np.eye(3), (len(chosen), 1, 1))
+        if targets.rays is not None:
+            ray = targets.rays[chosen]
+            squeeze -= (1 - RAY_SHARE) * ray[:, :, None] * ray[:, None, :]
+            gap = np.squeeze(squeeze @ gap[:, :, None], axis=2)
         trust = geman_mcclure((gap**2).sum(axis=1), width**2)
         rows = np.zeros((len(chosen), 3, len(gradient)))
         for part, jacobian in enumerate(self._equations.compute_jacobians(posed)):
             vertex = self._model.part_vertices[part]
             share = self._regressor[np.ix_(chosen, vertex)] * self._equations.share[vertex]
             rows[:, :, self._equations.unknowns(part)] += rotation[part] @ np.tensordot(share, jacobian, 1)
-        flat = rows.reshape(-1, len(gradient))
+        flat = (squeeze @ rows).reshape(-1, len(gradient)) if targets.rays is not None else rows.reshape(-1, len(gradient))
         weight = np.repeat(trust * targets.weight[chosen], 3)
         hessian += (flat * weight[:, None]).T @ flat
         gradient += flat.T @ (weight * gap.reshape(-1))
