@@ -65,7 +65,6 @@ MAY_IMPORT: dict[str, set[str]] = {
         "body.fit",
         "body.scans",
         "body.track",
-        "body.upright",
         "draw",
         "evaluate",
         "evaluate.bag",
@@ -186,6 +185,6 @@ MAY_IMPORT: dict[str, set[str]] = {
         "stream.messages",
         "stream.messages.bodies",
     },
-    "stream.messages": {"body.fit", "draw", "image.formats", "image.tracking", "model", "model.ds"},
+    "stream.messages": {"body.track", "draw", "image.formats", "image.tracking", "model", "model.ds"},
     "stream.messages.bodies": {"model", "multiview", "stream.messages"},
 }

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Array
-from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
+from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose, make_vector
 from flowing_puppet_ros.stream.messages.message_types import BODIES, PUPPETS, MessageFactory
 
 if TYPE_CHECKING:
-    from flowing_puppet_ros.body.fit.fitter import BodyFit
+    from flowing_puppet_ros.body.track.tracked_body import TrackedBody
     from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
     from flowing_puppet_ros.model.ds.puppet import DeformableStructures
     from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -82,9 +82,9 @@ def decode_body_joints(body: Any) -> dict[str, JointPosition]:
     }
 
 
-def make_body(factory: MessageFactory, identity: str, model: StitchedPuppet, fit: BodyFit) -> Any:
-    """Return the Body message of a fit, in the frame of the points that it was fitted to."""
-    state = fit.state
+def make_body(factory: MessageFactory, model: StitchedPuppet, body: TrackedBody) -> Any:
+    """Return the Body message of a body of `model`, in the frame of the points that it was fitted to."""
+    fit, state = body.fit, body.fit.state
     parts = []
     for index, name in enumerate(model.tree.names):
         used = model.pose_basis[index].shape[-1]
@@ -101,10 +101,14 @@ def make_body(factory: MessageFactory, identity: str, model: StitchedPuppet, fit
     confidence = np.full(len(fit.joints), fit.confidence)
     return factory.make(
         _MESSAGES + "Body",
-        id=identity,
+        id=body.id,
+        state=int(body.status),
         model=model.name,
         energy=fit.energy,
         confidence=fit.confidence,
+        reliable=fit.reliable,
+        height=model.measure_height(state.shape),
+        velocity=make_vector(factory, body.velocity),
         joints=make_joints(factory, model.joint_names, fit.joints, confidence),
         parts=parts,
     )
