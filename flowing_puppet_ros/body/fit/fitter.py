@@ -16,6 +16,7 @@ from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleVie
 from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings, Progress, sub_progress
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.quality import assess_fit
+from flowing_puppet_ros.body.fit.visibility import BodyVisibility, judge_visibility
 from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton
 from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
 from flowing_puppet_ros.body.refine.nonrigid import NonRigidRefinement, NonRigidWeights
@@ -49,6 +50,7 @@ class BodyFit:
         confidence: 0 to 1, from the parts on the cloud and the cloud on the body.
         reliable: whether the body can be trusted, see `FitQuality.reliable`.
         two_way_distance: mean distance between body and cloud over both directions, metres.
+        visibility: which vertices, joints and parts the sensor saw; None for bodies that were not fitted to a cloud.
     """
 
     state: BodyState
@@ -59,6 +61,7 @@ class BodyFit:
     confidence: float
     reliable: bool
     two_way_distance: float
+    visibility: BodyVisibility | None = None
 
 
 class BodyFitter:
@@ -235,6 +238,7 @@ class BodyFitter:
             quality.confidence,
             quality.reliable,
             quality.distance,
+            judge_visibility(self.model, vertices, cloud),
         )
 
 
