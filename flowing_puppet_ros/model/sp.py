@@ -161,7 +161,9 @@ class StitchedPuppet:
         change = [basis @ own for basis, own in zip(self.shape_basis, state.shape, strict=True)]
         for (parent, child), interface in zip(self.tree.edges, self.interfaces, strict=True):
             apart = change[parent][interface.parent_index] - change[child][interface.child_index]
-            moved = np.average(apart, axis=0, weights=interface.weight) + state.center[parent] - self.rest_center[parent]
+            moved = (
+                np.average(apart, axis=0, weights=interface.weight) + state.center[parent] - self.rest_center[parent]
+            )
             state.center[child] += moved
         return state
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import I64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
@@ -122,7 +123,8 @@ class BodyOutputs:
                 self._marker_count += 1
                 self._marker_ids[identity] = self._marker_count
             number = self._marker_ids[identity]
-            markers.append(make_mesh_marker(self._factory, header, number, self._preview_faces, fit.vertices))
+            inferred = fit.visibility.vertices == Visibility.INFERRED
+            markers.append(make_mesh_marker(self._factory, header, number, self._preview_faces, fit.vertices, inferred))
         return markers
 
     @cached_property

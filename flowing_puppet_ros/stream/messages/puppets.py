@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 _MESSAGES = "flowing_puppet_msgs/msg/"
 
+JOINT_CONFIDENCE = np.array([0.3, 0.8, 1.0])
+"""Confidence of a joint that is inferred, near the cloud, or seen, relative to that of the body."""
+
 type JointPosition = tuple[float, float, float, float]
 """x, y, z in metres, and a confidence in [0, 1]."""
 
@@ -66,11 +69,15 @@ def _make_puppet(factory: MessageFactory, model: DeformableStructures, puppet: T
     )
 
 
-def make_joints(factory: MessageFactory, names: Sequence[str], joints: Array, confidence: Array) -> list[Any]:
-    """Return the BodyJoints of `joints` (J, 3) in metres with `confidence` (J,); joints that are NaN are left out."""
+def make_joints(
+    factory: MessageFactory, names: Sequence[str], joints: Array, confidence: Array, visibility: Sequence[int] | Array
+) -> list[Any]:
+    """Return the BodyJoints of `joints` (J, 3) in metres with `confidence` (J,) and `Visibility` (J,), without NaN."""
     return [
-        factory.make(_MESSAGES + "BodyJoint", name=name, position=make_point(factory, xyz), confidence=c)
-        for name, xyz, c in zip(names, joints, confidence, strict=True)
+        factory.make(
+            _MESSAGES + "BodyJoint", name=name, position=make_point(factory, xyz), confidence=c, visibility=int(v)
+        )
+        for name, xyz, c, v in zip(names, joints, confidence, visibility, strict=True)
         if np.isfinite(xyz).all()
     ]
 
@@ -96,9 +103,11 @@ def make_body(factory: MessageFactory, model: StitchedPuppet, body: TrackedBody)
                 shape_coefficients=state.shape[index],
                 pose_coefficients=state.pose[index, :used],
                 confidence=fit.part_confidence[index],
+                visibility=int(fit.visibility.parts[index]),
             )
         )
-    confidence = np.full(len(fit.joints), fit.confidence)
+    visibility = fit.visibility.joints
+    confidence = fit.confidence * JOINT_CONFIDENCE[visibility]
     return factory.make(
         _MESSAGES + "Body",
         id=body.id,
@@ -109,7 +118,7 @@ def make_body(factory: MessageFactory, model: StitchedPuppet, body: TrackedBody)
         reliable=fit.reliable,
         height=model.measure_height(state.shape),
         velocity=make_vector(factory, body.velocity),
-        joints=make_joints(factory, model.joint_names, fit.joints, confidence),
+        joints=make_joints(factory, model.joint_names, fit.joints, confidence, visibility),
         parts=parts,
     )
 

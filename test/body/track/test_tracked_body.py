@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
 from flowing_puppet_ros.body.track.tracked_body import BodyMotion, TrackStatus
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -22,7 +23,8 @@ def body_at(place: np.ndarray) -> BodyFit:
     state = model.rest_state()
     state = replace(state, center=state.center + place)
     vertices = model.vertices(state)
-    return BodyFit(state, vertices, model.joints(vertices), 0.0, np.ones(16), 1.0, True, 0.0)
+    seen = BodyVisibility.of_vertices(model, np.full(len(vertices), Visibility.SEEN, np.int8))
+    return BodyFit(state, vertices, model.joints(vertices), 0.0, np.ones(16), 1.0, True, 0.0, seen)
 
 
 def test_the_velocity_is_that_of_the_walk_in_spite_of_noise() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody, TrackStatus
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyOutputSettings
@@ -30,10 +31,15 @@ def model() -> StitchedPuppet:
 
 
 def body(model: StitchedPuppet, place: tuple[float, float, float]) -> BodyFit:
+    """Return a body of which all but the left lower arm was seen."""
     state = model.rest_state()
     state = replace(state, center=state.center + np.array(place))
     vertices = model.vertices(state)
-    return BodyFit(state, vertices, model.joints(vertices), 1.0, np.ones(16), 0.9, True, 0.01)
+    hidden = model.part_of_vertex == model.tree.index("left_lower_arm")
+    visibility = BodyVisibility.of_vertices(
+        model, np.where(hidden, Visibility.INFERRED, Visibility.SEEN).astype(np.int8)
+    )
+    return BodyFit(state, vertices, model.joints(vertices), 1.0, np.ones(16), 0.9, True, 0.01, visibility)
 
 
 def header(tenths: int) -> Any:
@@ -160,3 +166,31 @@ def test_a_body_tells_how_it_came_how_it_moves_and_how_tall_it_is(model: Stitche
     assert one.reliable and not two.reliable
     assert one.height == pytest.approx(np.ptp(fit.vertices[:, 2]), abs=1e-3)
     assert abs(two.height - one.height) > 0.02
+
+
+def test_what_was_not_seen_is_said_and_pale(model: StitchedPuppet) -> None:
+    made = dict(outputs(model).make(header(0), [TrackedBody("b1", body(model, (2, 0, 1)))], subscribed=ALL))
+    (one,) = made["bodies"].bodies
+    parts = {part.name: part.visibility for part in one.parts}
+    assert parts.pop("left_lower_arm") == one.parts[0].INFERRED
+    assert set(parts.values()) == {one.parts[0].SEEN}
+    joints = {joint.name: joint for joint in one.joints}
+    assert joints["right_elbow"].visibility == joints["right_elbow"].SEEN
+    assert joints["right_elbow"].confidence == pytest.approx(0.9)
+    (marker,) = made["body_meshes"].markers
+    corners = np.array([(p.x, p.y, p.z) for p in marker.points])
+    pale = np.array([colour.r > marker.color.r for colour in marker.colors])
+    assert 0.01 < pale.mean() < 0.1
+    left_arm = [
+        (joints[name].position.x, joints[name].position.y, joints[name].position.z)
+        for name in ("left_elbow", "left_wrist")
+    ]
+    middle = np.mean(left_arm, axis=0)
+    assert np.linalg.norm(corners[pale] - middle, axis=1).max() < 0.25
+
+
+def test_a_body_that_was_seen_all_over_has_one_colour(model: StitchedPuppet) -> None:
+    fit = body(model, (2, 0, 1))
+    seen = BodyVisibility.of_vertices(model, np.full(len(model.part_of_vertex), Visibility.SEEN, np.int8))
+    made = dict(outputs(model).make(header(0), [TrackedBody("b1", replace(fit, visibility=seen))], subscribed=ALL))
+    assert not made["body_meshes"].markers[0].colors
