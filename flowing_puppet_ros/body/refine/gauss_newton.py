@@ -12,7 +12,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dposv
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic, geman_mcclure
 from flowing_puppet_ros.body.refine.joint_rows import JointRows
@@ -119,7 +120,7 @@ class GaussNewton:
         equations.add_joint_prior(weights.pairwise, state, system)
         self._add_priors(state, weights, system)
         hessian[np.diag_indices(equations.size)] += 1e-9 + 1e-3 * hessian.diagonal()
-        return self._retract(state, solve(hessian, -gradient, lower=True, assume_a="pos", overwrite_a=True))
+        return self._retract(state, _solve_lower(hessian, -gradient))
 
     def _add_joints(
         self, targets: JointTargets, width: float, posed: PosedPoints, rotation: np.ndarray, system: System
@@ -157,3 +158,14 @@ class GaussNewton:
         shape = np.clip(state.shape + step[first[-1] :], -MAX_COEFFICIENT, MAX_COEFFICIENT)
         pose = np.clip(pose, -MAX_COEFFICIENT, MAX_COEFFICIENT)
         return BodyState(center, state.rotation @ so3.exp(turn), pose, shape)
+
+
+def _solve_lower(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a positive definite system of which only the lower triangle is filled; `matrix` (U, U) is overwritten.
+
+    LAPACK itself, because `scipy.linalg.solve` takes as long again to copy the matrix and to estimate its condition.
+    """
+    solution, failed = dposv(matrix.T, right, lower=0, overwrite_a=True)[1:]
+    if failed:
+        raise LinAlgError("the normal equations are not positive definite")
+    return np.asarray(solution)
