@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.segmentation.linkage import link_within
 from flowing_puppet_ros.body.segmentation.planes import Plane, PlaneCache, find_floor, find_wall
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
@@ -103,7 +104,7 @@ def segment_people(
     centres = _average_voxels(local, voxel)
     free, floor = _remove_planes(centres, settings.plane_clearance, origin, plane_cache)
     label = np.full(len(centres), -1)
-    label[free] = _cluster(_average_voxels(compensated, voxel)[free], settings.max_gap)
+    label[free] = link_within(_average_voxels(compensated, voxel)[free], settings.max_gap)
     new_clusters = label.max() + 1
     # Scores by the first point of a cluster: what a claim leaves as it was is not scored again.
     scored: dict[int, tuple[np.ndarray, float]] = {}
@@ -244,16 +245,6 @@ def _find_planes(centres: np.ndarray, clearance: float) -> tuple[Plane | None, l
 def _subsample(points: np.ndarray) -> np.ndarray:
     """Return evenly chosen points, as many as are enough to find planes."""
     return np.ascontiguousarray(points[:: 1 + len(points) // MAX_PLANE_POINTS])
-
-
-def _cluster(points: np.ndarray, gap: float) -> np.ndarray:
-    """Return the cluster (M,) of each point: points closer than `gap` belong together (DBSCAN, Ester et al. 1996)."""
-    import open3d as o3d
-
-    if not len(points):
-        return np.empty(0, dtype=np.int64)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    return np.asarray(cloud.cluster_dbscan(eps=gap, min_points=1)).astype(np.int64)
 
 
 def _group_by_label(label: np.ndarray) -> list[tuple[int, np.ndarray]]:

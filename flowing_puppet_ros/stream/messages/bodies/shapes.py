@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import I64, Array
+from flowing_puppet_ros.stream.messages.bodies.mesh_preview import simplify_mesh
 from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
 from flowing_puppet_ros.stream.messages.message_types import MESH, MessageFactory
 
@@ -76,19 +77,8 @@ def make_topology(factory: MessageFactory, model: StitchedPuppet) -> Any:
 
 
 def preview_faces(model: StitchedPuppet, triangles: int) -> I64:
-    """Return about `triangles` faces (F', 3) over the model's own vertices; all of the model's faces when 0.
-
-    Quadric edge collapse (Garland and Heckbert 1997) of the body at rest. Every remaining vertex is replaced by the
-    nearest one of the model, so that the coarse mesh has the pose and shape of the full one.
-    """
-    if not 0 < triangles < len(model.faces):
-        return np.asarray(model.faces, np.int64)
-    import open3d as o3d
-    from scipy.spatial import cKDTree
-
-    vertices = model.vertices(model.rest_state())
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(model.faces))
-    coarse = mesh.simplify_quadric_decimation(triangles)
-    faces = cKDTree(vertices).query(np.asarray(coarse.vertices))[1][np.asarray(coarse.triangles)]
-    a, b, c = faces.T
-    return np.asarray(faces[(a != b) & (b != c) & (c != a)], np.int64)
+    """Return about `triangles` faces (F', 3) over the model's own vertices; all of the model's faces when 0."""
+    faces = np.asarray(model.faces, np.int64)
+    if not 0 < triangles < len(faces):
+        return faces
+    return simplify_mesh(model.vertices(model.rest_state()), faces, triangles)
