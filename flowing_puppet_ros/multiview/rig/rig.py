@@ -17,6 +17,7 @@ from flowing_puppet_ros.multiview.camera import Camera
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 """Metres in a unit of length."""
 _MAX_ROTATION_ERROR = 1e-3  # of R @ R.T from the identity; files are rounded
+_ROUNDING = 1e-12  # of R @ R.T from the identity that is left as it is
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,12 +85,14 @@ def make_rig_camera(
         raise InputError(f"the rotation of {name} is {np.round(turned, 4).tolist()}, which is not a rotation matrix")
     if np.linalg.det(turned) < 0:
         raise InputError(f"the rotation of {name} is mirrored (its determinant is -1): one axis has the wrong sign")
-    u, _, v = np.linalg.svd(turned)
+    if np.abs(turned @ turned.T - np.eye(3)).max() > _ROUNDING:
+        u, _, v = np.linalg.svd(turned)
+        turned = u @ v
     while len(coefficients) > 5 and coefficients[-1] == 0:
         coefficients = coefficients[:-1]
     width, height = size or (2 * k[0, 2] + 1, 2 * k[1, 2] + 1)
     try:
-        camera = Camera.from_info(k, coefficients, max(1, round(width)), max(1, round(height)), u @ v, moved)
+        camera = Camera.from_info(k, coefficients, max(1, round(width)), max(1, round(height)), turned, moved)
     except InputError as error:
         raise InputError(f"the calibration of {name}: {error}") from error
     return RigCamera(camera, size is not None, float(time_offset))
