@@ -53,6 +53,7 @@ class LiftedJoints:
         confidence: (J,) 0 to 1, that of the puppet, 0 without a depth.
         hidden: (J,) whether the joint is probably not on the surface that is seen at its pixel.
         depth: median depth of the trunk in metres along the camera's axis, NaN without any.
+        centre: (3,) metres, where the camera is.
     """
 
     points: F64
@@ -60,6 +61,7 @@ class LiftedJoints:
     confidence: F64
     hidden: Bools
     depth: float
+    centre: F64
 
     @property
     def found(self) -> Bools:
@@ -96,7 +98,7 @@ def lift_joints(
     points = cloud.camera.centre + rays * along[:, None]
     found = np.isfinite(points).all(axis=1)
     hidden = puppet.hidden | _find_broken(model, puppet, cloud, rows, surface)
-    return LiftedJoints(points, rays, np.where(found, puppet.confidence, 0.0), hidden, depth)
+    return LiftedJoints(points, rays, np.where(found, puppet.confidence, 0.0), hidden, depth, cloud.camera.centre)
 
 
 def _find_broken(
