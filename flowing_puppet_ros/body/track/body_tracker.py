@@ -221,7 +221,7 @@ class BodyTracker:
         if on_floor and viewpoint is not None:
             cloud: Cloud = self._upright.make_cloud(points, viewpoint, np.empty((0, 3)))
         else:
-            cloud = self._fitter.prepare_cloud(points, normals, viewpoint)
+            cloud = self._fitter.prepare_cloud(points, normals, viewpoint, person.field)
         pull = self._no_joints if targets is None else targets
         return _Prepared(cloud, stamp, occluded, oriented, person.floor if on_floor else None, pull)
 
@@ -273,6 +273,7 @@ class BodyTracker:
             cloud.points,
             normals,
             viewpoint=cloud.viewpoint,
+            field=cloud.field,
             seed=seed,
             progress=progress,
             nonrigid=False,
