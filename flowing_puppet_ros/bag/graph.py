@@ -277,7 +277,7 @@ def _make_scene_fitter(
     factory: MessageFactory,
 ) -> Instance:
     """Return a body fitter for a topic of clouds, or for depth images with their camera_info."""
-    remapped = {port: "" for port in ("points", "depth", "camera_info", "silhouettes", "puppets", "puppets/camera_info")}
+    remapped = dict.fromkeys(("points", "depth", "camera_info", "silhouettes", "puppets", "puppets/camera_info"), "")
     if isinstance(source, DepthTopic):
         topic = base_topic(source.image)
         remapped |= {"depth": source.image, "camera_info": source.info}

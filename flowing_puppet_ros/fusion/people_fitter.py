@@ -25,7 +25,6 @@ from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.threads import one_blas_thread, parallel_map, usable_threads
 
-
 MAX_LIMB_M = 0.6
 """Length of a limb that takes points by itself."""
 CLAIM_ROUNDS = 2
@@ -45,8 +44,7 @@ class FusionSettings(Settings):
         0.3, "confidence from which on a body that is not reliable is published", low=0.0, high=1.0, advanced=True
     )
     max_lag: float = setting(
-        0.35, "time between a cloud and the nearest puppets beyond which they do not belong together", unit="s", low=0.0,
-        high=5.0,
+        0.35, "time between a cloud and the nearest puppets up to which they belong together", unit="s", low=0.0, high=5.0
     )  # fmt: skip
     wait: int = setting(
         3, "clouds to wait for late puppets before one is used without them", low=0, high=50, advanced=True
@@ -84,7 +82,7 @@ class PeopleFitter:
         self._trunk = trunk_rows(fitter.model)
 
     def fit_people(
-        self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints]
+        self, cloud: SeenCloud, puppets: Sequence[PuppetJoints], image: RangeImage | None
     ) -> list[tuple[str, BodyFit]]:
         """Return (id, body) of the puppets that have enough points; the same for any number of threads.
 
@@ -94,7 +92,9 @@ class PeopleFitter:
             clear, floor = self.find_clear(cloud.points)
             claims, _ = self.claim(cloud, puppets, clear)
             people = [make_person(cloud, image, claim.own, floor, 0) for claim in claims]
-            found = parallel_map(lambda pair: self.fit_claim(*pair), list(zip(claims, people, strict=True)), self.threads)
+            found = parallel_map(
+                lambda pair: self.fit_claim(*pair), list(zip(claims, people, strict=True)), self.threads
+            )
         return [
             (claim.puppet.id, fit)
             for claim, fit in zip(claims, found, strict=True)
@@ -166,7 +166,7 @@ class PeopleFitter:
             return None
 
     def _list_capsules(self, claim: Claim) -> F64:
-        """Return the capsules (C, 8) of a body, and of the limbs whose joints are certain, should the body miss them."""
+        """Return the capsules (C, 8) of a body, and of limbs with certain joints, should the body miss them."""
         names, joints = self.model.joint_names, claim.joints
         certain = joints.found & ~joints.hidden & (joints.confidence >= MIN_LIMB_CONFIDENCE)
         seen = {name: place for name, place, sure in zip(names, joints.points, certain, strict=True) if sure}
@@ -175,7 +175,9 @@ class PeopleFitter:
         return np.concatenate([self._list_body(claim.start), limbs])
 
     def _list_body(self, body: BodyState) -> F64:
-        return list_capsules(dict(zip(self.model.joint_names, self.model.joints(self.model.vertices(body)), strict=True)))
+        return list_capsules(
+            dict(zip(self.model.joint_names, self.model.joints(self.model.vertices(body)), strict=True))
+        )
 
     def fit_claim(self, claim: Claim, person: PersonCloud) -> BodyFit | None:
         """Return the body of a puppet's own points, from its joints; None where there is none."""

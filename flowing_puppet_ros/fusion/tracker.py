@@ -1,27 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """Track the people whom a camera sees as puppets through the clouds of a sensor, each under the puppet's id.
 
-    puppet | depth | what is done
-    yes    | yes   | the body moves on by a few steps, with the joints as soft evidence across their rays;
-           |       | a new or lost one is fitted anew from the joints
-    yes    | no    | the person keeps the id and has no body in this cloud
-    no     | yes   | who is known is tracked by the cloud alone for as long as ids are held; nobody is new
-    no     | no    | the id is held for a while
+puppet | depth | what is done
+yes    | yes   | the body moves on by a few steps, with the joints as soft evidence across their rays;
+|       | a new or lost one is fitted anew from the joints
+yes    | no    | the person keeps the id and has no body in this cloud
+no     | yes   | who is known is tracked by the cloud alone for as long as ids are held; nobody is new
+no     | no    | the id is held for a while
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.arrays import Bools
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
+from flowing_puppet_ros.body.track.tracked_body import BodyMotion, TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.fusion.people_fitter import Claim, PeopleFitter, make_person
@@ -39,13 +40,14 @@ MAX_SAME_PERSON_M = 0.6
 
 @dataclass(slots=True, eq=False)
 class _PuppetTrack:
-    """One person: the `stamp` ns of the last puppet or body, that of the last fit from joints, whether it is `proven`."""
+    """One person: the `stamp` ns of the last sign, that of the last fit from joints, whether it is `proven`."""
 
     id: str
     tracker: BodyTracker
     stamp: int
     fitted: int = 0
     proven: bool = False
+    motion: BodyMotion = field(default_factory=BodyMotion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,8 +87,8 @@ class FusedTracker:
 
     def step(
         self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints], stamp: int
-    ) -> tuple[list[tuple[str, BodyFit]], Bools]:
-        """Return (id, body) of everybody who is seen, and which points (N,) are theirs.
+    ) -> tuple[list[TrackedBody], Bools]:
+        """Return the bodies of everybody who is seen, and which points (N,) are theirs.
 
         Args:
             cloud: with the pixels of the camera that saw the puppets.
@@ -100,7 +102,7 @@ class FusedTracker:
         with one_blas_thread():
             jobs, own = self._share_out(cloud, image, self._name(puppets, cloud, stamp), stamp)
             fits = parallel_map(lambda job: self._track(job, stamp), jobs, self._people.threads)
-        found = []
+        found: list[TrackedBody] = []
         for job, fit in zip(jobs, fits, strict=True):
             if isinstance(fit, InputError):
                 self._report.count_unusable(fit)
@@ -108,11 +110,12 @@ class FusedTracker:
                 job.track.stamp = stamp
                 job.track.proven = job.track.proven or self._people.is_proven(fit)
                 if job.track.proven:
-                    found.append((job.track.id, fit))
-        self._shown = {identity for identity, _ in found}
+                    hidden = job.track.tracker.hidden
+                    found.append(job.track.motion.add(job.track.id, stamp, fit, hidden))
+        self._shown = {body.id for body in found}
         self._report.counters["tracked people"] += len(found)
         self._drop_lost(stamp)
-        return sorted(found, key=lambda pair: (len(pair[0]), pair[0])), own
+        return sorted(found, key=lambda body: (len(body.id), body.id)), own
 
     def _share_out(
         self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints], stamp: int
@@ -121,9 +124,7 @@ class FusedTracker:
         clear, floor = self._people.find_clear(cloud.points, self._planes)
         seen = {puppet.id for puppet in puppets}
         known = {identity: track.tracker.predict(stamp) for identity, track in self._tracks.items()}
-        alone = {
-            identity: body for identity, body in known.items() if body is not None and identity not in seen
-        }
+        alone = {identity: body for identity, body in known.items() if body is not None and identity not in seen}
         bodies: list[BodyState | None] = [known.get(puppet.id) for puppet in puppets]
         claims, unclaimed = self._people.claim(cloud, puppets, clear, bodies, list(alone.values()))
         jobs = []

@@ -127,9 +127,7 @@ class PuppetPairs:
         if self._settings.rectified:
             matrix = np.asarray(info.p, float).reshape(3, 4)[:, :3].ravel()
             return Camera.from_info(matrix, [], info.width, info.height, rotation, translation)
-        return Camera.from_info(
-            info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model
-        )
+        return Camera.from_info(info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model)
 
     def _decode(self, message: Any, camera: Camera) -> list[PuppetJoints]:
         found = []
@@ -166,8 +164,9 @@ def _find_hidden(puppet: Any) -> list[str]:
     for joint in puppet.joints:
         side, _, kind = joint.name.partition("_")
         part = parts.get(f"{side}_{_ARMS.get(kind, '')}")
-        inside = len(outline) > 2 and np.isfinite(joint.x) and np.isfinite(joint.y)
-        if part is not None and inside and part.depth < torso.depth:
-            if cv2.pointPolygonTest(outline, (float(joint.x), float(joint.y)), False) > 0:
-                hidden.append(joint.name)
+        place = float(joint.x), float(joint.y)
+        if part is None or part.depth >= torso.depth or len(outline) < 3 or not np.isfinite(place).all():
+            continue
+        if cv2.pointPolygonTest(outline, place, False) > 0:
+            hidden.append(joint.name)
     return hidden
