@@ -28,6 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "body.search",
         "body.segmentation",
         "body.upright",
+        "evidence.cloud",
         "model",
     },
     "body.upright": {
@@ -174,6 +175,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "body.scans",
         "body.track",
         "draw",
+        "evidence.cloud",
         "flow",
         "image.formats",
         "image.networks",

@@ -213,7 +213,7 @@ class BodyTracker:
         if on_floor and viewpoint is not None:
             cloud: Cloud = self._upright.make_cloud(points, viewpoint, np.empty((0, 3)))
         else:
-            cloud = self._fitter.prepare_cloud(points, normals, viewpoint)
+            cloud = self._fitter.prepare_cloud(points, normals, viewpoint, person.field)
         return _Prepared(cloud, stamp, occluded, oriented, person.floor if on_floor else None)
 
     def _track(self, prepared: _Prepared) -> tuple[BodyFit | None, bool]:
@@ -264,6 +264,7 @@ class BodyTracker:
             cloud.points,
             normals,
             viewpoint=cloud.viewpoint,
+            field=cloud.field,
             seed=seed,
             progress=progress,
             nonrigid=False,

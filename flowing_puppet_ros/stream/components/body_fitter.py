@@ -20,6 +20,7 @@ from flowing_puppet_ros.body.track.scene_tracker import (
     crop_to_region,
 )
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.settings import nested, setting
@@ -28,7 +29,7 @@ from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyO
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriSettings
 from flowing_puppet_ros.stream.components.silhouette_bodies import SilhouetteBodies
 from flowing_puppet_ros.stream.depth_pairs import DepthPairs
-from flowing_puppet_ros.stream.messages.clouds import decode_cloud
+from flowing_puppet_ros.stream.messages.clouds import decode_pixels
 from flowing_puppet_ros.stream.messages.depth import make_depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.message_types import (
@@ -145,13 +146,16 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
         That of a depth image is seen from one side, in an optical frame, whatever its name, whose y axis points down.
         """
-        points, normals = decode_cloud(cloud)
+        points, normals, pixel = decode_pixels(cloud)
+        image = RangeImage.of_organised(points, pixel, (int(cloud.height), int(cloud.width)))
         inside = crop_to_region(points, self.settings.region)
         if not inside.all():
             points, normals = points[inside], None if normals is None else normals[inside]
+            image = image and image.take(inside)
         to_z_up = rotation_to_z_up(parse_axis(self._find_up(cloud.header.frame_id, points, of_depth)))
         rotated = None if normals is None else normals @ to_z_up.T
-        return SceneCloud(points @ to_z_up.T, rotated, stamp_ns(cloud), of_depth), to_z_up
+        image = image and image.turn(to_z_up)
+        return SceneCloud(points @ to_z_up.T, rotated, stamp_ns(cloud), of_depth, image), to_z_up
 
     def _find_up(self, frame: str, points: F64, of_depth: bool) -> str:
         """Return the axis that is up in a frame; for one without a name the first cloud decides."""
@@ -175,6 +179,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
     ) -> list[tuple[str, BodyFit]]:
         """Fit each of the bodies in `initial` to the whole cloud, from its joints."""
         viewpoint = np.zeros(3) if self.settings.view == "single" or scene.single_view else None
+        field = scene.image.make_field(slice(None)) if scene.image is not None and viewpoint is not None else None
         fits = []
         for number, body in enumerate(initial.bodies, start=1):
             fit = self._fitter.fit(
@@ -182,6 +187,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
                 scene.normals,
                 initial=_rotate_joints(decode_body_joints(body), to_z_up),
                 viewpoint=viewpoint,
+                field=field,
                 seed=seed,
                 progress=progress,
             )
