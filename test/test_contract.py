@@ -20,7 +20,15 @@ PACKAGE = Path(flowing_puppet_ros.__file__).parent
 ROOT = PACKAGE.parent
 NAME = PACKAGE.name
 MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
-ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
+ROS_PACKAGES = {
+    "ament_index_python",
+    "rclpy",
+    "launch",
+    "launch_ros",
+    "rcl_interfaces",
+    "builtin_interfaces",
+    "std_srvs",
+}
 FOUNDATION = {"arrays", "errors", "extras", "ids", "images", "reporting", "settings", "threads", "units"}
 """Modules beside the rooms, which everything may import."""
 OPTIONAL_PACKAGES = {
@@ -147,7 +155,9 @@ def test_no_import_cycles() -> None:
 @pytest.mark.slow
 def test_all_but_node_imports_without_ros() -> None:
     """Every other module imports where rclpy, the message packages and what is optional are absent."""
-    names = [module_name(path) for path in MODULES if room_of(module_name(path)) not in ("node", "__main__")]
+    names = [
+        module_name(path) for path in MODULES if package_of(room_of(module_name(path))) not in ("node", "__main__")
+    ]
     names.remove(ONLY_WITH_EXTRA)
     code = f"""
 import importlib, sys
@@ -181,7 +191,7 @@ def test_third_party_imports_are_required() -> None:
         optional = next((name for place, name in OPTIONAL.items() if f"{dotted}.".startswith(f"{place}.")), "runtime")
         allowed = listed["runtime"] | listed[optional]
         for top in {name.split(".")[0] for name in imports(path)} - set(sys.stdlib_module_names) - {NAME}:
-            if own == "node" and (top in ROS_PACKAGES or top.endswith("_msgs")):
+            if package_of(own) == "node" and (top in ROS_PACKAGES or top.endswith("_msgs")):
                 continue
             providers = {name.lower() for name in distributions.get(top, [top.replace("_", "-")])}
             assert providers & allowed, f"{module_name(path)} imports {top}, which no requirements file names"
