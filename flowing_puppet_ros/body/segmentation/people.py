@@ -106,16 +106,19 @@ def segment_people(
     label = np.full(len(centres), -1)
     label[free] = link_within(_average_voxels(compensated, voxel)[free], settings.max_gap)
     new_clusters = label.max() + 1
+    # Scores by the first point of a cluster: what a claim leaves as it was is not scored again.
+    scored: dict[int, tuple[np.ndarray, float]] = {}
     if known and len(free):
-        whole = {
-            number for number, group in _group_by_label(label[voxel])
-            if person_score(local[group], floor) >= settings.min_score
-        }  # fmt: skip
+        clusters = _group_by_label(label[voxel])
+        scored = {int(group[0]): (group, person_score(local[group], floor)) for _, group in clusters}
+        whole = {number for number, group in clusters if scored[int(group[0])][1] >= settings.min_score}
         label[free] = assign_to_known(centres[free] + origin, label[free], known, whole)
     people = []
     for number, group in _group_by_label(label[voxel]):
         owner = int(number - new_clusters) if number >= new_clusters else None
-        score = person_score(local[group], floor)
+        before, score = scored.get(int(group[0]), (group[:0], 0.0))
+        if not np.array_equal(before, group):
+            score = person_score(local[group], floor)
         if len(group) >= settings.min_points and (owner is not None or score >= settings.min_score):
             chosen = rows[group]
             own_normals = None if normals is None else normals[chosen]

@@ -90,20 +90,6 @@ def stature_cost(stature: np.ndarray) -> np.ndarray:
     return STATURE_COST_M * ((stature - MEAN_STATURE_M) / STATURE_DEVIATION_M) ** 2
 
 
-def measure_stature(model: StitchedPuppet, state: BodyState) -> float:
-    """Return the height of the person when standing, in metres: the rest pose, stitched in the person's shape."""
-    rest = model.rest_state()
-    rest.shape[:] = state.shape
-    for number, (parent, child) in enumerate(model.tree.edges):
-        interface = model.interfaces[number]
-        target, own = (
-            model.local_vertices(part, rest.pose[part], rest.shape[part])[index]
-            for part, index in ((parent, interface.parent_index), (child, interface.child_index))
-        )
-        rest.center[child] = rest.center[parent] + np.average(target - own, axis=0, weights=interface.weight)
-    return float(np.ptp(model.vertices(rest)[:, 2]))
-
-
 @lru_cache(maxsize=3)
 def make_upright_bank(model: StitchedPuppet) -> UprightBank:
     """Draw the bank; made once for a model."""
@@ -122,7 +108,7 @@ def make_upright_bank(model: StitchedPuppet) -> UprightBank:
         states.append(BodyState(state.center + down, state.rotation, state.pose, state.shape))
         points.append((vertices + down)[rows])
         normals.append(vertex_normals(vertices, model.faces)[rows])
-        statures.append(measure_stature(model, state))
+        statures.append(model.measure_height(state.shape))
     turns = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
     turned = [np.concatenate([np.stack(each) @ turn.T for turn in turns]) for each in (points, normals)]
     return UprightBank(states, turns, turned[0], turned[1], np.array(statures))
