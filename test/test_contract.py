@@ -47,7 +47,6 @@ OPTIONAL = {
     "bag.foreign.video": "video",
     "evaluate.output": "report",
     "body.scans.scan": "scans",
-    "body.cloud.normals": "scans",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10
