@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dposv
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic, geman_mcclure
 from flowing_puppet_ros.body.refine.joint_rows import JointRows
 from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, PosedPoints, System
-from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.search.energy import RAY_SHARE, JointTargets
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -130,8 +130,13 @@ class GaussNewton:
         if not len(chosen):
             return
         gap = self._joints.find_joints(chosen, posed.vertices) - targets.points[chosen]
+        rows = self._joints.derive(chosen, posed, rotation)
+        if targets.rays is not None:
+            ray = targets.rays[chosen]
+            squeeze = np.eye(3) - (1 - RAY_SHARE) * ray[:, :, None] * ray[:, None, :]
+            gap, rows = np.squeeze(squeeze @ gap[:, :, None], axis=2), squeeze @ rows
         trust = geman_mcclure((gap**2).sum(axis=1), width**2)
-        flat = self._joints.derive(chosen, posed, rotation).reshape(-1, len(gradient))
+        flat = rows.reshape(-1, len(gradient))
         weight = np.repeat(trust * targets.weight[chosen], 3)
         hessian += (flat * weight[:, None]).T @ flat
         gradient += flat.T @ (weight * gap.reshape(-1))
