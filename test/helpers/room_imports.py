@@ -180,6 +180,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "model": set(),
     "model.ds": {"model"},
     "multiview": {"body.cloud", "body.fit", "body.refine", "body.search", "model"},
+    "node.launching": set(),
     "node": {"stream", "stream.components", "stream.messages"},
     "node.live": {"bag", "doctor", "node"},
     "report": {"bag", "draw", "evaluate", "evaluate.bag", "flow", "model", "model.ds", "multiview", "stream.messages"},

@@ -16,7 +16,6 @@ from numba import njit
 
 from flowing_puppet_ros.evidence.cloud.data_term import fill_nearest
 from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours
-
 from flowing_puppet_ros.evidence.cloud.sensor_field import NO_FIELD, FieldArrays, SensorField, is_unknown
 
 MAX_CELLS = 60_000  # of the grid of directions
