@@ -24,6 +24,7 @@ VERBS = {
     "replay": "run the nodes' algorithms over a bag, losslessly and reproducibly",
     "report": "make the HTML report of a replayed bag",
     "doctor": "say what can be computed from an input or on this machine, and what to run",
+    "export": "write fitted bodies as GLB, BVH, TRC, OBJ or JSON",
     "networks": "list, check and install the keypoint networks",
     "annotate": "pose puppets on images in the browser",
     "learn": "learn the body models, the likelihood and the detector",
@@ -35,8 +36,8 @@ VERBS = {
 
 _INPUT_ARGUMENTS = ("inputs", "input", "images")
 """Names of the arguments of verbs that are inputs."""
-VERB_PACKAGES = ("evaluate", "sample")
-"""Verbs of several kinds: folders with a module per kind."""
+VERB_PACKAGES = ("doctor", "evaluate", "export", "sample")
+"""Verbs in folders of their own."""
 
 
 def import_verb(verb: str) -> ModuleType:
