@@ -6,10 +6,12 @@ from __future__ import annotations
 from typing import Any
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.track.scene_tracker import ONLY_ID
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitter, SilhouetteFitterSettings
+from flowing_puppet_ros.stream.components.body_outputs import id_sort_key
 from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_silhouettes
-from flowing_puppet_ros.stream.messages.geometry import stamp_ns
+from flowing_puppet_ros.stream.messages.geometry import header_ns, stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
 
 _MAX_AGE_NS = 1_000_000_000
@@ -17,20 +19,53 @@ _MAX_AGE_NS = 1_000_000_000
 
 
 class SilhouetteBodies:
-    """Fits the person of each SilhouetteSet; remembers every person's last reliable body for a second."""
+    """Fits the person of each SilhouetteSet; remembers every person's last reliable body for a second.
+
+    The fits of one instant are collected until everybody's set has come, or a set of another instant.
+    """
 
     def __init__(self, model: StitchedPuppet, settings: SilhouetteFitterSettings) -> None:
         """Prepare to fit `model`."""
         self._fitter = SilhouetteFitter(model, settings)
         self._last: dict[str, tuple[int, BodyState]] = {}
+        self._header: Any = None
+        self._missing: set[str] = set()
+        self._fits: list[tuple[str, BodyFit]] = []
 
     def reset(self) -> None:
-        """Forget all people."""
+        """Forget all people and what is collected."""
         self._last.clear()
+        self._header = None
+        self._missing.clear()
+        self._fits.clear()
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether sets have come and none of the same instant is to come."""
+        return self._header is not None and not self._missing
+
+    def is_other_instant(self, message: Any) -> bool:
+        """Return whether a set is of another instant than those collected, or of somebody who is among them."""
+        if self._header is None:
+            return False
+        return header_ns(self._header) != stamp_ns(message) or _find_id(message) not in self._missing
+
+    def add(self, message: Any) -> None:
+        """Fit the person in a SilhouetteSet and collect the body. InputError when it cannot be fitted."""
+        if self._header is None:
+            self._header, self._missing = message.header, {*message.people, _find_id(message)}
+        self._missing.discard(_find_id(message))
+        self._fits.append(self.fit(message))
+
+    def collect(self) -> tuple[Any, list[tuple[str, BodyFit]]]:
+        """Return the header (None if there is nothing) and the bodies of the sets collected, and begin anew."""
+        header, fits = self._header, sorted(self._fits, key=lambda entry: id_sort_key(entry[0]))
+        self._header, self._missing, self._fits = None, set(), []
+        return header, fits
 
     def fit(self, message: Any) -> tuple[str, BodyFit]:
         """Fit the person in a SilhouetteSet; return the id and the body. InputError when it cannot be fitted."""
-        identity, stamp = message.person.id or "b1", stamp_ns(message)
+        identity, stamp = _find_id(message), stamp_ns(message)
         last_stamp, last_state = self._last.get(identity, (stamp, None))
         if not 0 <= stamp - last_stamp <= _MAX_AGE_NS:
             last_state = None
@@ -38,3 +73,7 @@ class SilhouetteBodies:
         if fit.reliable:
             self._last[identity] = stamp, fit.state
         return identity, fit
+
+
+def _find_id(message: Any) -> str:
+    return message.person.id or ONLY_ID
