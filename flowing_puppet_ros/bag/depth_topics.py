@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from flowing_puppet_ros.bag.reader import Bag
+from flowing_puppet_ros.bag.reader import RecordingLike
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.component import base_topic, is_compressed_depth_topic
 from flowing_puppet_ros.stream.messages.compressed_depth import decode_compressed_depth, source_encoding
@@ -41,7 +41,7 @@ class DepthTopic:
     info: str
 
 
-def read_samples(bag: Bag) -> dict[str, ImageSample]:
+def read_samples(bag: RecordingLike) -> dict[str, ImageSample]:
     """Return topic -> its first readable image, for raw images and for compressed ones that hold depth."""
     found: dict[str, ImageSample] = {}
     for name, topic in bag.details.items():

@@ -18,9 +18,9 @@ from tqdm import tqdm
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.bag.depth_topics import read_samples
 from flowing_puppet_ros.bag.foreign.static_frames import find_static_transforms
-from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Instance, build_graph, find_info_topics
+from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Graph, Instance, build_graph, find_info_topics
 from flowing_puppet_ros.bag.graph_run import Call, GraphRun, Step
-from flowing_puppet_ros.bag.reader import Bag, Record, open_bag
+from flowing_puppet_ros.bag.reader import Record, RecordingLike, open_bag
 from flowing_puppet_ros.bag.stuck_stamps import StuckStamps
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.unused import count_used, explain_unused
@@ -101,10 +101,24 @@ def replay(source: Path, target: Path, options: ReplayOptions | None = None) -> 
     return run.summarise(source, target, time.perf_counter() - begin, counts)
 
 
+@dataclass(frozen=True, slots=True)
+class ReplayPlan:
+    """What a replay of a recording would run, and what it would warn of before the first message."""
+
+    graph: Graph
+    warnings: tuple[str, ...]
+
+
+def plan_replay(recording: RecordingLike) -> ReplayPlan:
+    """Return what `replay` would run; InputError as of `replay`."""
+    run = _Replay(recording, ReplayOptions())
+    return ReplayPlan(run._graph, tuple(run.warnings))
+
+
 class _Replay:
     """One pass over a bag."""
 
-    def __init__(self, bag: Bag, options: ReplayOptions) -> None:
+    def __init__(self, bag: RecordingLike, options: ReplayOptions) -> None:
         self._bag = bag
         self._options = options
         self._new_name = _rename_topics(bag.topics, options.topic_map)

@@ -49,12 +49,12 @@ class Gaussian:
         """
         gain, covariance = self._regress(kept, given)
         values = np.asarray(values, dtype=np.float64)
-        mean = self.mean[np.asarray(kept, dtype=np.intp)] + gain @ (values - self.mean[np.asarray(given, dtype=np.intp)])
+        mean = self.mean[np.asarray(kept, dtype=np.intp)] + gain @ (
+            values - self.mean[np.asarray(given, dtype=np.intp)]
+        )
         return Gaussian(mean, covariance)
 
-    def make_conditional(
-        self, kept: Sequence[int] | Array, given: Sequence[int] | Array
-    ) -> tuple[Array, Array, Array]:
+    def make_conditional(self, kept: Sequence[int] | Array, given: Sequence[int] | Array) -> tuple[Array, Array, Array]:
         """Return `condition` for any values: the mean (K,) at values of zero, its slope (K, G), and axes (K, K).
 
         A sample is the mean plus the axes times standard normal numbers.

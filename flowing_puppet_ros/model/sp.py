@@ -146,12 +146,30 @@ class StitchedPuppet:
         """Return P_i, the number of pose coefficients of a part."""
         return int(self.pose_basis[part].shape[2])
 
-    def rest_state(self) -> BodyState:
-        """Return the average body in the template pose: pose coefficients that undo the mean pose deformation."""
+    def rest_state(self, shape: Array | None = None) -> BodyState:
+        """Return a body in the template pose: pose coefficients that undo the mean pose deformation.
+
+        `shape` (16, S) are its shape coefficients, to which the parts are stitched; None: the average body.
+        """
         rest = _fit_rest_pose(self)
         parts = len(self.tree)
         upright = np.broadcast_to(np.eye(3), (parts, 3, 3)).copy()
-        return BodyState(self.rest_center.copy(), upright, rest.copy(), np.zeros((parts, self.shape_count)))
+        state = BodyState(self.rest_center.copy(), upright, rest.copy(), np.zeros((parts, self.shape_count)))
+        if shape is None:
+            return state
+        state.shape[:] = shape
+        change = [basis @ own for basis, own in zip(self.shape_basis, state.shape, strict=True)]
+        for (parent, child), interface in zip(self.tree.edges, self.interfaces, strict=True):
+            apart = change[parent][interface.parent_index] - change[child][interface.child_index]
+            moved = (
+                np.average(apart, axis=0, weights=interface.weight) + state.center[parent] - self.rest_center[parent]
+            )
+            state.center[child] += moved
+        return state
+
+    def measure_height(self, shape: Array) -> float:
+        """Return the height in metres of the person of a `shape` (16, S), standing in the template pose."""
+        return float(np.ptp(self.vertices(self.rest_state(shape))[:, 2]))
 
     def local_vertices(self, i: int, d: Array, s: Array) -> Array:
         """Return the vertices (..., N_i, 3) of part `i` in its own frame (Eqs. 45 and 46).

@@ -19,7 +19,7 @@ from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_setti
 ROOT = Path(__file__).resolve().parents[2]
 FENCE = re.compile(r"^```(bash(?: test)?|python(?: test)?)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 ROS2 = {"launch", "topic", "node", "security", "action", "bag", "lifecycle", "param", "service", "run"}
-USUAL = {"source", "export", "colcon", "ls", "cd", "rviz2"}
+USUAL = {"source", "export", "colcon", "ls", "cd", "rviz2", "git", "ln", "rosdep", "docker"}
 
 
 class WrongCommand(AssertionError):

@@ -11,6 +11,7 @@ from numba.extending import register_jitable
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
+from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 
 # Weight of a pair's squared length beside its squared distance along the cloud's normal.
 TANGENTIAL_WEIGHT = 0.05
@@ -30,23 +31,26 @@ class Cloud:
         normals: (N, 3) unit normals, outward.
         nearest: index of `points`.
         viewpoint: (3,) position of the sensor in metres, None when the body was seen from all sides.
+        field: what the sensor at the viewpoint can know, None where it sees everything.
     """
 
     points: np.ndarray
     normals: np.ndarray
     nearest: NearestPoints
     viewpoint: np.ndarray | None
+    field: SensorField | None
 
     @classmethod
     def of(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray | None = None) -> Cloud:
         """Index a cloud."""
-        return cls(points, normals, NearestPoints(points), viewpoint)
+        return cls(points, normals, NearestPoints(points), viewpoint, None)
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return which vertices (V,) face the viewpoint; all of them when there is none."""
+        """Return which vertices (V,) face the viewpoint and are in its field; all when there is no viewpoint."""
         if self.viewpoint is None:
             return np.ones(len(vertices), dtype=bool)
-        return ((self.viewpoint - vertices) * normals).sum(axis=1) > 0
+        facing = ((self.viewpoint - vertices) * normals).sum(axis=1) > 0
+        return facing if self.field is None else facing & ~self.field.find_unknown(vertices)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +75,9 @@ class TwoWayCorrespondence:
         self._nearest = NearestPoints(cloud.points, cloud.normals, NORMAL_LENGTH_M)
         step = 1 if max_points is None else max(1, -(-len(cloud.points) // max_points))
         self._matched = np.arange(0, len(cloud.points), step)
+        # The last answers, from which the next body's are found faster.
+        self._to_cloud = np.empty(0, dtype=np.int64)
+        self._to_body: np.ndarray | None = None
 
     def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float) -> VertexQuadratic:
         """Match both ways and return the quadratic that attracts the vertices to the cloud.
@@ -88,9 +95,12 @@ class TwoWayCorrespondence:
         cloud, matched = self._cloud, self._matched
         normals = vertex_normals(vertices, faces)
         seen = np.flatnonzero(cloud.sees(vertices, normals))
-        to_cloud = self._nearest.query(vertices[seen], normals[seen])[1]
+        if len(self._to_cloud) != len(vertices):
+            self._to_cloud, self._to_body = np.zeros(len(vertices), dtype=np.int64), None
+        to_cloud = self._nearest.query(vertices[seen], normals[seen], self._to_cloud[seen])[1]
         body = NearestPoints(vertices, normals, NORMAL_LENGTH_M)
-        to_body = body.query(cloud.points[matched], cloud.normals[matched])[1]
+        to_body = body.query(cloud.points[matched], cloud.normals[matched], self._to_body)[1]
+        self._to_cloud[seen], self._to_body = to_cloud, to_body
         quadratic = VertexQuadratic(np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3)))
         for pairs in ((seen, to_cloud), (to_body, matched)):
             _add_pairs(

@@ -326,7 +326,7 @@ class BodyTracker:
         learned = SHAPE_WEIGHT_PER_FRAME * min(self._state.frames, MAX_SHAPE_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
         # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
-        facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint)
+        facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint, cloud.field)
         body = self._fitter.gauss_newton.run(start, facing, self._no_joints, weights, terms)
         return self._fitter.assess(body, cloud)
 

@@ -18,6 +18,7 @@ from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_c
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.person_finder import FoundBody, PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
@@ -126,8 +127,8 @@ class SceneTracker:
 
     def step(
         self, cloud: SceneCloud, seed: int, executor: Executor | None = None
-    ) -> tuple[list[tuple[str, BodyFit]], list[str]]:
-        """Return (id, fit) of everybody in the next cloud, and the ids of those who are out of sight for now.
+    ) -> tuple[list[TrackedBody], list[str]]:
+        """Return the bodies of everybody in the next cloud, and the ids of those who are out of sight for now.
 
         Full fits run on the `executor`, or in line. InputError when the cloud cannot be one of people.
 
@@ -144,7 +145,7 @@ class SceneTracker:
         if not settings.scene:
             (person,) = self._with_viewpoint(cloud, [cloud.whole])
             if not settings.track:
-                return [(ONLY_ID, self._fit(person, seed))], []
+                return [TrackedBody(ONLY_ID, self._fit(person, seed))], []
             return self._tracker.step_one(person, seed, executor), []
         known = self._tracker.predict_bodies(cloud.stamp) if settings.track else ()
         if self._is_one_sided(cloud, remember=True):
@@ -152,7 +153,7 @@ class SceneTracker:
             if not settings.track:
                 fits = {id(body.person): body.fit for body in found}
                 named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
-                return [(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
+                return [TrackedBody(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
             first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
             seen = [body.person for body in found]
             return self._tracker.step(seen, cloud.stamp, seed, executor, first), self._tracker.occluded_ids
@@ -160,10 +161,10 @@ class SceneTracker:
         if settings.track:
             return self._tracker.step(people, cloud.stamp, seed, executor), self._tracker.occluded_ids
         named = self._tracker.associate_only(people, cloud.stamp)
-        return [(identity, self._fit(person, seed)) for identity, person in named], []
+        return [TrackedBody(identity, self._fit(person, seed)) for identity, person in named], []
 
-    def fit_once(self, cloud: SceneCloud, seed: int, progress: Progress | None = None) -> list[tuple[str, BodyFit]]:
-        """Return (id, fit) of everybody in a cloud that belongs to no stream; ids count from b1.
+    def fit_once(self, cloud: SceneCloud, seed: int, progress: Progress | None = None) -> list[TrackedBody]:
+        """Return the bodies of everybody in a cloud that belongs to no stream; ids count from b1.
 
         Where nobody can be told from surroundings, a cloud of a person's size is the person.
         """
@@ -172,14 +173,17 @@ class SceneTracker:
             proven = self.fit_found(self.find_once(cloud), seed, progress)
             if not proven:
                 raise InputError(_NOBODY.format(len(cloud.points)))
-            return [(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
+            return [TrackedBody(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
         people = self._segment(cloud) if self._settings.scene else []
         if not people and (not self._settings.scene or extent <= MAX_HEIGHT_M):
             people = [cloud.whole]
         if not people:
             raise InputError(_NOBODY.format(len(cloud.points)))
         people = self._with_viewpoint(cloud, people, remember=False)
-        return [(f"b{number}", self._fit(person, seed, progress)) for number, person in enumerate(people, start=1)]
+        return [
+            TrackedBody(f"b{number}", self._fit(person, seed, progress))
+            for number, person in enumerate(people, start=1)
+        ]
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
         """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""

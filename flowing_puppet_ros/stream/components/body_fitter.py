@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings, Progress
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.scans.scan_frame import parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.track.scene_tracker import (
     RegionSettings,
@@ -19,6 +19,7 @@ from flowing_puppet_ros.body.track.scene_tracker import (
     SceneTracker,
     crop_to_region,
 )
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
@@ -125,20 +126,20 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def fit(
         self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None
-    ) -> tuple[Any, list[tuple[str, BodyFit]]]:
+    ) -> tuple[Any, list[TrackedBody]]:
         """Fit the bodies in a PointCloud2 message: those in `initial` (a BodyArray), else those of the scene, else one.
 
-        Nothing of other clouds is used or changed. Returns the BodyArray message and (id, fit) of each of its bodies,
-        in the cloud's frame. InputError in one sentence when the cloud cannot be used.
+        Nothing of other clouds is used or changed. Returns the BodyArray message and its bodies, in the cloud's frame.
+        InputError in one sentence when the cloud cannot be used.
         """
         scene, to_z_up = self._decode(cloud, of_depth=False)
         if initial is not None and initial.bodies:
-            fits = self._fit_initial(scene, to_z_up, initial, seed, progress)
+            bodies = self._fit_initial(scene, to_z_up, initial, seed, progress)
         else:
-            fits = self._scene.fit_once(scene, seed, progress)
-        fits = [(identity, _rotate_fit(fit, to_z_up.T)) for identity, fit in fits]
-        bodies = [make_body(self.factory, identity, self._model, fit) for identity, fit in fits]
-        return make_bodies(self.factory, cloud.header, bodies), fits
+            bodies = self._scene.fit_once(scene, seed, progress)
+        bodies = [body.rotate(to_z_up.T) for body in bodies]
+        messages = [make_body(self.factory, self._model, body) for body in bodies]
+        return make_bodies(self.factory, cloud.header, messages), bodies
 
     def _decode(self, cloud: Any, of_depth: bool) -> tuple[SceneCloud, F64]:
         """Return the points of a cloud message in the region of interest, z up, and the rotation (3, 3) to there.
@@ -172,10 +173,10 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def _fit_initial(
         self, scene: SceneCloud, to_z_up: F64, initial: Any, seed: int, progress: Progress | None = None
-    ) -> list[tuple[str, BodyFit]]:
+    ) -> list[TrackedBody]:
         """Fit each of the bodies in `initial` to the whole cloud, from its joints."""
         viewpoint = np.zeros(3) if self.settings.view == "single" or scene.single_view else None
-        fits = []
+        bodies = []
         for number, body in enumerate(initial.bodies, start=1):
             fit = self._fitter.fit(
                 scene.points,
@@ -185,8 +186,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
                 seed=seed,
                 progress=progress,
             )
-            fits.append((body.id or f"b{number}", fit))
-        return sorted(fits, key=lambda pair: id_sort_key(pair[0]))
+            bodies.append(TrackedBody(body.id or f"b{number}", fit))
+        return sorted(bodies, key=lambda body: id_sort_key(body.id))
 
     def seed_of(self, stamp: int) -> int:
         """Return the seed of the fit to the cloud of a stamp (nanoseconds)."""
@@ -234,20 +235,20 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def _fit_one(self, stamp: int, cloud: Any, of_depth: bool, initial: Any | None) -> Output:
         self.counters["clouds"] += 1
-        fits: list[tuple[str, BodyFit]] = []
+        bodies: list[TrackedBody] = []
         occluded: list[str] = []
         try:
             scene, to_z_up = self._decode(cloud, of_depth)
             scene = replace(scene, stamp=self._advance_clock(stamp))
             if initial is not None and initial.bodies:
-                fits = self._fit_initial(scene, to_z_up, initial, self.seed_of(stamp))
+                bodies = self._fit_initial(scene, to_z_up, initial, self.seed_of(stamp))
             else:
-                fits, occluded = self._scene.step(scene, self.seed_of(stamp), self.background)
-            fits = [(identity, _rotate_fit(fit, to_z_up.T)) for identity, fit in fits]
+                bodies, occluded = self._scene.step(scene, self.seed_of(stamp), self.background)
+            bodies = [body.rotate(to_z_up.T) for body in bodies]
         except InputError as error:
             self.report.count_unusable(error)
-        self.counters["bodies"] += len(fits)
-        return self._outputs.make(cloud.header, fits, occluded, self._subscribed)
+        self.counters["bodies"] += len(bodies)
+        return self._outputs.make(cloud.header, bodies, occluded, self._subscribed)
 
     def _advance_clock(self, stamp: int) -> int:
         """Return the time of a cloud, ns: its stamp, or some time after the cloud before it if that has the same."""
@@ -262,14 +263,14 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def _fit_silhouettes(self, message: Any) -> Output:
         self.counters["silhouettes"] += 1
-        fits: list[tuple[str, BodyFit]] = []
+        bodies: list[TrackedBody] = []
         try:
-            fits.append(self._silhouettes.fit(message))
+            bodies.append(self._silhouettes.fit(message))
         except InputError as error:
             self.report.count_unusable(error)
-        self.counters["bodies"] += len(fits)
-        self.counters["doubtful bodies"] += sum(not fit.reliable for _, fit in fits)
-        return self._outputs.make(message.header, fits, subscribed=self._subscribed)
+        self.counters["bodies"] += len(bodies)
+        self.counters["doubtful bodies"] += sum(not body.fit.reliable for body in bodies)
+        return self._outputs.make(message.header, bodies, subscribed=self._subscribed)
 
 
 def is_ahead_along_z(points: F64) -> bool:
@@ -286,8 +287,3 @@ def is_ahead_along_z(points: F64) -> bool:
 def _rotate_joints(joints: dict[str, JointPosition], rotation: F64) -> dict[str, JointPosition]:
     places = {name: rotation @ np.array(joint[:3]) for name, joint in joints.items()}
     return {name: (float(p[0]), float(p[1]), float(p[2]), joints[name][3]) for name, p in places.items()}
-
-
-def _rotate_fit(fit: BodyFit, rotation: F64) -> BodyFit:
-    state = replace(fit.state, center=fit.state.center @ rotation.T, rotation=rotation @ fit.state.rotation)
-    return replace(fit, state=state, vertices=fit.vertices @ rotation.T, joints=fit.joints @ rotation.T)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.hull_builder import HullBuilder, HullBuilderSettings, MultiViewPerson
@@ -143,7 +144,8 @@ class VisualHullComponent(Component[VisualHullSettings]):
         person = self._builder.segment({name: view.observation for name, view in views.items()})
         header = make_header(self.factory, stamp, self._frame)
         names = next(iter(views.values())).joint_names
-        joints = make_joints(self.factory, names, person.joints, person.confidence)
+        seen = [Visibility.SEEN] * len(names)
+        joints = make_joints(self.factory, names, person.joints, person.confidence, seen)
         confidence = float(person.confidence.mean())
         body = self.factory.make("flowing_puppet_msgs/msg/Body", id="b1", confidence=confidence, joints=joints)
         headers = {name: complete[name][1]["image"].header for name in views}

@@ -191,14 +191,14 @@ def find_video_codec(form: str) -> str:
 
 
 def _decode_file(data: U8, form: str) -> U8:
-    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(data, flags) if len(data) else None
     except cv2.error:  # the header names more pixels than OpenCV accepts
         image = None
     if image is None:
         raise InputError(f"a compressed image of format {form!r} and {len(data)} bytes cannot be decoded")
-    return np.asarray(image, np.uint8)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _read_rows(message: Any, channels: int, dtype: np.dtype[Any]) -> Array:
