@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.segmentation.linkage import link_within
 from flowing_puppet_ros.body.segmentation.planes import Plane, PlaneCache, find_planes, is_clear_of_planes
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
@@ -101,18 +102,21 @@ def segment_people(
     centres = _average_voxels(local, voxel)
     free, floor = _remove_planes(centres, settings.plane_clearance, origin, plane_cache)
     label = np.full(len(centres), -1)
-    label[free] = _cluster(_average_voxels(compensated, voxel)[free], settings.max_gap)
+    label[free] = link_within(_average_voxels(compensated, voxel)[free], settings.max_gap)
     new_clusters = label.max() + 1
+    # Scores by the first point of a cluster: what a claim leaves as it was is not scored again.
+    scored: dict[int, tuple[np.ndarray, float]] = {}
     if known and len(free):
-        whole = {
-            number for number, group in _group_by_label(label[voxel])
-            if person_score(local[group], floor) >= settings.min_score
-        }  # fmt: skip
+        clusters = _group_by_label(label[voxel])
+        scored = {int(group[0]): (group, person_score(local[group], floor)) for _, group in clusters}
+        whole = {number for number, group in clusters if scored[int(group[0])][1] >= settings.min_score}
         label[free] = assign_to_known(centres[free] + origin, label[free], known, whole)
     people = []
     for number, group in _group_by_label(label[voxel]):
         owner = int(number - new_clusters) if number >= new_clusters else None
-        score = person_score(local[group], floor)
+        before, score = scored.get(int(group[0]), (group[:0], 0.0))
+        if not np.array_equal(before, group):
+            score = person_score(local[group], floor)
         if len(group) >= settings.min_points and (owner is not None or score >= settings.min_score):
             chosen = rows[group]
             own_normals = None if normals is None else normals[chosen]
@@ -212,16 +216,6 @@ def _remove_planes(
     if plane_cache and cached is None:
         plane_cache.put(centres, clearance, floor, walls, origin)
     return np.flatnonzero(is_clear_of_planes(centres, clearance, floor, walls)), floor
-
-
-def _cluster(points: np.ndarray, gap: float) -> np.ndarray:
-    """Return the cluster (M,) of each point: points closer than `gap` belong together (DBSCAN, Ester et al. 1996)."""
-    import open3d as o3d
-
-    if not len(points):
-        return np.empty(0, dtype=np.int64)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    return np.asarray(cloud.cluster_dbscan(eps=gap, min_points=1)).astype(np.int64)
 
 
 def _group_by_label(label: np.ndarray) -> list[tuple[int, np.ndarray]]:
