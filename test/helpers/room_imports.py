@@ -113,7 +113,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "learn.thesis_loop",
         "model.ds",
     },
-    "evaluate.rgbd": {"body.fit", "body.upright", "evaluate.body", "evaluate.scene", "model", "multiview"},
+    "evaluate.rgbd": {"body.fit", "evaluate.body", "evaluate.scene", "model", "multiview"},
     "evaluate.scene": {"body.scans", "evaluate.body"},
     "evaluate.video": {
         "evaluate",
