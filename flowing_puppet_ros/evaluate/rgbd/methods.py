@@ -99,7 +99,7 @@ class FusionMethod:
         """Return the puppets with the true person's number as id."""
         model = self._people.model
         if self._networks is None:
-            return [_as_puppet(model.joint_names, str(k), person) for k, person in enumerate(frame.keypoints)]
+            return [as_puppet(model.joint_names, str(k), person) for k, person in enumerate(frame.keypoints)]
         puppets: dict[int, tuple[float, PuppetJoints]] = {}
         for person in self._networks.find(frame.rgb):
             keypoints = person.keypoints
@@ -132,7 +132,7 @@ class SearchMethod:
         return fits, scene.to_world, time.process_time() - started
 
 
-def _as_puppet(names: tuple[str, ...], identity: str, person: SeenKeypoints) -> PuppetJoints:
+def as_puppet(names: tuple[str, ...], identity: str, person: SeenKeypoints) -> PuppetJoints:
     """Return keypoints, which are the model's own joints, as a puppet."""
     pixels, confidence = np.full((len(names), 2), np.nan), np.zeros(len(names))
     rows = [names.index(name) for name in LIMB_JOINTS]

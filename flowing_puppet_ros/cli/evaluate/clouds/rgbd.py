@@ -17,12 +17,14 @@ from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
 from flowing_puppet_ros.evaluate.rgbd.methods import FusionMethod, RgbdMethod, SearchMethod
 from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summarise_rgbd
+from flowing_puppet_ros.evaluate.rgbd.tracking import MotionScore, summarise_motions, track_motion
 from flowing_puppet_ros.evaluate.rgbd.views import CUTS, RgbdStudio, make_pair, make_registered
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
 from flowing_puppet_ros.image.networks.choice import IMAGE_SIDE_PX, load_networks
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import make_out_folder
 
+MOTION_S = 2.5
 METHODS = ("fusion", "networks", "search")
 
 
@@ -49,6 +51,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--any-pose", action="store_true", help="whole people crouch, bend and sit too, as motion capture has it"
     )
+    parser.add_argument(
+        "--motions", type=int, metavar="N", help="track so many fast motions instead, of 2.5 s each, of one person"
+    )
+    parser.add_argument(
+        "--rates", nargs="+", type=float, default=[15.0, 30.0], help="at which they are tracked, Hz [15 30]"
+    )
+    parser.add_argument(
+        "--lag", type=float, default=0.0, help="by which colour is later than depth in motions, seconds [%(default)s]"
+    )
     parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture that the poses are from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for rgbd.csv and rgbd.json")
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
@@ -68,6 +79,10 @@ def run(arguments: argparse.Namespace) -> int:
         make_out_folder(arguments.out)
     cameras = make_pair() if arguments.unregistered else make_registered()
     studio = RgbdStudio(BodySource(arguments.mocap), cameras, arguments.sensor)
+    if arguments.motions is not None:
+        motions = _track_motions(arguments, fitter, studio)
+        print(format_json({"motions": motions}) if arguments.json else format_table(motions))
+        return 0
     scores: list[RgbdScore] = []
     rows = [(cut, number) for cut in arguments.cuts for number in range(arguments.count)]
     for cut, number in tqdm(rows, file=sys.stderr, disable=arguments.json):
@@ -83,6 +98,22 @@ def run(arguments: argparse.Namespace) -> int:
         write_json(arguments.out / "rgbd.json", {"summary": figures, "bodies": table})
     print(format_json({"summary": figures}) if arguments.json else format_table(figures))
     return 0
+
+
+def _track_motions(arguments: argparse.Namespace, fitter: BodyFitter, studio: RgbdStudio) -> list[dict[str, float]]:
+    """Track the motions and return the figures of each rate."""
+    rates = sorted(set(arguments.rates), reverse=True)
+    if arguments.motions < 1 or not 0 <= arguments.lag <= 1:
+        raise InputError("--motions is at least 1 and --lag between 0 and 1 s")
+    if any(rate <= 0 or rates[0] % rate for rate in rates):
+        raise InputError(f"--rates are {arguments.rates} Hz; the highest must be a multiple of the others")
+    scores: list[list[MotionScore]] = [[] for _ in rates]
+    for number in tqdm(range(arguments.motions), file=sys.stderr, disable=arguments.json):
+        rng = np.random.default_rng([arguments.people_seed, 100, number])
+        found = track_motion(fitter, studio, rng, rates, MOTION_S, arguments.lag, arguments.noise)
+        for each, score in zip(scores, found, strict=True):
+            each.append(score)
+    return [summarise_motions(each) for each in reversed(scores)]
 
 
 def _make_method(name: str, fitter: BodyFitter) -> RgbdMethod:
