@@ -52,7 +52,9 @@ def hang_unseen_parts(model: StitchedPuppet, before: BodyState, after: BodyState
     owner, parts = model.part_of_vertex, len(model.tree)
     share = np.bincount(owner, unknown, parts) / np.bincount(owner, minlength=parts)
     state = BodyState(after.center.copy(), after.rotation.copy(), after.pose.copy(), after.shape)
-    for part in np.flatnonzero(share[1:] >= MIN_UNSEEN_SHARE) + 1:
+    for part in range(1, parts):
+        if share[part] < MIN_UNSEEN_SHARE:
+            continue
         parent, interface = model.tree.parents[part], model.interfaces[part - 1]
         state.pose[part] = before.pose[part]
         state.rotation[part] = state.rotation[parent] @ before.rotation[parent].T @ before.rotation[part]
