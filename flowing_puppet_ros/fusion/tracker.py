@@ -186,11 +186,11 @@ class FusedTracker:
         pairs = []
         for number, puppet in enumerate(nameless):
             for identity, (pixel, depth) in free.items():
-                apart = np.linalg.norm(self._people.find_trunk_pixel(puppet) - pixel)
-                pairs.append((float(apart * depth) / cloud.camera.focal, number, identity))
+                apart = float(np.linalg.norm(self._people.find_trunk_pixel(puppet) - pixel))
+                pairs.append((apart * float(depth) / cloud.camera.focal, number, identity))
         names: dict[int, str] = {}
-        for away, number, identity in sorted(pairs):
-            if away < MAX_SAME_PERSON_M and number not in names and identity not in names.values():
+        for gap, number, identity in sorted(pairs):
+            if gap < MAX_SAME_PERSON_M and number not in names and identity not in names.values():
                 names[number] = identity
         for number, puppet in enumerate(nameless):
             if number not in names:

@@ -59,10 +59,10 @@ MAY_IMPORT: dict[str, set[str]] = {
         "image.video",
         "model",
         "model.ds",
-        "node.live",
         "report",
     },
     "cli.batch": set(),
+    "cli.doctor": {"doctor", "node.live"},
     "cli.evaluate": {
         "bag",
         "body.fit",
@@ -85,6 +85,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "model.ds",
         "report",
     },
+    "cli.export": {"bag.storage", "body.scans", "exchange"},
     "cli.sample": {"body.scans", "draw", "model", "model.ds"},
     "cli.scans": {"body.cloud", "body.fit", "body.scans", "body.segmentation", "body.track", "draw", "model"},
     "doctor": {
@@ -130,6 +131,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "evidence": set(),
     "evidence.cloud": set(),
     "evidence.image": {"model", "model.ds"},
+    "exchange": {
+        "bag",
+        "body.cloud",
+        "body.scans",
+        "model",
+        "stream.messages",
+    },
     "flow": set(),
     "fusion": {
         "body.cloud",
@@ -193,6 +201,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "model": set(),
     "model.ds": {"model"},
     "multiview": {"body.cloud", "body.fit", "body.refine", "body.search", "model"},
+    "node.launching": set(),
     "node": {"stream", "stream.components", "stream.messages"},
     "node.live": {"bag", "doctor", "node"},
     "report": {"bag", "draw", "evaluate", "evaluate.bag", "flow", "model", "model.ds", "multiview", "stream.messages"},

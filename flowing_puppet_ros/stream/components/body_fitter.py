@@ -142,7 +142,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def flush(self) -> Output:
         """Fit the clouds that still wait."""
-        return self._fit_depth(self._depth.flush()) + self._release(final=True)
+        return self._fit_depth(self._depth.flush()) + self._release(final=True) + self._publish_silhouettes()
 
     def fit(
         self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None
@@ -330,15 +330,20 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         return self._clock[1]
 
     def _fit_silhouettes(self, message: Any) -> Output:
+        """Fit one person; bodies go out together when the last one of the same images is there."""
         self.counters["silhouettes"] += 1
-        bodies: list[TrackedBody] = []
+        outputs = self._publish_silhouettes() if self._silhouettes.is_other_instant(message) else []
         try:
-            bodies.append(self._silhouettes.fit(message))
+            self._silhouettes.add(message)
         except InputError as error:
             self.report.count_unusable(error)
+        return outputs + (self._publish_silhouettes() if self._silhouettes.is_complete else [])
+
+    def _publish_silhouettes(self) -> Output:
+        header, bodies = self._silhouettes.collect()
         self.counters["bodies"] += len(bodies)
         self.counters["doubtful bodies"] += sum(not body.fit.reliable for body in bodies)
-        return self._outputs.make(message.header, bodies, subscribed=self._subscribed)
+        return self._outputs.make(header, bodies, subscribed=self._subscribed) if header is not None else []
 
 
 def is_ahead_along_z(points: F64) -> bool:
