@@ -20,7 +20,15 @@ PACKAGE = Path(flowing_puppet_ros.__file__).parent
 ROOT = PACKAGE.parent
 NAME = PACKAGE.name
 MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
-ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
+ROS_PACKAGES = {
+    "ament_index_python",
+    "rclpy",
+    "launch",
+    "launch_ros",
+    "rcl_interfaces",
+    "builtin_interfaces",
+    "std_srvs",
+}
 FOUNDATION = {"arrays", "errors", "extras", "ids", "images", "reporting", "settings", "threads", "units"}
 """Modules beside the rooms, which everything may import."""
 OPTIONAL_PACKAGES = {
@@ -39,7 +47,6 @@ OPTIONAL = {
     "bag.foreign.video": "video",
     "evaluate.output": "report",
     "body.scans.scan": "scans",
-    "body.cloud.normals": "scans",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10

@@ -33,7 +33,7 @@ class NearestPoints:
         cell = CELL_SPACINGS * float((high - low).max()) / np.sqrt(len(points))
         cell = max(cell, float(np.prod((high - low) / MAX_CELLS ** (1 / 3))) ** (1 / 3), 1e-9)
         shape = np.floor((high - low) / cell).astype(np.int64) + 1
-        rows, start = _sort_by_cell(self.points, low, cell, shape)
+        rows, start = sort_by_cell(self.points, low, cell, shape)
         scaled_normals = self._scaled_normals[rows] if len(self._scaled_normals) else self._scaled_normals
         self._grid = (low, cell, shape, rows, start, self.points[rows], scaled_normals)
         self._tree: cKDTree | None = None
@@ -63,7 +63,7 @@ def _stack_normals(points: np.ndarray, scaled_normals: np.ndarray) -> np.ndarray
 
 
 @njit(cache=True, nogil=True)
-def _sort_by_cell(points: np.ndarray, low: np.ndarray, cell: float, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sort_by_cell(points: np.ndarray, low: np.ndarray, cell: float, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows (N,) of the points, sorted by cell, and where each cell's begin (cells + 1,)."""
     number = np.empty(len(points), np.int64)
     start = np.zeros(shape[0] * shape[1] * shape[2] + 1, np.int64)
@@ -128,8 +128,8 @@ def _nearest(  # type: ignore[no-untyped-def]
                             if squared < best:
                                 best, found = squared, rows[place]
             gap = min(
-                _gap(x, low[0], cell, nx, a, ring), _gap(y, low[1], cell, ny, b, ring),
-                _gap(z, low[2], cell, nz, c, ring),
+                gap_beyond_rings(x, low[0], cell, nx, a, ring), gap_beyond_rings(y, low[1], cell, ny, b, ring),
+                gap_beyond_rings(z, low[2], cell, nz, c, ring),
             )  # fmt: skip
             if best <= gap * abs(gap):
                 break
@@ -151,7 +151,7 @@ def _cell_of(x: float, low: float, cell: float, count: int) -> int:
 
 
 @njit(cache=True, inline="always")
-def _gap(x: float, low: float, cell: float, count: int, home: int, ring: int) -> float:
+def gap_beyond_rings(x: float, low: float, cell: float, count: int, home: int, ring: int) -> float:
     """Return the distance along one axis to the cells beyond the rings so far; infinite where there are none."""
     gap = np.inf
     if home - ring > 0:
