@@ -21,7 +21,6 @@ from flowing_puppet_ros.bag.foreign.static_frames import find_static_transforms
 from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Graph, Instance, build_graph, find_info_topics
 from flowing_puppet_ros.bag.graph_run import Call, GraphRun, Step
 from flowing_puppet_ros.bag.reader import Record, RecordingLike, open_bag
-from flowing_puppet_ros.bag.stuck_stamps import StuckStamps
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.unused import count_used, explain_unused
 from flowing_puppet_ros.bag.writer import BagWriter
@@ -40,6 +39,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
     TRANSFORMS,
 )
 from flowing_puppet_ros.stream.pipeline import Pipeline
+from flowing_puppet_ros.stream.stuck_stamps import StuckStamps
 from flowing_puppet_ros.threads import MAX_THREADS, one_blas_thread, one_opencv_thread, usable_threads
 
 STATIC_TRANSFORMS = "/tf_static"
