@@ -126,6 +126,7 @@ class _Replay:
         self._factory = BagMessageFactory()
         self.warnings: list[str] = list(bag.notes)
         self._stuck = StuckStamps()
+        self._writing_seconds = 0.0
         topics = {self._new_name[name]: kind for name, kind in bag.topics.items()}
         unknown = sorted(set(options.topic_map) - set(bag.topics))
         if unknown:
@@ -258,6 +259,7 @@ class _Replay:
                 bar.update()
             run.flush(log_time)
         self.warnings += run.warnings
+        self._writing_seconds = run.writing_seconds
 
     def _select_time_span(self, records: Iterator[Record]) -> Iterator[Record]:
         """Yield the records of the selected time span; InputError if there are none."""
@@ -343,6 +345,7 @@ class _Replay:
     def summarise(self, source: Path, target: Path, seconds: float, counts: Mapping[str, int]) -> dict[str, Any]:
         """Return the summary of the replay, ready for JSON."""
         instances = self._graph.instances
+        spent_seconds = {instance.name: instance.seconds for instance in instances} | {"writing": self._writing_seconds}
         frames = sum(instance.component.counters["images"] for instance in instances)
         return {
             "input": str(source),
@@ -351,7 +354,7 @@ class _Replay:
             "bodies": sum(instance.component.counters["bodies"] for instance in instances),
             "seconds": round(seconds, 2),
             "frames_per_second": round(frames / seconds, 2),
-            "seconds_of": {instance.name: round(instance.seconds, 2) for instance in instances},
+            "seconds_of": {name: round(spent, 2) for name, spent in spent_seconds.items()},
             "messages": dict(counts),
             **({} if count_used(instances) else {"unused": explain_unused(self._graph, self._recorded, self.warnings)}),
             **self.describe(),
