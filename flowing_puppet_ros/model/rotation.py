@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from flowing_puppet_ros.arrays import Array
 
@@ -74,3 +75,40 @@ def procrustes(a: Array, b: Array, w: Array | None = None) -> tuple[Array, Array
     rotation = nearest_rotation(moment)
     translation = centre_b - np.squeeze(rotation @ centre_a[..., None], axis=-1)
     return rotation, np.asarray(translation)
+
+
+@njit(cache=True, nogil=True)
+def exp_one(vector: Array) -> Array:
+    """Return the rotation (3, 3) of one rotation vector (3,) by Rodrigues' formula; `exp` for compiled loops."""
+    angle = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    cross = np.zeros((3, 3))
+    cross[0, 1], cross[0, 2] = -vector[2], vector[1]
+    cross[1, 0], cross[1, 2] = vector[2], -vector[0]
+    cross[2, 0], cross[2, 1] = -vector[1], vector[0]
+    first = np.sin(angle) / angle if angle > 1e-8 else 1.0
+    second = (1 - np.cos(angle)) / angle**2 if angle > 1e-8 else 0.5
+    return np.eye(3) + first * cross + second * (cross @ cross)
+
+
+@njit(cache=True, nogil=True)
+def log_one(m: Array) -> Array:
+    """Return the rotation vector (3,) of one rotation (3, 3), by the quaternion; `log` for compiled loops."""
+    trace = m[0, 0] + m[1, 1] + m[2, 2]
+    q = np.empty(4)
+    best = 0
+    for i in range(1, 4):
+        if m[i - 1, i - 1] > (trace if best == 0 else m[best - 1, best - 1]):
+            best = i
+    if best == 0:
+        q[0] = 1 + trace
+        q[1], q[2], q[3] = m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]
+    else:
+        i = best - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[0], q[1 + i] = m[k, j] - m[j, k], 1 + 2 * m[i, i] - trace
+        q[1 + j], q[1 + k] = m[j, i] + m[i, j], m[k, i] + m[i, k]
+    q /= np.sqrt(q[0] ** 2 + q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    if q[0] < 0:
+        q = -q
+    sine = np.sqrt(q[1] ** 2 + q[2] ** 2 + q[3] ** 2)
+    return q[1:] * (2 * np.arctan2(sine, q[0]) / sine if sine > 1e-12 else 2.0)

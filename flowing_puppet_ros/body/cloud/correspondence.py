@@ -152,16 +152,55 @@ def _add_pairs(pairs, body, cloud, squared_width, share, quadratic):  # type: ig
                 matrix[v, i, j] += weight * point_normals[p, i] * point_normals[p, j]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceDistances:
+    """Distances in metres between a cloud of N points and a body's surface points: V vertices, then F face centres.
+
+    Attributes:
+        seen: (V + F,) which surface points the sensor sees.
+        to_cloud: distances of those to the cloud, in their order.
+        nearest: indices of the cloud's points nearest to them.
+        to_body: (N,) distances of the cloud's points to the nearest surface point, seen or not.
+        to_vertex: (N,) distances of the cloud's points to the nearest vertex, or the nearest of the nearest face.
+    """
+
+    seen: np.ndarray
+    to_cloud: np.ndarray
+    nearest: np.ndarray
+    to_body: np.ndarray
+    to_vertex: np.ndarray
+
+    @property
+    def two_way(self) -> float:
+        """Mean distance over both directions, metres; infinite when nothing is seen."""
+        to_cloud = self.to_cloud.mean() if len(self.to_cloud) else np.inf
+        return float((to_cloud + self.to_body.mean()) / 2)
+
+
+def measure_distances(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, cloud: Cloud) -> SurfaceDistances:
+    """Measure how far a body and a cloud are apart.
+
+    Args:
+        vertices: (V, 3) metres.
+        normals: (V, 3) unit normals of the vertices.
+        faces: (F, 3), outward.
+        cloud: the cloud.
+    """
+    corners = vertices[faces]
+    surface = np.concatenate([vertices, corners.mean(axis=1)])
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    seen = cloud.sees(surface, np.concatenate([normals, face_normals]))
+    to_cloud, nearest = cloud.nearest.query(surface[seen])
+    to_body, place = NearestPoints(surface).query(cloud.points)
+    to_vertex, at_face = to_body.copy(), np.flatnonzero(place >= len(vertices))
+    gaps = corners[place[at_face] - len(vertices)] - cloud.points[at_face][:, None]
+    to_vertex[at_face] = np.sqrt((gaps**2).sum(axis=2).min(axis=1))
+    return SurfaceDistances(seen, to_cloud, nearest, to_body, to_vertex)
+
+
 def two_way_distance(vertices: np.ndarray, faces: np.ndarray, cloud: Cloud) -> float:
     """Return the mean distance in metres, over both directions, between the body's surface points and the cloud.
 
     The surface is sampled at vertices and face centres; for a one-sided cloud only where it faces the sensor.
     """
-    normals = vertex_normals(vertices, faces)
-    corners = vertices[faces]
-    surface = np.concatenate([vertices, corners.mean(axis=1)])
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    seen = cloud.sees(surface, np.concatenate([normals, face_normals]))
-    to_cloud = cloud.nearest.query(surface[seen])[0].mean() if seen.any() else np.inf
-    to_body = NearestPoints(surface).query(cloud.points)[0].mean()
-    return float((to_cloud + to_body) / 2)
+    return measure_distances(vertices, vertex_normals(vertices, faces), faces, cloud).two_way

@@ -230,7 +230,7 @@ class BodyFitter:
             state,
             vertices,
             self.model.joints(vertices),
-            self.hypotheses.particle_search.energy(state, ExactCloud(cloud.points, cloud.normals, cloud.nearest)),
+            self.hypotheses.energy.measure(state, ExactCloud(cloud.points, cloud.normals, cloud.nearest)),
             quality.part_confidence,
             quality.confidence,
             quality.reliable,

@@ -20,6 +20,7 @@ from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
 from flowing_puppet_ros.body.fit.quality import MAX_UNCOVERED, FitQuality, assess_fit
 from flowing_puppet_ros.body.fit.single_view_search import ROUGH, SingleViewSearch
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
+from flowing_puppet_ros.body.search.body_energy import BodyEnergy
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.limb_search import SINGLE_LIMBS, LimbSearch, limb_groups
@@ -110,7 +111,9 @@ class BodyHypotheses:
         self._settings = settings
         self._threads = usable_threads(settings.threads)
         points = build_part_points(model)
-        self.particle_search = BodyParticleSearch(model, points, SearchWeights(lm_steps=settings.levenberg_steps))
+        weights = SearchWeights(lm_steps=settings.levenberg_steps)
+        self.particle_search = BodyParticleSearch(model, points, weights)
+        self.energy = BodyEnergy(model, points, weights.stitch, weights.mismatch)
         self.gauss_newton = GaussNewton(model)
         self._proposer = Proposer(model, points)
         self.limb_search = LimbSearch(model, self.particle_search, self._proposer)

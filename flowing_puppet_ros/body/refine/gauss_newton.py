@@ -12,13 +12,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dposv
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic, geman_mcclure
-from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, PosedPoints, System
+from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, System
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.model import rotation as so3
+from flowing_puppet_ros.model.posing import PosedPoints
+from flowing_puppet_ros.model.rotation import exp_one
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 MAX_COEFFICIENT = 3.5  # standard deviations
@@ -154,16 +156,25 @@ class GaussNewton:
 
     def _retract(self, state: BodyState, step: np.ndarray) -> BodyState:
         first, (rows, parts, numbers) = self._equations.first, self._equations.coefficients
-        pose = state.pose.copy()
-        rigid = step[first[:-1, None] + np.arange(6)]
-        turn, translation = rigid[:, :3], rigid[:, 3:]
-        angle = np.linalg.norm(turn, axis=1, keepdims=True)
-        turn = turn * np.minimum(1.0, MAX_ROTATION_STEP_RAD / np.maximum(angle, 1e-12))
-        center = state.center + np.squeeze(state.rotation @ translation[:, :, None], axis=2)
+        center, rotation, pose = state.center.copy(), np.ascontiguousarray(state.rotation), state.pose.copy()
         pose[parts, numbers] += step[rows]
+        rotation = _move_parts(center, rotation, step, first)
         shape = np.clip(state.shape + step[first[-1] :], -MAX_COEFFICIENT, MAX_COEFFICIENT)
         pose = np.clip(pose, -MAX_COEFFICIENT, MAX_COEFFICIENT)
-        return BodyState(center, state.rotation @ so3.exp(turn), pose, shape)
+        return BodyState(center, rotation, pose, shape)
+
+
+@njit(cache=True, nogil=True)
+def _move_parts(center: np.ndarray, rotation: np.ndarray, step: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Move the centres (N, 3) by the steps' translations and return the rotations (N, 3, 3) turned by their turns."""
+    turned = np.empty_like(rotation)
+    for part in range(len(center)):
+        turn, translation = step[first[part] : first[part] + 3].copy(), step[first[part] + 3 : first[part] + 6]
+        angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+        turn *= min(1.0, MAX_ROTATION_STEP_RAD / max(angle, 1e-12))
+        center[part] += rotation[part] @ translation
+        turned[part] = rotation[part] @ exp_one(turn)
+    return turned
 
 
 def _solve_lower(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.evidence.cloud.nearest import gap_beyond_rings, sort_by_cell
+from flowing_puppet_ros.evidence.cloud.nearest import find_bounds, gap_beyond_rings, sort_by_cell
 
 MEAN_SHARE = 0.4
 """Points in a point's own cell, in neighbours, on the mean."""
@@ -30,7 +30,7 @@ def find_neighbours(points: np.ndarray, count: int) -> np.ndarray:
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     count = min(count, len(points))
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = find_bounds(points)
     min_cell = max(float(np.prod((high - low) / MAX_CELLS ** (1 / 3))) ** (1 / 3), 1e-9)
     # First as if the cloud were as wide as high, then by the points that are really in the cells of that size.
     cell = max(float((high - low).max()) * np.sqrt(MEAN_SHARE * count / len(points)), min_cell)
