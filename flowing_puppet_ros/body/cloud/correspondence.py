@@ -65,17 +65,21 @@ class VertexQuadratic:
 class TwoWayCorrespondence:
     """Correspondences in both directions between a cloud and the bodies of one fit."""
 
-    def __init__(self, cloud: Cloud, max_points: int | None = None) -> None:
-        """Index a cloud; of more than `max_points` points only every second, third ... is matched to a vertex."""
+    def __init__(self, cloud: Cloud, max_points: int | None = None, alternate: int = 1) -> None:
+        """Index a cloud; of more than `max_points` points only every second, third ... is matched to a vertex.
+
+        `alternate` is the number of sets that `attract` takes in turns.
+        """
         self._cloud = cloud
         self._nearest = NearestPoints(cloud.points, cloud.normals, NORMAL_LENGTH_M)
         step = 1 if max_points is None else max(1, -(-len(cloud.points) // max_points))
         self._matched = np.arange(0, len(cloud.points), step)
+        self._alternate = alternate
         # The last answers, from which the next body's are found faster.
         self._to_cloud = np.empty(0, dtype=np.int64)
-        self._to_body: np.ndarray | None = None
+        self._to_body = np.zeros(len(self._matched), dtype=np.int64)
 
-    def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float) -> VertexQuadratic:
+    def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float, turn: int = 0) -> VertexQuadratic:
         """Match both ways and return the quadratic that attracts the vertices to the cloud.
 
         Every vertex that the sensor sees is matched to its closest cloud point, every cloud point to its closest
@@ -87,16 +91,17 @@ class TwoWayCorrespondence:
             vertices: (V, 3) metres.
             faces: (F, 3), outward.
             sigma: width of the robust kernel, metres.
+            turn: number of the step; where sets alternate, it chooses the one that is matched.
         """
-        cloud, matched = self._cloud, self._matched
+        cloud, first, step = self._cloud, turn % self._alternate, self._alternate
         normals = vertex_normals(vertices, faces)
-        seen = np.flatnonzero(cloud.sees(vertices, normals))
+        seen = first + step * np.flatnonzero(cloud.sees(vertices[first::step], normals[first::step]))
         if len(self._to_cloud) != len(vertices):
-            self._to_cloud, self._to_body = np.zeros(len(vertices), dtype=np.int64), None
+            self._to_cloud = np.zeros(len(vertices), dtype=np.int64)
         to_cloud = self._nearest.query(vertices[seen], normals[seen], self._to_cloud[seen])[1]
-        body = NearestPoints(vertices, normals, NORMAL_LENGTH_M)
-        to_body = body.query(cloud.points[matched], cloud.normals[matched], self._to_body)[1]
-        self._to_cloud[seen], self._to_body = to_cloud, to_body
+        body, matched = NearestPoints(vertices, normals, NORMAL_LENGTH_M), self._matched[first::step]
+        to_body = body.query(cloud.points[matched], cloud.normals[matched], self._to_body[first::step])[1]
+        self._to_cloud[seen], self._to_body[first::step] = to_cloud, to_body
         quadratic = VertexQuadratic(np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3)))
         for pairs in ((seen, to_cloud), (to_body, matched)):
             _add_pairs(

@@ -108,7 +108,7 @@ class BodyFitter:
             seed: overrides the settings' seed.
             progress: called with the fraction done, 0 to 1.
             nonrigid: refine the vertices beyond the model where a whole cloud is dense.
-            quick: without initial joints, try a small search first, whose limbs may be wrong.
+            quick: without initial joints, take a close body as it is, whose limbs may be wrong.
 
         Raises:
             InputError: when the cloud cannot be the surface of a person or the initial joints place no body.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numba import njit
@@ -50,6 +51,7 @@ class RefineWeights:
         sigma_start: first width of the robust kernel, metres.
         sigma_end: last width of the robust kernel, metres.
         iterations: number of steps.
+        alternate: sets that vertices and matched cloud points are divided into; a step asks one set for its matches.
         shape_center: (S,) expected shape in standard deviations, such as that of earlier frames; None for 0.
     """
 
@@ -60,6 +62,7 @@ class RefineWeights:
     sigma_start: float = 0.10
     sigma_end: float = 0.03
     iterations: int = 25
+    alternate: int = 1
     shape_center: np.ndarray | None = None
 
 
@@ -95,15 +98,16 @@ class GaussNewton:
             state.pose.copy(),
             np.tile(state.shape.mean(axis=0), (len(state.shape), 1)),
         )
-        all_terms = list(terms)
-        if cloud is not None:
-            matches = TwoWayCorrespondence(cloud, MAX_MATCHED_POINTS)
-            all_terms.append(lambda vertices, sigma: matches.attract(vertices, self._model.faces, sigma))
+        matches = None if cloud is None else TwoWayCorrespondence(cloud, MAX_MATCHED_POINTS, weights.alternate)
         ratio = weights.sigma_end / weights.sigma_start
         for step in range(weights.iterations):
             sigma = weights.sigma_start * ratio ** (step / max(weights.iterations - 1, 1))
-            state = self._step(state, all_terms, targets, weights, sigma)
+            turns = [] if matches is None else [partial(self._attract, matches, step)]
+            state = self._step(state, [*terms, *turns], targets, weights, sigma)
         return state
+
+    def _attract(self, matches: TwoWayCorrespondence, turn: int, vertices: np.ndarray, sigma: float) -> VertexQuadratic:
+        return matches.attract(vertices, self._model.faces, sigma, turn)
 
     def _step(
         self,

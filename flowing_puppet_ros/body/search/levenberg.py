@@ -13,6 +13,8 @@ cloud's count less, joint targets count too, and a weak prior keeps the deformat
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numba import njit
 
@@ -67,12 +69,18 @@ def prepare_part(
     mean = np.concatenate(
         [surface.apply_shape(particles.shape)[:, :count], joints.apply_shape(particles.shape)], axis=1
     )
-    basis = np.concatenate([surface.pose_basis[:count], joints.pose_basis]).transpose(0, 2, 1).copy()
+    return mean, _share_part(points, targets, count)
+
+
+@lru_cache(maxsize=64)
+def _share_part(points: PartPoints, targets: JointTargets, count: int) -> PartArrays:
+    """Return what all particles of a part share, made once in a search."""
+    basis = np.concatenate([points.surface.pose_basis[:count], points.joints.pose_basis]).transpose(0, 2, 1).copy()
     weight = np.concatenate([np.full(count, 1.0 / count), targets.weight[points.joint_index]])
     first = np.tensordot(weight, basis, 1)
     second = np.tensordot(basis * weight[:, None, None], basis, axes=([0, 2], [0, 2]))
     target = np.ascontiguousarray(targets.points[points.joint_index])
-    return mean, (basis, np.ascontiguousarray(points.normals[:count]), weight, target, first, second)
+    return basis, np.ascontiguousarray(points.normals[:count]), weight, target, first, second
 
 
 @njit(cache=True, nogil=True)
