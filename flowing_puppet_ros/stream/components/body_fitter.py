@@ -136,10 +136,13 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         if initial is not None and initial.bodies:
             bodies = self._fit_initial(scene, to_z_up, initial, seed, progress)
         else:
-            bodies = self._scene.fit_once(scene, seed, progress)
+            bodies = self._publish_ids(self._scene.fit_once(scene, seed, progress))
         bodies = [body.rotate(to_z_up.T) for body in bodies]
         messages = [make_body(self.factory, self._model, body) for body in bodies]
         return make_bodies(self.factory, cloud.header, messages), bodies
+
+    def _publish_ids(self, bodies: list[TrackedBody]) -> list[TrackedBody]:
+        return [replace(body, id=self.publish_id(body.id)) for body in bodies]
 
     def _decode(self, cloud: Any, of_depth: bool) -> tuple[SceneCloud, F64]:
         """Return the points of a cloud message in the region of interest, z up, and the rotation (3, 3) to there.
@@ -186,7 +189,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
                 seed=seed,
                 progress=progress,
             )
-            bodies.append(TrackedBody(body.id or f"b{number}", fit))
+            bodies.append(TrackedBody(body.id or self.publish_id(f"b{number}"), fit))
         return sorted(bodies, key=lambda body: id_sort_key(body.id))
 
     def seed_of(self, stamp: int) -> int:
@@ -244,6 +247,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
                 bodies = self._fit_initial(scene, to_z_up, initial, self.seed_of(stamp))
             else:
                 bodies, occluded = self._scene.step(scene, self.seed_of(stamp), self.background)
+                bodies, occluded = self._publish_ids(bodies), [self.publish_id(own) for own in occluded]
             bodies = [body.rotate(to_z_up.T) for body in bodies]
         except InputError as error:
             self.report.count_unusable(error)

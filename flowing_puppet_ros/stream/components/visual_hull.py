@@ -147,7 +147,9 @@ class VisualHullComponent(Component[VisualHullSettings]):
         seen = [Visibility.SEEN] * len(names)
         joints = make_joints(self.factory, names, person.joints, person.confidence, seen)
         confidence = float(person.confidence.mean())
-        body = self.factory.make("flowing_puppet_msgs/msg/Body", id="b1", confidence=confidence, joints=joints)
+        body = self.factory.make(
+            "flowing_puppet_msgs/msg/Body", id=self.publish_id("b1"), confidence=confidence, joints=joints
+        )
         headers = {name: complete[name][1]["image"].header for name in views}
         outputs = self._make_silhouettes(header, body, person, headers)
         return outputs + self._make_hull(header, body, person) if carve else outputs
