@@ -35,6 +35,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IDS_LIST,
+    POINT_CLOUD,
     PUPPETS,
     TRANSFORMS,
 )
@@ -137,7 +138,13 @@ class _Replay:
         self._static += self._find_fixed_frames(topics, infos)
         samples = {self._new_name[name]: sample for name, sample in read_samples(bag).items()}
         self._graph = build_graph(
-            topics, samples, self._build_frame_tree(), infos, self._collect_settings(), self._factory
+            topics,
+            samples,
+            self._build_frame_tree(),
+            infos,
+            self._collect_settings(),
+            self._factory,
+            self._read_cloud_frames(topics),
         )
         self.warnings += self._graph.notes
         self._recorded = {self._new_name[name]: detail for name, detail in bag.details.items()}
@@ -223,6 +230,16 @@ class _Replay:
             if len(found) == len(names):
                 break
         return {self._new_name[old]: info for old, info in found.items()}
+
+    def _read_cloud_frames(self, topics: Mapping[str, str]) -> dict[str, str]:
+        """Return cloud topic -> the frame of its first readable cloud."""
+        found: dict[str, str] = {}
+        for name in self._find_recorded_topics(topics, lambda name: topics[name] == POINT_CLOUD):
+            for record in self._bag.messages([name]):
+                with suppress(InputError):
+                    found[self._new_name[name]] = record.message.header.frame_id
+                break
+        return found
 
     def write_to(self, writer: BagWriter) -> None:
         """Pass every message through the graph and write the results."""

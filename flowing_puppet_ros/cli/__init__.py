@@ -26,6 +26,7 @@ VERBS = {
     "doctor": "say what can be computed from an input or on this machine, and what to run",
     "import": "write the videos and the calibration of several cameras into a bag",
     "calibrate": "refine the calibration and the clocks of several cameras by the people in a bag",
+    "export": "write fitted bodies as GLB, BVH, TRC, OBJ or JSON",
     "networks": "list, check and install the keypoint networks",
     "annotate": "pose puppets on images in the browser",
     "learn": "learn the body models, the likelihood and the detector",
@@ -37,8 +38,8 @@ VERBS = {
 
 _INPUT_ARGUMENTS = ("inputs", "input", "images")
 """Names of the arguments of verbs that are inputs."""
-VERB_PACKAGES = ("evaluate", "sample")
-"""Verbs of several kinds: folders with a module per kind."""
+VERB_PACKAGES = ("doctor", "evaluate", "export", "sample")
+"""Verbs in folders of their own."""
 _MODULES = {"import": "cameras.import_folder", "calibrate": "cameras.calibrate_bag"}
 """Verbs whose module is elsewhere."""
 

@@ -37,8 +37,8 @@ MAX_SWAP_RATIO = 0.9
 HIDDEN_SHARE = 0.25
 """Of the weight, for joints that the puppet itself hides."""
 MIN_START_CONFIDENCE, MIN_LIMB_CONFIDENCE = 0.1, 0.3
-"""In a start: what joints of trunk and head count at least, since a puppet places them as the rest of the body suggests,
-and below which those of limbs do not count, since a hanging arm is a better guess."""
+"""In a start: what joints of trunk and head count at least, since a puppet places them as the rest of the body
+suggests, and below which those of limbs do not count, since a hanging arm is a better guess."""
 SPINE_M = 0.5
 """From the shoulders to the pelvis of a person of whom no more than shoulders and head are seen."""
 

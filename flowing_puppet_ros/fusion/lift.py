@@ -53,6 +53,7 @@ class LiftedJoints:
         confidence: (J,) 0 to 1, that of the puppet, 0 without a depth.
         hidden: (J,) whether the joint is probably not on the surface that is seen at its pixel.
         depth: median depth of the trunk in metres along the camera's axis, NaN without any.
+        centre: (3,) metres, where the camera is.
     """
 
     points: F64
@@ -60,6 +61,7 @@ class LiftedJoints:
     confidence: F64
     hidden: Bools
     depth: float
+    centre: F64
 
     @property
     def found(self) -> Bools:
@@ -67,9 +69,7 @@ class LiftedJoints:
         return np.isfinite(self.points).all(axis=1)
 
 
-def lift_joints(
-    model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, usable: Bools
-) -> LiftedJoints:
+def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, usable: Bools) -> LiftedJoints:
     """Lift the joints of a puppet into a cloud.
 
     Args:
@@ -79,8 +79,7 @@ def lift_joints(
         usable: (N,) which points may be the person's.
     """
     rows = np.flatnonzero(cloud.seen & usable)
-    offsets = np.array([BEHIND_SURFACE_M[_kind(name)] if _kind(name) in BEHIND_SURFACE_M else 0.0
-                        for name in model.joint_names])  # fmt: skip
+    offsets = np.array([BEHIND_SURFACE_M.get(_kind(name), 0.0) for name in model.joint_names])
     samples = _collect_samples(puppet, cloud, rows)
     trunk = trunk_rows(model)
     depth = _find_trunk_depth(puppet, samples, trunk)
@@ -96,7 +95,7 @@ def lift_joints(
     points = cloud.camera.centre + rays * along[:, None]
     found = np.isfinite(points).all(axis=1)
     hidden = puppet.hidden | _find_broken(model, puppet, cloud, rows, surface)
-    return LiftedJoints(points, rays, np.where(found, puppet.confidence, 0.0), hidden, depth)
+    return LiftedJoints(points, rays, np.where(found, puppet.confidence, 0.0), hidden, depth, cloud.camera.centre)
 
 
 def _find_broken(
@@ -122,7 +121,8 @@ def _find_broken(
         if not (puppet.known[start] and np.isfinite(surface[start])):
             continue
         path = puppet.pixels[start] + share * (puppet.pixels[joint] - puppet.pixels[start])
-        near, index = tree.query(path, k=PATH_POINTS, distance_upper_bound=PATH_RADIUS_M * cloud.camera.focal / surface[joint] + MIN_RADIUS_PX)
+        radius = PATH_RADIUS_M * cloud.camera.focal / surface[joint] + MIN_RADIUS_PX
+        near, index = tree.query(path, k=PATH_POINTS, distance_upper_bound=radius)
         found = np.isfinite(near).all(axis=1)
         along = np.median(depth[index[found]], axis=1)
         broken[joint] = bool(len(along) > 1 and np.diff(along).max() > MAX_JUMP_M)

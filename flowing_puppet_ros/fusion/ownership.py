@@ -48,7 +48,7 @@ def assign_points(points: F64, people: Sequence[F64]) -> I32:
 
 @njit(cache=True, nogil=True)
 def _claim(points, capsules, number, best, owner):  # type: ignore[no-untyped-def]
-    """Give person `number` the points that are nearer to its capsules (C, 8: two ends, two radii) than `best`, in radii."""
+    """Give person `number` the points that are nearer to its capsules (C, 8) than `best` (N,) radii."""
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     for c in range(len(capsules)):
         reach = best.max() * max(capsules[c, 6], capsules[c, 7]) if len(best) else 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The joints of puppets, whoever found them, in the body model's order; and puppets carried from one stamp to another."""
+"""The joints of puppets, whoever found them, in the body model's order; and puppets carried to another stamp."""
 
 from __future__ import annotations
 
@@ -45,9 +45,7 @@ class PuppetJoints:
     def swap_sides(self, model: StitchedPuppet) -> PuppetJoints:
         """Return the puppet with left called right."""
         other = find_other_sides(model.joint_names)
-        return replace(
-            self, pixels=self.pixels[other], confidence=self.confidence[other], hidden=self.hidden[other]
-        )
+        return replace(self, pixels=self.pixels[other], confidence=self.confidence[other], hidden=self.hidden[other])
 
 
 @lru_cache(maxsize=8)
@@ -98,9 +96,7 @@ def place_joints(
     return made if np.count_nonzero(made.known) >= MIN_PUPPET_JOINTS else None
 
 
-def carry_puppets(
-    earlier: Sequence[PuppetJoints], later: Sequence[PuppetJoints], share: float
-) -> list[PuppetJoints]:
+def carry_puppets(earlier: Sequence[PuppetJoints], later: Sequence[PuppetJoints], share: float) -> list[PuppetJoints]:
     """Return the puppets at a time between or beyond two images: `share` 0 is the earlier one, 1 the later one.
 
     Joints move evenly. A puppet that only one of the images has stays where it is, if that image is the nearer one.

@@ -25,12 +25,14 @@ class SeenCloud:
         pixels: (N, 2) in the camera's image, NaN for points that it does not see.
         depth: (N,) metres along the camera's axis.
         camera: projects points of this frame.
+        in_view: (N,) whether each lies in the camera's field of view, hidden by others or not.
     """
 
     points: F64
     pixels: F64
     depth: F64
     camera: Camera
+    in_view: Bools
 
     @classmethod
     def of(cls, points: F64, camera: Camera) -> SeenCloud:
@@ -39,9 +41,10 @@ class SeenCloud:
         width, height = camera.size
         with np.errstate(invalid="ignore"):
             inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < width - 0.5) & (pixels[:, 1] < height - 0.5)
+        seen = inside.copy()
         if np.linalg.norm(camera.centre) > MAX_SAME_PLACE_M:
-            inside[inside] = _find_unhidden(pixels[inside], depth[inside])
-        return cls(points, np.where(inside[:, None], pixels, np.nan), depth, camera)
+            seen[inside] = _find_unhidden(pixels[inside], depth[inside])
+        return cls(points, np.where(seen[:, None], pixels, np.nan), depth, camera, inside)
 
     @property
     def seen(self) -> Bools:

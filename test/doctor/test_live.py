@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from flowing_puppet_ros.bag.reader import Topic, open_bag
@@ -59,7 +60,7 @@ def test_a_running_graph_is_heard() -> None:
     rclpy.init()
     factory, node = RosMessageFactory(), rclpy.create_node("driver")
     publisher = node.create_publisher(message_type(POINT_CLOUD), "/lidar/points", qos_profile_sensor_data)
-    cloud = make_cloud(factory, make_header(factory, 5, "lidar"), [[1.0, 2.0, 3.0]] * 30)
+    cloud = make_cloud(factory, make_header(factory, 5, "lidar"), np.ones((30, 3)))
     timer = node.create_timer(0.05, lambda: publisher.publish(cloud))
     listening = subprocess.Popen(
         [sys.executable, "-m", "flowing_puppet_ros", "doctor", "live", "--seconds", "4"],

@@ -28,6 +28,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "body.search",
         "body.segmentation",
         "body.upright",
+        "evidence.cloud",
         "model",
     },
     "body.upright": {
@@ -58,10 +59,10 @@ MAY_IMPORT: dict[str, set[str]] = {
         "image.video",
         "model",
         "model.ds",
-        "node.live",
         "report",
     },
     "cli.batch": set(),
+    "cli.doctor": {"doctor", "node.live"},
     "cli.evaluate": {
         "bag",
         "body.fit",
@@ -84,6 +85,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "model.ds",
         "report",
     },
+    "cli.export": {"bag.storage", "body.scans", "exchange"},
     "cli.sample": {"body.scans", "draw", "model", "model.ds"},
     "cli.scans": {"body.cloud", "body.fit", "body.scans", "body.segmentation", "body.track", "draw", "model"},
     "doctor": {
@@ -111,7 +113,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "learn.thesis_loop",
         "model.ds",
     },
-    "evaluate.rgbd": {"body.fit", "body.upright", "evaluate.body", "evaluate.scene", "model", "multiview"},
+    "evaluate.rgbd": {"body.fit", "evaluate.body", "evaluate.scene", "model", "multiview"},
     "evaluate.scene": {"body.scans", "evaluate.body"},
     "evaluate.video": {
         "evaluate",
@@ -129,6 +131,13 @@ MAY_IMPORT: dict[str, set[str]] = {
     "evidence": set(),
     "evidence.cloud": set(),
     "evidence.image": {"model", "model.ds"},
+    "exchange": {
+        "bag",
+        "body.cloud",
+        "body.scans",
+        "model",
+        "stream.messages",
+    },
     "flow": set(),
     "image": set(),
     "image.arms": {"evidence.image", "flow", "image.detector", "image.pose", "image.tracking", "model.ds"},
@@ -189,6 +198,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "body.scans",
         "body.track",
         "draw",
+        "evidence.cloud",
         "flow",
         "image.formats",
         "image.networks",

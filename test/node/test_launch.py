@@ -87,7 +87,7 @@ def described(name: str, **chosen: str) -> list[Recorded]:
     assert set(chosen) <= set(arguments)
     assert all(argument["description"] for argument in arguments.values())
     context = {name: argument.get("default_value", "") for name, argument in arguments.items()} | chosen
-    nodes = [item for item in entities if isinstance(item, ExecuteProcess)]
+    nodes: list[Recorded] = [item for item in entities if isinstance(item, ExecuteProcess)]
     for item in entities:
         if isinstance(item, OpaqueFunction):
             nodes += item.named["function"](context)

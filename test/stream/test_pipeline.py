@@ -108,7 +108,7 @@ def test_leaving_after_an_error_of_the_caller_waits_for_nothing() -> None:
 
     def leave(pipeline: Pipeline) -> None:
         with pipeline:
-            pipeline.add([Task("a", partial(gate.wait, WAIT_S)), Task("b", partial(done.append, 1), (0,))])
+            pipeline.add([Task("a", partial(_wait_for, gate)), Task("b", partial(done.append, 1), (0,))])
             gate.set()
             raise ValueError("of the caller")
 
@@ -120,3 +120,8 @@ def test_leaving_after_an_error_of_the_caller_waits_for_nothing() -> None:
 
 def _do_nothing() -> None:
     """Do nothing."""
+
+
+def _wait_for(gate: threading.Event) -> None:
+    """Wait until the gate is open."""
+    assert gate.wait(WAIT_S)

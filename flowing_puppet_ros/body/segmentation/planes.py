@@ -112,9 +112,7 @@ def find_planes(points: np.ndarray, clearance: float) -> tuple[Plane | None, lis
     return floor, walls
 
 
-def is_clear_of_planes(
-    points: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]
-) -> np.ndarray:
+def is_clear_of_planes(points: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]) -> np.ndarray:
     """Return which points (N,) are neither in or below the floor nor in walls."""
     clear = np.ones(len(points), dtype=bool) if floor is None else floor.height(points) > clearance
     for wall in walls:

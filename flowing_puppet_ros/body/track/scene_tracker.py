@@ -22,6 +22,7 @@ from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.person_finder import FoundBody, PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings, nested, setting
 
@@ -85,18 +86,43 @@ def crop_to_region(points: F64, region: RegionSettings) -> Bools:
 class SceneCloud:
     """A cloud with z up: `points` (N, 3) m, `normals` (N, 3) or None, `stamp` ns.
 
-    `single_view` says that it is known to be seen from one side, from the origin of its frame.
+    `single_view` says that it is known to be seen from one side, from the origin of its frame; `image` is its range
+    image where it is organised, whose pixels are those of the points.
     """
 
     points: F64
     normals: F64 | None
     stamp: int
     single_view: bool = False
+    image: RangeImage | None = None
 
     @property
     def whole(self) -> PersonCloud:
         """All of the cloud as one person."""
         return PersonCloud(self.points, self.normals, self.stamp)
+
+    def take(self, rows: Bools) -> SceneCloud:
+        """Return the part of the cloud whose points are `rows` (N,)."""
+        normals = None if self.normals is None else self.normals[rows]
+        return replace(self, points=self.points[rows], normals=normals, image=self.image and self.image.take(rows))
+
+    def with_fields(self, people: Sequence[PersonCloud]) -> list[PersonCloud]:
+        """Return people seen from the origin with what the sensor can know of each.
+
+        A scan without order is drawn into an image for that, unless the person is all of it: its own extent says
+        nothing about the sensor's.
+        """
+        image = self.image
+        if image is None and any(person.rows is not None for person in people):
+            image = RangeImage.of_scan(self.points, np.zeros(3))
+        if image is None:
+            return list(people)
+        return [
+            replace(person, field=image.make_field(slice(None) if person.rows is None else person.rows))
+            if self.image is not None or person.rows is not None
+            else person
+            for person in people
+        ]
 
 
 class SceneTracker:
@@ -141,7 +167,7 @@ class SceneTracker:
         In single views a new person has an upright body at once, which is refined by a full fit where it is doubtful.
         """
         settings = self._settings
-        self._check(cloud)
+        self.check(cloud)
         if not settings.scene:
             (person,) = self._with_viewpoint(cloud, [cloud.whole])
             if not settings.track:
@@ -227,7 +253,8 @@ class SceneTracker:
         rows, points = self._in_range(cloud)
         normals = None if cloud.normals is None else cloud.normals[rows]
         found = self._finder.find(points, normals, np.zeros(3), cloud.stamp, known, max_fits, remember)
-        moved = [FoundBody(replace(body.person, rows=rows[body.person.rows]), body.fit) for body in found]
+        people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
+        moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
 
     def _improve(
@@ -248,7 +275,8 @@ class SceneTracker:
         )
         return [replace(person, stamp=cloud.stamp) for person in people]
 
-    def _check(self, cloud: SceneCloud) -> None:
+    def check(self, cloud: SceneCloud) -> None:
+        """Raise an InputError when a cloud has no point, or none in range."""
         if not len(cloud.points):
             raise InputError("the cloud has no finite point in the region of interest")
         distance, limit = np.linalg.norm(cloud.points, axis=1).min(), self._settings.segmentation.max_range
@@ -259,7 +287,14 @@ class SceneTracker:
             )
 
     def _fit(self, person: PersonCloud, seed: int, progress: Progress | None = None) -> BodyFit:
-        return self._fitter.fit(person.points, person.normals, viewpoint=person.viewpoint, seed=seed, progress=progress)
+        return self._fitter.fit(
+            person.points,
+            person.normals,
+            viewpoint=person.viewpoint,
+            field=person.field,
+            seed=seed,
+            progress=progress,
+        )
 
     def _sensor(self, cloud: SceneCloud) -> F64 | None:
         """Return where the sensor is for the segmentation: at the origin, unless people are seen from all sides."""
@@ -281,4 +316,4 @@ class SceneTracker:
             single = is_single_view(people[0].points)
             if remember:
                 self._single_view = single
-        return [replace(person, viewpoint=np.zeros(3)) for person in people] if single else people
+        return cloud.with_fields([replace(person, viewpoint=np.zeros(3)) for person in people]) if single else people

@@ -10,7 +10,6 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
-from flowing_puppet_ros.body.upright.upright_bank import measure_stature
 from flowing_puppet_ros.evaluate.body.bodies import is_flipped
 from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS
 from flowing_puppet_ros.evaluate.rgbd.views import RgbdFrame
@@ -81,7 +80,7 @@ def score_body(
         seen_error=seen_error,
         unseen_error=_mean(error[~seen.in_view]),
         visible_error=_mean(error[seen.visible]),
-        stature_error=measure_stature(model, fit.state) - truth.stature,
+        stature_error=model.measure_height(fit.state.shape) - truth.stature,
         flipped=is_flipped(vertices, template, model),
         wrong=(vertex_error if cut == "whole" else seen_error) > MIN_WRONG_M,
         lost_arms=int((error[arms] > MIN_LOST_M).sum()),

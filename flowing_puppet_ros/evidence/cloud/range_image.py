@@ -26,6 +26,7 @@ MAX_CAMERA_TANGENT = 1.2  # of half of a camera's field of view: 100 degrees fro
 POINT_SPACINGS, MIN_PIXEL = 2.0, np.radians(0.2)  # of an estimated image's pixel, in mean spacings of points
 END_PIXELS, MIN_END_SHARE = 2, 0.25
 """The field of view of an estimated image ends where so many of its lines end, within so many pixels."""
+AZIMUTH_BINS = 720  # in which the largest gap of azimuth is found
 MIN_GAP_RAD = np.radians(5.0)  # of azimuth without points, from which on a scan does not go all the way round
 
 
@@ -51,7 +52,8 @@ class RangeImage:
     def of_camera(cls, projection: SensorProjection, points: F64, pixel: I64, shape: tuple[int, int]) -> RangeImage:
         """Take a depth image of `shape` (H, W) with the pixels (N,) and places (N, 3) m of its valid depths, N > 0."""
         depth = np.full(shape, np.inf, dtype=np.float32)
-        depth.reshape(-1)[pixel] = (points - projection.viewpoint) @ projection.axes[2]
+        forward = projection.axes[2]
+        depth.reshape(-1)[pixel] = points @ forward - projection.viewpoint @ forward
         return cls(projection, _find_border(np.isfinite(depth)), depth, pixel)
 
     @classmethod
@@ -172,7 +174,8 @@ def _calibrate(local: F64, pixels: F64, axes: F64) -> SensorProjection | None:
 
 def _find_camera_axes(local: F64) -> F64 | None:
     """Return rows right, down and forward where places (N, 3) m lie ahead along an axis as a camera's do, else None."""
-    mean = (local / np.maximum(np.linalg.norm(local, axis=1, keepdims=True), 1e-9)).mean(axis=0)
+    few = local[:: 1 + len(local) // MAX_CALIBRATION_POINTS]
+    mean = (few / np.maximum(np.linalg.norm(few, axis=1, keepdims=True), 1e-9)).mean(axis=0)
     ahead = int(np.abs(mean).argmax())
     forward = np.eye(3)[ahead] * np.sign(mean[ahead])
     depth = local @ forward
@@ -188,7 +191,8 @@ def _find_lidar_axes(local: F64, azimuth: tuple[float, float] | None) -> F64:
     if azimuth is not None:
         middle = (azimuth[0] + azimuth[1]) / 2
     else:
-        angles = np.sort(np.arctan2(local[:, 1], local[:, 0]))
+        bins = np.floor((np.arctan2(local[:, 1], local[:, 0]) + np.pi) / (2 * np.pi) * AZIMUTH_BINS).astype(np.int64)
+        angles = np.flatnonzero(np.bincount(bins)) * (2 * np.pi / AZIMUTH_BINS) - np.pi
         gaps = np.diff(angles, append=angles[0] + 2 * np.pi)
         widest = int(gaps.argmax())
         middle = angles[widest] + gaps[widest] / 2 + np.pi

@@ -60,9 +60,8 @@ def _read_camera(path: Path, node: ElementTree.Element) -> RigCamera:
     except (KeyError, ValueError) as error:
         raise InputError(f"{name} has an entry that is missing or not a number: {error}") from error
     rotation = _TO_OPTICAL @ axes
-    return make_rig_camera(
-        name, [[fu, 0, cu - left], [0, fv, cv - top], [0, 0, 1]], lens, size, rotation, -rotation @ centre
-    )
+    matrix = np.array([[fu, 0.0, cu - left], [0.0, fv, cv - top], [0.0, 0.0, 1.0]])
+    return make_rig_camera(name, matrix, lens, size, rotation, -rotation @ centre)
 
 
 def write_qualisys_rig(rig: CameraRig, path: Path) -> None:

@@ -21,6 +21,10 @@ from flowing_puppet_ros.body.track.scene_tracker import (
 )
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
+from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
+from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
+from flowing_puppet_ros.fusion.tracker import FusedTracker
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.settings import nested, setting
@@ -29,7 +33,7 @@ from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyO
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriSettings
 from flowing_puppet_ros.stream.components.silhouette_bodies import SilhouetteBodies
 from flowing_puppet_ros.stream.depth_pairs import DepthPairs
-from flowing_puppet_ros.stream.messages.clouds import decode_cloud
+from flowing_puppet_ros.stream.messages.clouds import decode_pixels
 from flowing_puppet_ros.stream.messages.depth import make_depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.message_types import (
@@ -37,16 +41,22 @@ from flowing_puppet_ros.stream.messages.message_types import (
     CAMERA_INFO,
     IMAGE,
     POINT_CLOUD,
+    PUPPETS,
     SILHOUETTES,
+    TRANSFORMS,
     MessageFactory,
 )
 from flowing_puppet_ros.stream.messages.puppets import JointPosition, decode_body_joints, make_bodies, make_body
+from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
 from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 
 OPTICAL = re.compile(r"optical(_frame)?$")
 """Frames that look along z with y down (REP-103)."""
 ASSUMED_INTERVAL_NS = 100_000_000
 """Between clouds whose stamps do not advance (drivers that stamp nothing)."""
+COLOUR_PORTS = ("puppets", "puppets/camera_info", "/tf_static")
+MIN_OUTSIDE_SHARE = 0.1
+"""Of a cloud's points, outside of the camera's view, from which on people are found there without puppets."""
 MIN_CAMERA_DISTANCE_M = 0.1
 MAX_FIELD_OF_VIEW = 1.2  # tangent of half of it: 100 degrees from side to side
 
@@ -66,6 +76,7 @@ class BodyFitterSettings(SceneSettings):
         1, "clouds to wait for late initial joints before fitting a cloud without them", low=0, high=50, advanced=True
     )
     region: RegionSettings = nested(RegionSettings)
+    fusion: FusionSettings = nested(FusionSettings)
     fitter: FitterSettings = nested(FitterSettings)
     silhouettes: SilhouetteFitterSettings = nested(SilhouetteFitterSettings)
     output: BodyOutputSettings = nested(BodyOutputSettings)
@@ -86,6 +97,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         Port("points", POINT_CLOUD, "sensor"),
         Port("depth", IMAGE, "sensor", transport=COMPRESSED_DEPTH),
         Port("camera_info", CAMERA_INFO, "sensor"),
+        Port("puppets", PUPPETS, optional=True),
+        Port("puppets/camera_info", CAMERA_INFO, "sensor", optional=True),
+        Port("/tf_static", TRANSFORMS, "latched", optional=True),
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),
     )
@@ -97,6 +111,10 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._model = StitchedPuppet.load(settings.model)
         self._fitter = BodyFitter(self._model, settings.fitter)
         self._scene = SceneTracker(self._fitter, settings, self.report)
+        self._fused = FusedTracker(
+            PeopleFitter(self._fitter, settings.fusion), settings.tracker, settings.tracker.hold, self.report
+        )
+        self._puppets = PuppetPairs(self._model, settings.fusion)
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
         self._depth = DepthPairs(self.report)
         self._up_of_nameless = ""
@@ -114,6 +132,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""
         self._silhouettes.reset()
         self._scene.reset()
+        self._fused.reset()
+        self._puppets.reset()
         self._depth.reset()
         self._line.clear()
         self._initial.clear()
@@ -122,7 +142,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def flush(self) -> Output:
         """Fit the clouds that still wait."""
-        return self._fit_depth(self._depth.flush()) + self._release(final=True)
+        return self._fit_depth(self._depth.flush()) + self._release(final=True) + self._publish_silhouettes()
 
     def fit(
         self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None
@@ -141,6 +161,11 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         messages = [make_body(self.factory, self._model, body) for body in bodies]
         return make_bodies(self.factory, cloud.header, messages), bodies
 
+    def _step_scene(self, scene: SceneCloud, seed: int) -> tuple[list[TrackedBody], list[str]]:
+        """Return the bodies of everybody in a cloud alone, and the ids of those out of sight."""
+        bodies, occluded = self._scene.step(scene, seed, self.background)
+        return self._publish_ids(bodies), [self.publish_id(own) for own in occluded]
+
     def _publish_ids(self, bodies: list[TrackedBody]) -> list[TrackedBody]:
         return [replace(body, id=self.publish_id(body.id)) for body in bodies]
 
@@ -149,13 +174,16 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
         That of a depth image is seen from one side, in an optical frame, whatever its name, whose y axis points down.
         """
-        points, normals = decode_cloud(cloud)
+        points, normals, pixel = decode_pixels(cloud)
+        image = RangeImage.of_organised(points, pixel, (int(cloud.height), int(cloud.width)))
         inside = crop_to_region(points, self.settings.region)
         if not inside.all():
             points, normals = points[inside], None if normals is None else normals[inside]
+            image = image and image.take(inside)
         to_z_up = rotation_to_z_up(parse_axis(self._find_up(cloud.header.frame_id, points, of_depth)))
         rotated = None if normals is None else normals @ to_z_up.T
-        return SceneCloud(points @ to_z_up.T, rotated, stamp_ns(cloud), of_depth), to_z_up
+        image = image and image.turn(to_z_up)
+        return SceneCloud(points @ to_z_up.T, rotated, stamp_ns(cloud), of_depth, image), to_z_up
 
     def _find_up(self, frame: str, points: F64, of_depth: bool) -> str:
         """Return the axis that is up in a frame; for one without a name the first cloud decides."""
@@ -179,6 +207,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
     ) -> list[TrackedBody]:
         """Fit each of the bodies in `initial` to the whole cloud, from its joints."""
         viewpoint = np.zeros(3) if self.settings.view == "single" or scene.single_view else None
+        field = scene.image.make_field(slice(None)) if scene.image is not None and viewpoint is not None else None
         bodies = []
         for number, body in enumerate(initial.bodies, start=1):
             fit = self._fitter.fit(
@@ -186,6 +215,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
                 scene.normals,
                 initial=_rotate_joints(decode_body_joints(body), to_z_up),
                 viewpoint=viewpoint,
+                field=field,
                 seed=seed,
                 progress=progress,
             )
@@ -201,6 +231,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             return self._fit_silhouettes(message)
         if port in ("depth", "camera_info"):
             return self._fit_depth(self._depth.add(port, message))
+        if port in COLOUR_PORTS:
+            self._puppets.add(port, message)
+            return self._release(final=False)
         stamp = stamp_ns(message)
         if port == "points":
             self._line.waiting.append((stamp, (message, False)))
@@ -228,13 +261,20 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         while self._line.waiting:
             stamp, (cloud, of_depth) = self._line.waiting[0]
             initial = self._initial.get(stamp)
-            crowded = len(self._line.waiting) > self.settings.wait
-            if not (final or crowded or initial is not None or "initial" not in self._expected):
+            if not (final or self._is_ready(stamp, initial)):
                 break
             self._line.pop()
             self._initial.drop_until(stamp)
             outputs += self._fit_one(stamp, cloud, of_depth, initial)
         return outputs
+
+    def _is_ready(self, stamp: int, initial: Any | None) -> bool:
+        """Return whether all that is expected for the first cloud in line is there, or it has waited long enough."""
+        waiting = len(self._line.waiting) - 1
+        if "initial" in self._expected and initial is None and waiting < self.settings.wait:
+            return False
+        puppets = "puppets" in self._expected and waiting < self.settings.fusion.wait
+        return not puppets or self._puppets.is_ready(stamp)
 
     def _fit_one(self, stamp: int, cloud: Any, of_depth: bool, initial: Any | None) -> Output:
         self.counters["clouds"] += 1
@@ -246,13 +286,45 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             if initial is not None and initial.bodies:
                 bodies = self._fit_initial(scene, to_z_up, initial, self.seed_of(stamp))
             else:
-                bodies, occluded = self._scene.step(scene, self.seed_of(stamp), self.background)
-                bodies, occluded = self._publish_ids(bodies), [self.publish_id(own) for own in occluded]
+                bodies, occluded = self._fit_scene(scene, cloud.header, stamp, to_z_up)
             bodies = [body.rotate(to_z_up.T) for body in bodies]
         except InputError as error:
             self.report.count_unusable(error)
         self.counters["bodies"] += len(bodies)
         return self._outputs.make(cloud.header, bodies, occluded, self._subscribed)
+
+    def _fit_scene(
+        self, scene: SceneCloud, header: Any, stamp: int, to_z_up: F64
+    ) -> tuple[list[TrackedBody], list[str]]:
+        """Return the bodies of everybody, and the ids of those out of sight: with a camera's puppets, or without.
+
+        Where the camera looks, only who has a puppet has a body. Elsewhere people are found in the cloud alone.
+        """
+        seed = self.seed_of(stamp)
+        if "puppets" not in self._expected or not self.settings.scene:
+            return self._step_scene(scene, seed)
+        try:
+            paired = self._puppets.find(header, stamp, to_z_up)
+        except InputError as error:
+            self.report.warn(str(error))
+            self.counters["clouds without puppets"] += 1
+            return self._step_scene(scene, seed)
+        self._puppets.drop_until(stamp)
+        self._scene.check(scene)
+        seen = SeenCloud.of(scene.points, paired.camera)
+        image = scene.image or RangeImage.of_scan(scene.points, np.zeros(3))
+        bodies, own = self._fused.step(seen, image, paired.puppets, scene.stamp)
+        occluded = self._fused.occluded_ids
+        if paired.puppets and not own.any():
+            self.report.warn(
+                f"none of the {len(paired.puppets)} puppets lies on the cloud: nobody is near enough to the sensor, or "
+                "camera and cloud do not belong together"
+            )
+        outside = ~seen.in_view & ~own
+        if outside.mean() > MIN_OUTSIDE_SHARE:
+            others, hidden = self._step_scene(scene.take(outside), seed)
+            bodies, occluded = [*bodies, *others], [*occluded, *hidden]
+        return bodies, occluded
 
     def _advance_clock(self, stamp: int) -> int:
         """Return the time of a cloud, ns: its stamp, or some time after the cloud before it if that has the same."""
@@ -266,15 +338,20 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         return self._clock[1]
 
     def _fit_silhouettes(self, message: Any) -> Output:
+        """Fit one person; bodies go out together when the last one of the same images is there."""
         self.counters["silhouettes"] += 1
-        bodies: list[TrackedBody] = []
+        outputs = self._publish_silhouettes() if self._silhouettes.is_other_instant(message) else []
         try:
-            bodies.append(self._silhouettes.fit(message))
+            self._silhouettes.add(message)
         except InputError as error:
             self.report.count_unusable(error)
+        return outputs + (self._publish_silhouettes() if self._silhouettes.is_complete else [])
+
+    def _publish_silhouettes(self) -> Output:
+        header, bodies = self._silhouettes.collect()
         self.counters["bodies"] += len(bodies)
         self.counters["doubtful bodies"] += sum(not body.fit.reliable for body in bodies)
-        return self._outputs.make(message.header, bodies, subscribed=self._subscribed)
+        return self._outputs.make(header, bodies, subscribed=self._subscribed) if header is not None else []
 
 
 def is_ahead_along_z(points: F64) -> bool:

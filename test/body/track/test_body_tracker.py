@@ -12,6 +12,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettin
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, sample_surface, scan_whole
+from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -31,12 +32,13 @@ class _KnowingFitter(BodyFitter):
         *,
         initial: Mapping[str, tuple[float, float, float, float]] | None = None,
         viewpoint: np.ndarray | None = None,
+        field: SensorField | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
         nonrigid: bool = True,
         quick: bool = False,
     ) -> BodyFit:
-        return self.assess(self.truth, self.prepare_cloud(points, normals, viewpoint))
+        return self.assess(self.truth, self.prepare_cloud(points, normals, viewpoint, field))
 
 
 @pytest.fixture(scope="module")
