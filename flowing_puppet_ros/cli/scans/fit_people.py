@@ -79,6 +79,8 @@ class FitOptions:
     scene: bool
     settings: FitterSettings
     segmentation: SegmentationSettings
+    measure: bool = False
+    joints: tuple[tuple[str, tuple[float, float, float, float]], ...] = ()
 
 
 def list_scene_ups(options: FitOptions) -> list[np.ndarray]:
