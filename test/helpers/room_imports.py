@@ -113,7 +113,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "draw": {"flow"},
     "evaluate": {"image.formats", "model"},
     "evaluate.bag": {"bag", "body.scans", "evaluate", "image.formats", "multiview", "stream", "stream.messages"},
-    "evaluate.body": {"body.fit", "body.scans", "learn.anny", "model"},
+    "evaluate.body": {"body.fit", "body.measurements", "body.scans", "learn.anny", "model"},
     "evaluate.image": {
         "evaluate",
         "evidence.image",

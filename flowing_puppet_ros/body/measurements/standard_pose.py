@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Array
@@ -14,27 +12,33 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 def to_standard_pose(model: StitchedPuppet, state: BodyState, vertices: Array | None = None) -> F64:
     """Return the vertices (V, 3) of a body in the template's pose: metres, z up, facing x.
 
+    Every part has the shape that the model learned in that pose (Eq. 45 without the pose's share) and hangs on its
+    parent without turning.
+
     Args:
         model: of the body.
         state: the fitted variables.
-        vertices: (V, 3) of the fitted surface in the axes of `state`; what it has beyond the model's own is kept, in
-            the axes of the parts.
+        vertices: (V, 3) of the fitted surface in the axes of `state`; what a part has beyond the model's own is kept,
+            in the axes of the part.
     """
-    standard = _hang_parts(model, state.shape)
-    own = model.vertices(standard)
-    if vertices is None:
-        return own
-    beyond = np.asarray(vertices, np.float64) - model.vertices(state)
-    return np.asarray(own + np.einsum("vji,vj->vi", state.rotation[model.part_of_vertex], beyond))
+    local = [model.mean_shape[i] + model.shape_basis[i] @ state.shape[i] for i in range(len(model.tree))]
+    if vertices is not None:
+        surface = np.asarray(vertices, np.float64)
+        for i, ids in enumerate(model.part_vertices):
+            posed = (surface[ids] - state.center[i]) @ state.rotation[i]
+            local[i] = local[i] + posed - model.local_vertices(i, state.pose[i], state.shape[i])
+    return _assemble(model, local)
 
 
-def _hang_parts(model: StitchedPuppet, shape: Array) -> BodyState:
-    """Return a body of some `shape` (16, S) in the template's pose, each part hung on its parent without turning."""
-    state = replace(model.rest_state(), shape=np.asarray(shape, np.float64))
+def _assemble(model: StitchedPuppet, local: list[Array]) -> F64:
+    """Return the vertices (V, 3) of a body of parts (N_i, 3) in their own axes, each hung on its parent."""
+    center = np.array(model.rest_center)
     for parent, child in model.tree.edges:
         interface = model.interfaces[child - 1]
-        above = model.local_vertices(parent, state.pose[parent], state.shape[parent])[interface.parent_index]
-        below = model.local_vertices(child, state.pose[child], state.shape[child])[interface.child_index]
-        step = np.average(above - below, axis=0, weights=interface.weight)
-        state.center[child] = state.center[parent] + step
-    return state
+        gap = local[parent][interface.parent_index] - local[child][interface.child_index]
+        center[child] = center[parent] + np.average(gap, axis=0, weights=interface.weight)
+    total, copies = np.zeros((len(model.part_of_vertex), 3)), np.zeros(len(model.part_of_vertex))
+    for i, ids in enumerate(model.part_vertices):
+        total[ids] += local[i] + center[i]
+        copies[ids] += 1
+    return np.asarray(total / copies[:, None])

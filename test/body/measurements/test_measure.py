@@ -11,17 +11,21 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.measurements.measure import (
     CHEST_SHARES,
     DEFINITIONS,
     HIP_SHARE,
     LEVEL_STEP_M,
     measure,
+    measure_fit,
 )
 from flowing_puppet_ros.body.measurements.sections import Sections, girth, signed_volume
+from flowing_puppet_ros.body.measurements.standard_pose import to_standard_pose
+from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, scan_whole
 from flowing_puppet_ros.learn.anny.body import AnnyBody
-from flowing_puppet_ros.model import weights
-from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.model import rotation, weights
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 PEOPLE = 20
 TOLERANCE_M = 0.01
@@ -116,3 +120,39 @@ def test_measurements_of_twenty_people_are_those_that_another_library_takes() ->
         assert set(found) == set(DEFINITIONS)
         for name, value in truth.items():
             assert found[name] == pytest.approx(value, abs=TOLERANCE_M), (name, found[name], value)
+
+
+@pytest.mark.slow
+def test_measurements_of_fits_do_not_depend_on_the_pose() -> None:
+    """Two people who walk, scanned and fitted: the measurements are those of their surface at rest."""
+    anny, rng = AnnyBody("neutral"), np.random.default_rng(11)
+    fitter = BodyFitter(StitchedPuppet.load(), FitterSettings())
+    ids = weights.load("sp", "neutral")["anny_vertex"]
+    turns = {"LeftUpLeg": [0, -0.4, 0], "RightUpLeg": [0, 0.3, 0], "RightLeg": [0, 0.4, 0], "LeftArm": [0, -0.5, -0.3]}
+    for _ in range(2):
+        rest = anny.make_rest_body(anny.sample_phenotype(rng))
+        bones = np.tile(np.eye(3), (len(anny.bone_names), 1, 1))
+        for name, turn in turns.items():
+            bones[anny.bone_index(name)] = rotation.exp(np.array(turn, float))
+        posed = anny.pose(rest, bones)[0]
+        cloud = scan_whole(RaycastScene(posed, anny.triangles), rng, 10_000)
+        fit = fitter.fit(cloud.points, cloud.normals)
+        joints = dict(zip(fitter.model.joint_names, fitter.model.joints(rest.vertices[ids]), strict=True))
+        truth = measure(rest.vertices, anny.triangles, joints)
+        found = measure_fit(fitter.model, fit.state, fit.vertices)
+        errors = {name: found[name] - truth[name] for name in DEFINITIONS}
+        assert max(abs(error) for error in errors.values()) < TOLERANCE_M, errors
+
+
+def test_the_standard_pose_of_a_body_in_it_is_itself() -> None:
+    model = StitchedPuppet.load()
+    own = to_standard_pose(model, model.rest_state())
+    np.testing.assert_allclose(own, model.vertices(model.rest_state()), atol=0.02)  # the pose's share does not vanish
+    turned = model.rest_state()
+    turn = rotation.exp(np.array([0.3, -0.2, 1.0]))
+    moved = BodyState(turned.center @ turn.T + 5.0, turn @ turned.rotation, turned.pose, turned.shape)
+    vertices = model.vertices(moved) + 0.01 * np.random.default_rng(0).standard_normal((len(own), 3))
+    kept = to_standard_pose(model, moved, vertices) - own
+    noise = (vertices - model.vertices(moved)) @ turn
+    inner = np.bincount(np.concatenate(model.part_vertices)) == 1
+    assert np.abs((kept - noise)[inner]).max() < 0.01, "what the surface has beyond the model turns with its part"
