@@ -26,6 +26,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "body": set(),
     "body.cloud": {"evidence.cloud"},
     "body.fit": {"body.cloud", "body.refine", "body.scans", "body.search", "evidence.cloud", "model"},
+    "body.measurements": {"model"},
     "body.refine": {"body.cloud", "body.search", "model"},
     "body.scans": {"body.cloud", "model"},
     "body.search": {"body.cloud", "evidence.cloud", "inference", "model"},
@@ -54,6 +55,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "bag",
         "bag.storage",
         "body.fit",
+        "body.measurements",
         "body.scans",
         "body.segmentation",
         "cli.batch",
@@ -107,6 +109,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "cli.scans": {
         "body.cloud",
         "body.fit",
+        "body.measurements",
         "body.scans",
         "body.segmentation",
         "body.track",
@@ -132,7 +135,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "draw": {"flow"},
     "evaluate": {"image.formats", "model"},
     "evaluate.bag": {"bag", "body.scans", "evaluate", "image.formats", "multiview", "stream", "stream.messages"},
-    "evaluate.body": {"body.fit", "body.scans", "learn.anny", "model"},
+    "evaluate.body": {"body.fit", "body.measurements", "body.scans", "learn.anny", "model"},
     "evaluate.image": {
         "evaluate",
         "evidence.image",
