@@ -61,7 +61,7 @@ def _read_camera(path: Path, node: ElementTree.Element) -> RigCamera:
         raise InputError(f"{name} has an entry that is missing or not a number: {error}") from error
     rotation = _TO_OPTICAL @ axes
     return make_rig_camera(
-        name, [[fu, 0, cu - left], [0, fv, cv - top], [0, 0, 1]], lens, size, rotation, -rotation @ centre
+        name, np.array([[fu, 0, cu - left], [0, fv, cv - top], [0, 0, 1]]), lens, size, rotation, -rotation @ centre
     )
 
 
