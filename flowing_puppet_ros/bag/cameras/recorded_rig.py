@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from flowing_puppet_ros.bag.graph import MIN_CAMERAS, find_cameras, find_info_to
 from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
-from flowing_puppet_ros.image.video.clip import Clip, DetectedFrame, track_clip
+from flowing_puppet_ros.image.video.clip import Clip, DetectedFrame, Progress, track_clip
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.multiview.association.view import PersonInView
 from flowing_puppet_ros.multiview.camera import Camera
@@ -32,7 +33,7 @@ type Frames = dict[str, list[tuple[float, list[PersonInView]]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordedRig:
-    """The calibrated cameras of a bag, metres, and the image topic of each."""
+    """The calibrated cameras of a bag, metres, and the image topic of each, "" where it has puppets only."""
 
     rig: CameraRig
     topics: dict[str, str]
@@ -48,15 +49,18 @@ def read_recorded_rig(path: Path, warn: Callable[[str], None]) -> RecordedRig:
         infos = _read_infos(bag)
         groups: dict[str, dict[str, RigCamera]] = {}
         topics: dict[str, str] = {}
-        for camera in find_cameras(bag.topics):
-            info = infos.get(f"{camera.namespace}/camera_info")
+        images = {camera.namespace: camera.image for camera in find_cameras(bag.topics)}
+        # What `replay` writes has puppets without images.
+        tracked = {name.removesuffix("/puppets") for name, kind in bag.topics.items() if kind == PUPPETS}
+        for namespace in sorted({*images, *(name for name in tracked if f"{name}/camera_info" in infos)}):
+            info = infos.get(f"{namespace}/camera_info")
             if info is None:
-                warn(f"there is no {camera.namespace}/camera_info: {camera.name} is left out")
+                warn(f"there is no {namespace}/camera_info: {namespace.lstrip('/')} is left out")
                 continue
             root, found = _place(info, frames)
-            groups.setdefault(root, {})[camera.name] = RigCamera(found)
-            compressed = f"{camera.image}/compressed"
-            topics[camera.name] = compressed if bag.topics.get(compressed) == COMPRESSED_IMAGE else camera.image
+            name, image = namespace.lstrip("/"), images.get(namespace, "")
+            groups.setdefault(root, {})[name] = RigCamera(found)
+            topics[name] = f"{image}/compressed" if bag.topics.get(f"{image}/compressed") == COMPRESSED_IMAGE else image
     cameras = max(groups.values(), key=len, default={})
     if len(cameras) < MIN_CAMERAS:
         raise InputError(
@@ -81,14 +85,8 @@ def _place(info: Any, frames: FrameTree) -> tuple[str, Camera]:
     root = frames.find_root(frame)
     pose = frames.lookup_pose(root, frame)
     assert pose is not None
-    return root, Camera.from_info(
-        info.k, info.d, info.width, info.height, *pose_to_extrinsics(*pose), info.distortion_model
-    )
-
-
-def pose_to_extrinsics(position: Any, rotation: Any) -> tuple[Any, Any]:
-    """Return rotation (3, 3) and translation (3,) from world to camera of a camera's pose in the world."""
-    return rotation.T, -rotation.T @ position
+    translation, rotation = pose  # of the root frame in the camera's: world to camera
+    return root, Camera.from_info(info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model)
 
 
 def read_people(
@@ -96,7 +94,7 @@ def read_people(
     recorded: RecordedRig,
     networks: KeypointSource | None,
     warn: Callable[[str], None],
-    progress: Callable[[Iterable[DetectedFrame], str], Iterable[DetectedFrame]] = lambda frames, title: frames,
+    progress: Progress = lambda frames, title: frames,
 ) -> tuple[tuple[str, ...], Frames]:
     """Return the names of joints and everybody in the images: the bag's own puppets, or else tracked now.
 
@@ -111,7 +109,10 @@ def read_people(
             missing, frames = list(recorded.topics), {}
         names = tuple(model.joint_names)
         for name in missing:
-            frames[name] = _track(path, recorded.topics[name], model, networks, warn, lambda f, n=name: progress(f, n))  # type: ignore[misc]
+            if not recorded.topics[name]:
+                raise InputError(f"{path} has neither images nor puppets of {name}: give the bag with the images")
+            shown = partial(progress, title=name)
+            frames[name] = _track(path, recorded.topics[name], model, networks, warn, shown)
     first = min(group[0][0] for group in frames.values() if group) if any(frames.values()) else 0.0
     return names, {name: [(time - first, people) for time, people in frames[name]] for name in recorded.topics}
 
