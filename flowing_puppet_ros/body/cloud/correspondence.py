@@ -75,6 +75,9 @@ class TwoWayCorrespondence:
         self._nearest = NearestPoints(cloud.points, cloud.normals, NORMAL_LENGTH_M)
         step = 1 if max_points is None else max(1, -(-len(cloud.points) // max_points))
         self._matched = np.arange(0, len(cloud.points), step)
+        # The last answers, from which the next body's are found faster.
+        self._to_cloud = np.empty(0, dtype=np.int64)
+        self._to_body: np.ndarray | None = None
 
     def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float) -> VertexQuadratic:
         """Match both ways and return the quadratic that attracts the vertices to the cloud.
@@ -92,9 +95,12 @@ class TwoWayCorrespondence:
         cloud, matched = self._cloud, self._matched
         normals = vertex_normals(vertices, faces)
         seen = np.flatnonzero(cloud.sees(vertices, normals))
-        to_cloud = self._nearest.query(vertices[seen], normals[seen])[1]
+        if len(self._to_cloud) != len(vertices):
+            self._to_cloud, self._to_body = np.zeros(len(vertices), dtype=np.int64), None
+        to_cloud = self._nearest.query(vertices[seen], normals[seen], self._to_cloud[seen])[1]
         body = NearestPoints(vertices, normals, NORMAL_LENGTH_M)
-        to_body = body.query(cloud.points[matched], cloud.normals[matched])[1]
+        to_body = body.query(cloud.points[matched], cloud.normals[matched], self._to_body)[1]
+        self._to_cloud[seen], self._to_body = to_cloud, to_body
         quadratic = VertexQuadratic(np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3)))
         for pairs in ((seen, to_cloud), (to_body, matched)):
             _add_pairs(

@@ -6,11 +6,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic, geman_mcclure
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
+from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours
 from flowing_puppet_ros.evidence.cloud.one_sided import OneSidedView
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 
@@ -57,8 +57,9 @@ class SingleViewCloud(Cloud):
                 f"the sensor at {np.round(viewpoint, 2).tolist()} m stands within the cloud and cannot have seen one"
                 " side of it; check the frame or fit it as a whole cloud"
             )
-        near = points[cKDTree(points).query(points, k=min(NOISE_NEIGHBOURS, len(points)))[1]]
-        noise = float(np.median(np.abs(((near - points[:, None]) * normals[:, None]).sum(axis=2)[:, 1:])))
+        near = find_neighbours(points, NOISE_NEIGHBOURS)
+        apart = np.abs(((points[near] - points[:, None]) * normals[:, None]).sum(axis=2))
+        noise = float(np.median(apart[near != np.arange(len(points))[:, None]]))
         view = OneSidedView.build(points, viewpoint, unknown, field)
         return cls(
             points,

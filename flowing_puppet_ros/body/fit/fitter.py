@@ -51,7 +51,7 @@ class BodyFit:
         confidence: 0 to 1, from the parts on the cloud and the cloud on the body.
         reliable: whether the body can be trusted, see `FitQuality.reliable`.
         two_way_distance: mean distance between body and cloud over both directions, metres.
-        visibility: which vertices, joints and parts the sensor saw; None for bodies that were not fitted to a cloud.
+        visibility: which vertices, joints and parts the sensor saw.
     """
 
     state: BodyState
@@ -62,7 +62,7 @@ class BodyFit:
     confidence: float
     reliable: bool
     two_way_distance: float
-    visibility: BodyVisibility | None = None
+    visibility: BodyVisibility
 
 
 class BodyFitter:

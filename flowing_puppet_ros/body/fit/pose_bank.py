@@ -186,7 +186,16 @@ class PoseBank:
 def make_bank(model: StitchedPuppet) -> list[Particles]:
     """Sample the bank: the particles of each part in every yaw and pose; made once for a model."""
     rng = np.random.default_rng(0)
-    bank = states_to_particles(model, [model.sample(rng, shape_scale=0.0) for _ in range(POSES)])
+    bodies = model.sample_many(rng, POSES, shape_scale=0.0)
+    bank = [
+        Particles(
+            bodies.center[:, part],
+            bodies.rotation[:, part],
+            bodies.pose[:, part, : model.pose_count(part)],
+            bodies.shape[:, part],
+        )
+        for part in range(len(model.tree))
+    ]
     yaws = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
     return [Particles.join([_rotate(group, yaw) for yaw in yaws]) for group in bank]
 

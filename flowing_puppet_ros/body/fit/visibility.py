@@ -38,23 +38,30 @@ class BodyVisibility:
     joints: I8
     parts: I8
 
+    @classmethod
+    def of_vertices(cls, model: StitchedPuppet, state: I8) -> BodyVisibility:
+        """Return that of a body from the `Visibility` (V,) of its vertices.
+
+        A joint or part is seen if a tenth of its vertices are, and near if three tenths are seen or near.
+        """
+        owner, parts = model.part_of_vertex, len(model.tree)
+        size = np.bincount(owner, minlength=parts)
+        seen, near = (np.bincount(owner, state >= level, minlength=parts) / size for level in (2, 1))
+        joints = [((state[model.joint_index] >= level) * model.joint_weight).sum(axis=1) for level in (2, 1)]
+        return cls(state, _judge_shares(joints[0], joints[1]), _judge_shares(seen, near))
+
 
 def judge_visibility(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> BodyVisibility:
     """Tell what a cloud says about each place on a body with `vertices` (V, 3) in metres.
 
     A vertex is seen if it faces the sensor, is neither hidden nor out of its view, and lies within 4 cm of the cloud;
-    it is near if it lies within 10 cm. A joint or part is seen if a tenth of its vertices are, and near if three
-    tenths are seen or near.
+    it is near if it lies within 10 cm.
     """
     distance = cloud.nearest.query(vertices)[0]
     could_see = cloud.sees(vertices, vertex_normals(vertices, model.faces))
     state = np.where(distance <= MAX_NEAR_DISTANCE_M, Visibility.NEAR, Visibility.INFERRED).astype(np.int8)
     state[could_see & (distance <= MAX_SEEN_DISTANCE_M)] = Visibility.SEEN
-    owner, parts = model.part_of_vertex, len(model.tree)
-    size = np.bincount(owner, minlength=parts)
-    seen, near = (np.bincount(owner, state >= level, minlength=parts) / size for level in (2, 1))
-    joints = [((state[model.joint_index] >= level) * model.joint_weight).sum(axis=1) for level in (2, 1)]
-    return BodyVisibility(state, _judge_shares(joints[0], joints[1]), _judge_shares(seen, near))
+    return BodyVisibility.of_vertices(model, state)
 
 
 def _judge_shares(seen: np.ndarray, near: np.ndarray) -> I8:

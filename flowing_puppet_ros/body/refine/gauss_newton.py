@@ -12,11 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import solve
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dposv
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic, geman_mcclure
+from flowing_puppet_ros.body.refine.joint_rows import JointRows
 from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, PosedPoints, System
-from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.search.energy import RAY_SHARE, JointTargets
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -70,9 +72,7 @@ class GaussNewton:
     def __init__(self, model: StitchedPuppet) -> None:
         self._model = model
         self._equations = NormalEquations(model)
-        self._regressor = np.zeros((len(model.joint_names), len(model.part_of_vertex)))
-        for row, (index, weight) in enumerate(zip(model.joint_index, model.joint_weight, strict=True)):
-            np.add.at(self._regressor[row], index, weight)
+        self._joints = JointRows(model, self._equations)
 
     def run(
         self,
@@ -120,7 +120,7 @@ class GaussNewton:
         equations.add_joint_prior(weights.pairwise, state, system)
         self._add_priors(state, weights, system)
         hessian[np.diag_indices(equations.size)] += 1e-9 + 1e-3 * hessian.diagonal()
-        return self._retract(state, solve(hessian, -gradient, lower=True, assume_a="pos", overwrite_a=True))
+        return self._retract(state, _solve_lower(hessian, -gradient))
 
     def _add_joints(
         self, targets: JointTargets, width: float, posed: PosedPoints, rotation: np.ndarray, system: System
@@ -129,13 +129,13 @@ class GaussNewton:
         chosen = np.flatnonzero(targets.weight > 0)
         if not len(chosen):
             return
-        gap = self._regressor[chosen] @ posed.vertices - targets.points[chosen]
+        gap = self._joints.find_joints(chosen, posed.vertices) - targets.points[chosen]
+        rows = self._joints.derive(chosen, posed, rotation)
+        if targets.rays is not None:
+            ray = targets.rays[chosen]
+            squeeze = np.eye(3) - (1 - RAY_SHARE) * ray[:, :, None] * ray[:, None, :]
+            gap, rows = np.squeeze(squeeze @ gap[:, :, None], axis=2), squeeze @ rows
         trust = geman_mcclure((gap**2).sum(axis=1), width**2)
-        rows = np.zeros((len(chosen), 3, len(gradient)))
-        for part, jacobian in enumerate(self._equations.compute_jacobians(posed)):
-            vertex = self._model.part_vertices[part]
-            share = self._regressor[np.ix_(chosen, vertex)] * self._equations.share[vertex]
-            rows[:, :, self._equations.unknowns(part)] += rotation[part] @ np.tensordot(share, jacobian, 1)
         flat = rows.reshape(-1, len(gradient))
         weight = np.repeat(trust * targets.weight[chosen], 3)
         hessian += (flat * weight[:, None]).T @ flat
@@ -163,3 +163,14 @@ class GaussNewton:
         shape = np.clip(state.shape + step[first[-1] :], -MAX_COEFFICIENT, MAX_COEFFICIENT)
         pose = np.clip(pose, -MAX_COEFFICIENT, MAX_COEFFICIENT)
         return BodyState(center, state.rotation @ so3.exp(turn), pose, shape)
+
+
+def _solve_lower(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a positive definite system of which only the lower triangle is filled; `matrix` (U, U) is overwritten.
+
+    LAPACK itself, because `scipy.linalg.solve` takes as long again to copy the matrix and to estimate its condition.
+    """
+    solution, failed = dposv(matrix.T, right, lower=0, overwrite_a=True)[1:]
+    if failed:
+        raise LinAlgError("the normal equations are not positive definite")
+    return np.asarray(solution)

@@ -9,7 +9,6 @@ filled.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -98,15 +97,6 @@ class NormalEquations:
         own = np.arange(self.first[part], self.first[part + 1])
         return np.concatenate([own, np.arange(self.first[-1], self.size)])
 
-    def compute_jacobians(self, posed: PosedPoints) -> list[np.ndarray]:
-        """Return for each part the derivatives (N_i, 3, unknowns) of its points in its own frame."""
-        shapes, made = self.size - int(self.first[-1]), []
-        for part, (start, end) in enumerate(pairwise(self._starts)):
-            jacobian = np.empty((end - start, 3, 6 + self._poses[part] + shapes))
-            _fill_jacobians(jacobian, posed.local[start:end], self._basis[start:end])
-            made.append(jacobian)
-        return made
-
     def pose_points(self, state: BodyState) -> PosedPoints:
         """Return the points of a body, whose shape is that of its first part."""
         body = (state.center, state.rotation, state.pose, state.shape[0])
@@ -169,12 +159,6 @@ def _fill_jacobian(jacobian, local, basis, k, columns):  # type: ignore[no-untyp
         jacobian[i, 3 + i] = 1.0
         for column in range(columns):
             jacobian[i, 6 + column] = basis[k, i, column]
-
-
-@njit(cache=True, nogil=True)
-def _fill_jacobians(jacobians, local, basis):  # type: ignore[no-untyped-def]
-    for k in range(len(local)):
-        _fill_jacobian(jacobians[k], local, basis, k, jacobians.shape[2] - 6)
 
 
 @njit(cache=True, nogil=True)

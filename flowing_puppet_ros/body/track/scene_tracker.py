@@ -18,6 +18,7 @@ from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_c
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.person_finder import FoundBody, PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
@@ -100,6 +101,11 @@ class SceneCloud:
         """All of the cloud as one person."""
         return PersonCloud(self.points, self.normals, self.stamp)
 
+    def take(self, rows: Bools) -> SceneCloud:
+        """Return the part of the cloud whose points are `rows` (N,)."""
+        normals = None if self.normals is None else self.normals[rows]
+        return replace(self, points=self.points[rows], normals=normals, image=self.image and self.image.take(rows))
+
     def with_fields(self, people: Sequence[PersonCloud]) -> list[PersonCloud]:
         """Return people seen from the origin with what the sensor can know of each.
 
@@ -147,8 +153,8 @@ class SceneTracker:
 
     def step(
         self, cloud: SceneCloud, seed: int, executor: Executor | None = None
-    ) -> tuple[list[tuple[str, BodyFit]], list[str]]:
-        """Return (id, fit) of everybody in the next cloud, and the ids of those who are out of sight for now.
+    ) -> tuple[list[TrackedBody], list[str]]:
+        """Return the bodies of everybody in the next cloud, and the ids of those who are out of sight for now.
 
         Full fits run on the `executor`, or in line. InputError when the cloud cannot be one of people.
 
@@ -161,11 +167,11 @@ class SceneTracker:
         In single views a new person has an upright body at once, which is refined by a full fit where it is doubtful.
         """
         settings = self._settings
-        self._check(cloud)
+        self.check(cloud)
         if not settings.scene:
             (person,) = self._with_viewpoint(cloud, [cloud.whole])
             if not settings.track:
-                return [(ONLY_ID, self._fit(person, seed))], []
+                return [TrackedBody(ONLY_ID, self._fit(person, seed))], []
             return self._tracker.step_one(person, seed, executor), []
         known = self._tracker.predict_bodies(cloud.stamp) if settings.track else ()
         if self._is_one_sided(cloud, remember=True):
@@ -173,7 +179,7 @@ class SceneTracker:
             if not settings.track:
                 fits = {id(body.person): body.fit for body in found}
                 named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
-                return [(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
+                return [TrackedBody(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
             first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
             seen = [body.person for body in found]
             return self._tracker.step(seen, cloud.stamp, seed, executor, first), self._tracker.occluded_ids
@@ -181,10 +187,10 @@ class SceneTracker:
         if settings.track:
             return self._tracker.step(people, cloud.stamp, seed, executor), self._tracker.occluded_ids
         named = self._tracker.associate_only(people, cloud.stamp)
-        return [(identity, self._fit(person, seed)) for identity, person in named], []
+        return [TrackedBody(identity, self._fit(person, seed)) for identity, person in named], []
 
-    def fit_once(self, cloud: SceneCloud, seed: int, progress: Progress | None = None) -> list[tuple[str, BodyFit]]:
-        """Return (id, fit) of everybody in a cloud that belongs to no stream; ids count from b1.
+    def fit_once(self, cloud: SceneCloud, seed: int, progress: Progress | None = None) -> list[TrackedBody]:
+        """Return the bodies of everybody in a cloud that belongs to no stream; ids count from b1.
 
         Where nobody can be told from surroundings, a cloud of a person's size is the person.
         """
@@ -193,14 +199,17 @@ class SceneTracker:
             proven = self.fit_found(self.find_once(cloud), seed, progress)
             if not proven:
                 raise InputError(_NOBODY.format(len(cloud.points)))
-            return [(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
+            return [TrackedBody(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
         people = self._segment(cloud) if self._settings.scene else []
         if not people and (not self._settings.scene or extent <= MAX_HEIGHT_M):
             people = [cloud.whole]
         if not people:
             raise InputError(_NOBODY.format(len(cloud.points)))
         people = self._with_viewpoint(cloud, people, remember=False)
-        return [(f"b{number}", self._fit(person, seed, progress)) for number, person in enumerate(people, start=1)]
+        return [
+            TrackedBody(f"b{number}", self._fit(person, seed, progress))
+            for number, person in enumerate(people, start=1)
+        ]
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
         """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
@@ -266,7 +275,8 @@ class SceneTracker:
         )
         return [replace(person, stamp=cloud.stamp) for person in people]
 
-    def _check(self, cloud: SceneCloud) -> None:
+    def check(self, cloud: SceneCloud) -> None:
+        """Raise an InputError when a cloud has no point, or none in range."""
         if not len(cloud.points):
             raise InputError("the cloud has no finite point in the region of interest")
         distance, limit = np.linalg.norm(cloud.points, axis=1).min(), self._settings.segmentation.max_range

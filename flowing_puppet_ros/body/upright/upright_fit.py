@@ -16,7 +16,6 @@ from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.upright.upright_bank import (
     make_upright_bank,
-    measure_stature,
     stature_cost,
 )
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
@@ -98,7 +97,7 @@ class UprightFitter:
             body = self._fitter.gauss_newton.run(start[1], cloud, self._none, weights, terms)
             if many:
                 body = self._fitter.gauss_newton.run(body, cloud, self._none, MANY_POINTS, terms)
-            stature = measure_stature(self._fitter.model, body)
+            stature = self._fitter.model.measure_height(body.shape)
             cost = self._fitter.hypotheses.pose_bank.cost(body, coarse) + float(stature_cost(np.array(stature)))
             return cost, body, stature
 

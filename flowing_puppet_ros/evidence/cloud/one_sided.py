@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
 
+from flowing_puppet_ros.evidence.cloud.data_term import fill_nearest
+from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours
 from flowing_puppet_ros.evidence.cloud.sensor_field import NO_FIELD, FieldArrays, SensorField, is_unknown
 
 MAX_CELLS = 60_000  # of the grid of directions
@@ -69,18 +70,18 @@ class OneSidedView:
         """
         axes = _axes(points.mean(axis=0) - viewpoint)
         directions, depth = _project(points, viewpoint, axes)
-        tree = cKDTree(directions)
-        neighbours = min(SPACING_NEIGHBOUR + 1, len(points))
-        spacing = float(np.percentile(tree.query(directions, k=neighbours)[0][:, -1], SPACING_PERCENTILE))
+        near = find_neighbours(np.pad(directions, ((0, 0), (0, 1))), SPACING_NEIGHBOUR + 1)
+        apart = np.linalg.norm(directions[near] - directions[:, None], axis=2).max(axis=1)
+        spacing = float(np.percentile(apart, SPACING_PERCENTILE))
         low, high = directions.min(axis=0) - 4 * spacing, directions.max(axis=0) + 4 * spacing
         cell = max(spacing / 2, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
         shape = np.ceil((high - low) / cell).astype(np.int64) + 1
-        centres = np.stack(np.meshgrid(*(low[k] + cell * np.arange(shape[k]) for k in (0, 1)), indexing="ij"), axis=-1)
         if unknown is not None and len(unknown):
             directions = np.concatenate([directions, _project(unknown, viewpoint, axes)[0]])
             depth = np.concatenate([depth, np.full(len(unknown), -1.0)])
-            tree = cKDTree(directions)
-        nearest = tree.query(centres.reshape(-1, 2))[1].astype(np.int32).reshape(shape)
+        inside = np.flatnonzero(((directions >= low) & (directions <= high)).all(axis=1))
+        level = np.pad(directions[inside], ((0, 0), (0, 1)))
+        nearest = inside[fill_nearest(level, np.append(low, 0.0), cell, np.append(shape, 1))[:, :, 0]].astype(np.int32)
         tolerance = TOLERANCE_SPACINGS * spacing
         return cls(viewpoint, axes, directions, depth, tolerance, low, cell, np.ascontiguousarray(nearest), field)
 

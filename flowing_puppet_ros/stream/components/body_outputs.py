@@ -12,6 +12,8 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import I64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.fit.visibility import Visibility
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import Output, Port
@@ -28,9 +30,6 @@ from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import header_ns, make_transform
 from flowing_puppet_ros.stream.messages.message_types import BODIES, MESH, POINT_CLOUD, TRANSFORMS, MessageFactory
 from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_body
-
-BodyFits = Sequence[tuple[str, BodyFit]]
-"""(id, fit in the cloud's frame) for each body."""
 
 URDF_CHANGE_M = 0.02
 """Metres by which a joint must move in its parent link before a person's URDF is published again."""
@@ -81,17 +80,19 @@ class BodyOutputs:
         self._topology_sent = False
 
     def make(
-        self, header: Any, fits: BodyFits, hidden: Collection[str] = (), subscribed: Collection[str] = ()
+        self, header: Any, bodies: Sequence[TrackedBody], hidden: Collection[str] = (), subscribed: Collection[str] = ()
     ) -> Output:
-        """Return everything to publish for one cloud, whose stamp and frame are those of `header`.
+        """Return everything to publish for the `bodies` in one cloud, whose stamp and frame are those of `header`.
 
         `hidden` are the ids of people who are occluded: they have no body in this cloud but are not lost yet.
         `subscribed` are the lazy outputs that have subscribers.
         """
         factory = self._factory
-        alive = sorted({identity for identity, _ in fits} | set(hidden), key=id_sort_key)
-        bodies = [make_body(factory, identity, self._model, fit) for identity, fit in fits]
-        outputs: Output = [("bodies", make_bodies(factory, header, bodies))]
+        fits = [(body.id, body.fit) for body in bodies]
+        alive = sorted({body.id for body in bodies} | set(hidden), key=id_sort_key)
+        outputs: Output = [
+            ("bodies", make_bodies(factory, header, [make_body(factory, self._model, body) for body in bodies]))
+        ]
         if fits and not self._topology_sent:
             self._topology_sent = True
             outputs.append(("body_topology", make_topology(factory, self._model)))
@@ -106,7 +107,7 @@ class BodyOutputs:
             outputs.append(("/tf", factory.make(TRANSFORMS, transforms=frames)))
         return outputs + (self._make_ros4hri(header, fits, alive) if self.ros4hri.enabled else [])
 
-    def _make_mesh_markers(self, header: Any, fits: BodyFits, alive: Collection[str]) -> list[Any]:
+    def _make_mesh_markers(self, header: Any, fits: Sequence[tuple[str, BodyFit]], alive: Collection[str]) -> list[Any]:
         """Return deletions of lost people at once, and meshes of the others no more often than is set."""
         lost = [self._marker_ids.pop(identity) for identity in list(self._marker_ids) if identity not in alive]
         markers = make_deletions(self._factory, header, lost)
@@ -122,14 +123,15 @@ class BodyOutputs:
                 self._marker_count += 1
                 self._marker_ids[identity] = self._marker_count
             number = self._marker_ids[identity]
-            markers.append(make_mesh_marker(self._factory, header, number, self._preview_faces, fit.vertices))
+            inferred = fit.visibility.vertices == Visibility.INFERRED
+            markers.append(make_mesh_marker(self._factory, header, number, self._preview_faces, fit.vertices, inferred))
         return markers
 
     @cached_property
     def _preview_faces(self) -> I64:
         return preview_faces(self._model, self._settings.max_mesh_triangles)
 
-    def _make_vertex_cloud(self, header: Any, fits: BodyFits) -> Any:
+    def _make_vertex_cloud(self, header: Any, fits: Sequence[tuple[str, BodyFit]]) -> Any:
         """Return all vertices as an organised cloud: one row per body, in the order of `bodies`."""
         cloud = make_cloud(self._factory, header, np.vstack([fit.vertices for _, fit in fits]))
         cloud.height, cloud.width = len(fits), len(fits[0][1].vertices)
@@ -158,7 +160,7 @@ class BodyOutputs:
             for name, (position, orientation) in frames_in_body.items()
         ]
 
-    def _make_ros4hri(self, header: Any, fits: BodyFits, alive: Sequence[str]) -> Output:
+    def _make_ros4hri(self, header: Any, fits: Sequence[tuple[str, BodyFit]], alive: Sequence[str]) -> Output:
         messages: dict[str, dict[str, Any]] = {}
         self._urdf_origins = {
             identity: origins for identity, origins in self._urdf_origins.items() if identity in alive
