@@ -151,6 +151,8 @@ def build_graph(
         if fitter.resolve("bodies") in graph.find_outputs():  # by another cloud in the same namespace
             fitter.namespace = f"/{fitter.name.removesuffix('/body_fitter')}"
         graph.instances.append(fitter)
+    for instance in graph.instances:  # people have the ids that a node of this name and namespace would give them
+        instance.component.node = f"{instance.namespace}/{instance.name.rpartition('/')[2]}"
     return graph
 
 
