@@ -20,7 +20,7 @@ from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCloud
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
-from flowing_puppet_ros.body.track.tracked_body import BodyMotion, TrackedBody
+from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.reporting import Report
@@ -58,7 +58,7 @@ class _BodyTrack:
     stamp: int
     tracker: BodyTracker
     velocity: F64 = field(default_factory=lambda: np.zeros(3))
-    motion: BodyMotion = field(default_factory=BodyMotion)
+    motion: TorsoMotion = field(default_factory=TorsoMotion)
     fits: int = 0
     fitted: int = 0
     proven: bool = True

@@ -41,7 +41,7 @@ class TrackedBody:
         return replace(self, fit=turned, velocity=rotation @ self.velocity)
 
 
-class BodyMotion:
+class TorsoMotion:
     """The places of a person's torso in the last half second."""
 
     def __init__(self) -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, U8
+from flowing_puppet_ros.extras import import_extra
 from flowing_puppet_ros.multiview.camera import Camera
 
 AMBIENT, HEADLIGHT, SKYLIGHT = 0.35, 0.45, 0.25  # shares of the light
@@ -67,7 +68,7 @@ class RayCamera:
 
     def render(self, meshes: Sequence[PaintedMesh]) -> RenderedView:
         """Render `meshes`; the result only depends on them and the camera."""
-        import open3d as o3d
+        o3d = import_extra("open3d", "scans", "synthetic depth images")
 
         scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         for mesh in meshes:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 from flowing_puppet_ros.body.track.scene_tracker import ONLY_ID
-from flowing_puppet_ros.body.track.tracked_body import BodyMotion, TrackedBody
+from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitter, SilhouetteFitterSettings
 from flowing_puppet_ros.stream.components.body_outputs import id_sort_key
@@ -28,7 +28,7 @@ class SilhouetteBodies:
         """Prepare to fit `model`."""
         self._fitter = SilhouetteFitter(model, settings)
         self._last: dict[str, tuple[int, BodyState]] = {}
-        self._motions: dict[str, BodyMotion] = {}
+        self._motions: dict[str, TorsoMotion] = {}
         self._header: Any = None
         self._missing: set[str] = set()
         self._bodies: list[TrackedBody] = []
@@ -74,7 +74,7 @@ class SilhouetteBodies:
         fit = self._fitter.fit(decode_silhouettes(message), decode_body_joints(message.person), last_state)
         if fit.reliable:
             self._last[identity] = stamp, fit.state
-        return self._motions.setdefault(identity, BodyMotion()).add(identity, stamp, fit)
+        return self._motions.setdefault(identity, TorsoMotion()).add(identity, stamp, fit)
 
 
 def _find_id(message: Any) -> str:

@@ -10,7 +10,7 @@ import pytest
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
-from flowing_puppet_ros.body.track.tracked_body import BodyMotion, TrackStatus
+from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackStatus
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -29,7 +29,7 @@ def body_at(place: np.ndarray) -> BodyFit:
 
 def test_the_velocity_is_that_of_the_walk_in_spite_of_noise() -> None:
     rng = np.random.default_rng(0)
-    motion = BodyMotion()
+    motion = TorsoMotion()
     measured = []
     for k in range(30):
         noise = rng.normal(scale=0.01, size=3)
@@ -40,7 +40,7 @@ def test_the_velocity_is_that_of_the_walk_in_spite_of_noise() -> None:
 
 
 def test_a_turn_is_followed_within_half_a_second() -> None:
-    motion, place = BodyMotion(), np.zeros(3)
+    motion, place = TorsoMotion(), np.zeros(3)
     for k in range(20):
         velocity = SPEED if k < 10 else -SPEED
         place = place + 0.1 * velocity
@@ -50,7 +50,7 @@ def test_a_turn_is_followed_within_half_a_second() -> None:
 
 
 def test_the_first_body_is_new_and_so_is_the_first_of_a_new_recording() -> None:
-    motion, fit = BodyMotion(), body_at(np.zeros(3))
+    motion, fit = TorsoMotion(), body_at(np.zeros(3))
     assert motion.add("b1", 5, fit).status is TrackStatus.NEW
     assert motion.add("b1", 10, fit).status is TrackStatus.TRACKED
     assert motion.add("b1", 20, fit, hidden=True).status is TrackStatus.HIDDEN
@@ -60,7 +60,7 @@ def test_the_first_body_is_new_and_so_is_the_first_of_a_new_recording() -> None:
 
 
 def test_a_turned_frame_turns_body_and_velocity_alike() -> None:
-    motion = BodyMotion()
+    motion = TorsoMotion()
     motion.add("b1", 0, body_at(np.zeros(3)))
     found = motion.add("b1", INTERVAL_NS, body_at(0.1 * SPEED))
     turned = found.rotate(rotation.exp(np.array([0.0, 0.0, np.pi / 2])))
