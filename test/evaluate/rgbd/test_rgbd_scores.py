@@ -17,7 +17,6 @@ from flowing_puppet_ros.evaluate.rgbd.views import RgbdFrame, look_along, make_p
 from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
-
 PLACE, EYE = np.array([2.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.2])  # of the person's torso and of the depth camera
 
 
