@@ -21,6 +21,7 @@ from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, check_cloud
+from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.upright.upright_fit import FEW_POINTS, MIN_MANY_POINTS, UprightFitter, floor_term
@@ -219,7 +220,7 @@ class BodyTracker:
             vertices = self._fitter.model.vertices(self._predict(last, points.mean(axis=0), stamp))
             normals = estimate_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
         if on_floor and viewpoint is not None:
-            cloud: Cloud = self._upright.make_cloud(points, viewpoint, np.empty((0, 3)))
+            cloud: Cloud = self._upright.make_cloud(points, viewpoint, None, person.field)
         else:
             cloud = self._fitter.prepare_cloud(points, normals, viewpoint, person.field)
         pull = self._no_joints if targets is None else targets
@@ -337,7 +338,9 @@ class BodyTracker:
         # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
         facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint, cloud.field)
         body = self._fitter.gauss_newton.run(start, facing, prepared.targets, weights, terms)
-        return self._fitter.assess(body, cloud)
+        # A limb that left the view stays in its last pose: its motion would go on for ever.
+        last = start if self._state.last is None else self._state.last.fit.state
+        return self._fitter.assess(hang_unseen_parts(self._fitter.model, last, body, cloud), cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
         return fit.two_way_distance > self._settings.lost_ratio * self._state.best + self._settings.lost_distance
