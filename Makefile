@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # make venv   set everything up in .venv          make check  linter, type checker and the fast tests
 # make demo   sample bag -> replay -> report      make test   linter, type checker and all tests
+# make demo-rgbd  the same with colour and depth of drawn people, compared with the truth
 # make bench  speed as ratios, and live nodes     make lint   linter and type checker alone
 # make docs   the documentation site, into out/site
 # make coverage, make release-check, make figures, make config, make lock: see CONTRIBUTING.md
@@ -8,6 +9,7 @@
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
 SAMPLE := bags/cache/sample
+RGBD := bags/cache/rgbd
 # The two variables that the ROS wheels leave in their children would keep another environment's Python from starting.
 CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Tests in this many processes. They keep the order of the files, so that costly fixtures are seldom made twice, and
@@ -15,7 +17,7 @@ CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE
 WORKERS := 2
 PYTEST = $(CLEAN_ENV) -u PYTHONDONTWRITEBYTECODE $(PYTHON) -m pytest --numprocesses $(WORKERS) --dist worksteal
 
-.PHONY: venv demo sample-bag check test coverage lint bench docs figures config changelog lock release-check clean
+.PHONY: venv demo demo-rgbd sample-bag check test coverage lint bench docs figures config changelog lock release-check clean
 
 venv:
 	@python=$$(sh scripts/find_python.sh) && $(CLEAN_ENV) "$$python" -I scripts/make_venv.py
@@ -26,6 +28,12 @@ sample-bag: venv
 demo: sample-bag
 	@$(CLEAN_ENV) .venv/bin/flowing-puppet replay $(SAMPLE) --out out/demo.mcap --report out/report.html
 	@echo "The puppets and bodies are in out/demo.mcap (RViz, Foxglove); the report is out/report.html (any browser)."
+
+demo-rgbd: venv
+	@$(CLEAN_ENV) $(PYTHON) bags/make_rgbd_sample.py --out $(RGBD)
+	@$(CLEAN_ENV) .venv/bin/flowing-puppet replay $(RGBD) --out out/rgbd.mcap --report out/rgbd.html
+	@$(CLEAN_ENV) .venv/bin/flowing-puppet evaluate bag out/rgbd.mcap --input $(RGBD) --truth $(RGBD)/truth.json
+	@echo "The bodies are in out/rgbd.mcap (RViz, Foxglove); the report is out/rgbd.html (any browser)."
 
 lint: venv
 	@.venv/bin/ruff check .
