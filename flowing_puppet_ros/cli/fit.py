@@ -79,6 +79,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="find the people among floor, walls and furniture first (in metres if --unit is auto); results are"
         " <stem>-1 and so on, the likeliest person first",
     )
+    parser.add_argument(
+        "--camera-info",
+        metavar="FILE|FX,FY,CX,CY",
+        help="the input is a depth image (16-bit .png or .tif in --unit, mm if auto; or .npy) of this camera: a file"
+        " with the fields of a CameraInfo, or four numbers in pixels; all people in it are fitted, in metres",
+    )
+    parser.add_argument(
+        "--color",
+        type=Path,
+        metavar="IMAGE",
+        help="colour image of the same pixels as the depth image or organised cloud: keypoint networks find the people"
+        " in it; an organised .pcd with colours has its own",
+    )
     parser.add_argument("--rerun", type=Path, metavar="RRD", help="write the fits as a recording for the Rerun viewer")
     runner.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object per input on stdout")
@@ -96,6 +109,8 @@ def run(arguments: argparse.Namespace) -> int:
         view=arguments.view,
         viewpoint=arguments.viewpoint,
         scene=arguments.scene,
+        camera_info=_resolve_info(arguments),
+        color=None if arguments.color is None else runner.resolve_path(arguments.color, arguments),
         settings=settings.fitter,
         segmentation=settings.segmentation,
     )
@@ -121,6 +136,14 @@ def run(arguments: argparse.Namespace) -> int:
 
         write_fits(_fits(finished), arguments.rerun)
     return status
+
+
+def _resolve_info(arguments: argparse.Namespace) -> str | None:
+    """Return the numbers of --camera-info, or its file as other processes find it."""
+    given: str | None = arguments.camera_info
+    if given is None or given.count(",") == 3:
+        return given
+    return str(runner.resolve_path(Path(given), arguments))
 
 
 def _parse_viewpoint(text: str) -> tuple[float, float, float]:

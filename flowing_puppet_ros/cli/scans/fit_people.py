@@ -79,6 +79,8 @@ class FitOptions:
     scene: bool
     settings: FitterSettings
     segmentation: SegmentationSettings
+    camera_info: str | None = None
+    color: Path | None = None
 
 
 def list_scene_ups(options: FitOptions) -> list[np.ndarray]:
