@@ -166,7 +166,8 @@ def install_requirements(names: Iterable[str], environment: dict[str, str]) -> N
     command = [str(PYTHON), "-m", "pip", "install", "--disable-pip-version-check"]
     failure = "Installing the Python packages failed"
     run([*command, "-c", f"requirements/{LOCK}.txt", *files], environment, "packages", failure)
-    run([*command, "--no-deps", "-r", "requirements/learn-assets.txt"], environment, "packages", failure)
+    if not NOBLE:
+        run([*command, "--no-deps", "-r", "requirements/learn-assets.txt"], environment, "packages", failure)
 
 
 def fix_include_paths(environment: dict[str, str]) -> None:
