@@ -140,9 +140,11 @@ def decode_image(message: Any) -> U8:
     if conversion is None:
         # Kernels are compiled for writeable arrays, which all other conversions return.
         return np.array(pixels)
+    if channels == 2 and pixels.shape[1] % 2:  # two pixels share their colours; not every OpenCV minds
+        raise _not_whole(message)
     try:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
-    except cv2.error as error:  # packed formats need an even width, Bayer patterns two rows
+    except cv2.error as error:  # Bayer patterns need two rows
         raise _not_whole(message) from error
 
 
