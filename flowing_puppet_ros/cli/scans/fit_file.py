@@ -35,14 +35,14 @@ def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str
     `shown` draws a progress bar on stderr. PuppetError if the file cannot be used or shows no person.
     """
     started = time.perf_counter()
-    fitter = _make_fitter(options.model, options.settings)
-    _refuse_overwriting(source, options)
+    fitter = make_fitter(options.model, options.settings)
+    refuse_overwriting(source, options)
     scan = read_scan(source)
     seen = _find_one_sided(scan, fitter, options) if options.scene else []
     if seen:
         each = (time.perf_counter() - started) / len(seen)  # found together
         fits = [
-            _finish(f"{source.stem}-{number}", fitter.model, found, "single", (), each, options)
+            write_result(f"{source.stem}-{number}", fitter.model, found, "single", (), each, options)
             for number, found in enumerate(seen, start=1)
         ]
         return {"input": str(source), "people": fits}
@@ -65,12 +65,13 @@ def list_files(summary: dict[str, Any]) -> list[Path]:
 
 
 @lru_cache(maxsize=1)
-def _make_fitter(model: str, settings: FitterSettings) -> BodyFitter:
+def make_fitter(model: str, settings: FitterSettings) -> BodyFitter:
     """Make the fitter that all inputs of a process share."""
     return BodyFitter(StitchedPuppet.load(model), settings)
 
 
-def _refuse_overwriting(source: Path, options: FitOptions) -> None:
+def refuse_overwriting(source: Path, options: FitOptions) -> None:
+    """Raise InputError when a result would have the name of its input."""
     if not options.scene and source.suffix in (".npz", ".ply") and source.parent.resolve() == options.out.resolve():
         raise InputError(f"the fit of {source} would overwrite it; choose another folder for --out")
 
@@ -82,7 +83,7 @@ def _fit_person(
     if options.joints:
         found = fit_from_joints(person, dict(options.joints), fitter, options)
         view = "full" if person.sensor is None else "single"
-        return _finish(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
+        return write_result(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
     with tqdm(total=100, desc=stem, unit="%", file=sys.stderr, disable=not shown) as bar:
         found = fit_in_best_frame(
             fitter,
@@ -93,9 +94,9 @@ def _fit_person(
             sensor=person.sensor,
             progress=_progress_on(bar),
         )
-    _refuse_no_person(person, found)
+    refuse_no_person(person, found)
     view = "full" if person.sensor is None else "single"
-    return _finish(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
+    return write_result(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
 
 
 def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list[FrameFit]:
@@ -112,7 +113,7 @@ def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list
     return [FrameFit(frame, unit, fit, True, True, measure_stature(fitter.model, fit.joints)) for fit in fits]
 
 
-def _finish(
+def write_result(
     stem: str,
     model: StitchedPuppet,
     found: FrameFit,
@@ -156,7 +157,7 @@ def _measure(model: StitchedPuppet, found: FrameFit) -> dict[str, float]:
     return {name: value * shrink ** DEFINITIONS[name].dimension for name, value in measured.items()}
 
 
-def _refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
+def refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
     """Raise InputError when a cloud has no person's size and, scaled to one, no person's shape."""
     guessed = found.unit.name == GUESS and len(person.units) > 1
     if guessed and not found.fit.reliable and not has_size_of_person(person.points):
