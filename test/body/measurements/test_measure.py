@@ -99,7 +99,7 @@ def measure_anew(vertices: np.ndarray, faces: np.ndarray) -> dict[str, float]:
 
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(tensor(np.float32(vertices)), tensor(np.uint32(faces)))
+    scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
     draws = np.random.default_rng(0).uniform(low, high, (400_000, 3)).astype(np.float32)
     inside = float(scene.compute_occupancy(tensor(draws)).numpy().mean())
     return {
