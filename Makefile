@@ -15,7 +15,7 @@ CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE
 WORKERS := 2
 PYTEST = $(CLEAN_ENV) -u PYTHONDONTWRITEBYTECODE $(PYTHON) -m pytest --numprocesses $(WORKERS) --dist worksteal
 
-.PHONY: venv demo sample-bag check test coverage lint bench docs figures config lock release-check clean
+.PHONY: venv demo sample-bag check test coverage lint bench docs figures config changelog lock release-check clean
 
 venv:
 	@python=$$(sh scripts/find_python.sh) && $(CLEAN_ENV) "$$python" -I scripts/make_venv.py
@@ -59,6 +59,9 @@ bench: venv
 
 config: venv
 	@$(PYTHON) scripts/write_config.py
+
+changelog:
+	@$(PYTHON) scripts/write_changelog.py
 
 lock: venv
 	@$(PYTHON) scripts/lock.py

@@ -14,7 +14,8 @@ HEADER = """# SPDX-License-Identifier: Apache-2.0
 
 def main() -> None:
     """Write down what pip would install into an empty environment."""
-    names = ("runtime", "annotate", "learn", "cluster", "neural", "video", "dev", "docs", "build", "ros")
+    extras = ("annotate", "cluster", "learn", "neural", "report", "scans", "video")
+    names = ("runtime", *extras, "dev", "docs", "build", "ros")
     lists = [part for name in names for part in ("-r", str(FOLDER / f"{name}.txt"))]
     command = [sys.executable, "-m", "pip", "install", "--dry-run", "--quiet", "--ignore-installed", "--report", "-"]
     report = json.loads(subprocess.run([*command, *lists], check=True, capture_output=True, text=True).stdout)

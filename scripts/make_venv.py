@@ -228,7 +228,8 @@ def install_networks(environment: dict[str, str]) -> None:
 
 def make_steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]:
     """Return the steps in order."""
-    names = ("runtime", "annotate", "neural", "video", "learn", "dev", "docs", "build", *(() if ros else ("ros",)))
+    extras = ("annotate", "learn", "neural", "report", "scans", "video")
+    names = ("runtime", *extras, "dev", "docs", "build", *(() if ros else ("ros",)))
     lists = [ROOT / "requirements" / f"{name}.txt" for name in (*names, "learn-assets", "lock")]
     package = [ROOT / name for name in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "launch", "config")]
     libraries = ROOT / "scripts" / "interface_libraries.py"

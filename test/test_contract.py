@@ -20,11 +20,22 @@ PACKAGE = Path(flowing_puppet_ros.__file__).parent
 ROOT = PACKAGE.parent
 NAME = PACKAGE.name
 MODULES = sorted(path for path in PACKAGE.rglob("*.py"))
-ROS_PACKAGES = {"rclpy", "launch", "launch_ros", "rcl_interfaces", "builtin_interfaces", "std_srvs"}
-FOUNDATION = {"arrays", "errors", "ids", "images", "reporting", "settings", "threads", "units"}
+ROS_PACKAGES = {
+    "ament_index_python",
+    "rclpy",
+    "launch",
+    "launch_ros",
+    "rcl_interfaces",
+    "builtin_interfaces",
+    "std_srvs",
+}
+FOUNDATION = {
+    "arrays", "errors", "extras", "ids", "images", "kernel_cache", "reporting", "settings", "threads", "units",
+}  # fmt: skip
 """Modules beside the rooms, which everything may import."""
 OPTIONAL_PACKAGES = {
-    "ai_edge_litert", "anny", "av", "body_models", "dask", "distributed", "flask", "rerun", "waitress", "werkzeug",
+    "ai_edge_litert", "anny", "av", "body_models", "dask", "distributed", "flask", "matplotlib", "open3d", "rerun",
+    "waitress", "werkzeug",
 }  # fmt: skip
 ONLY_WITH_EXTRA = "flowing_puppet_ros.annotate.server"
 """Nothing but an extra's own module imports what the extra brings at its top."""
@@ -36,6 +47,8 @@ OPTIONAL = {
     "image.networks.runtime": "neural",
     "report.rerun_file": "rerun",
     "bag.foreign.video": "video",
+    "evaluate.output": "report",
+    "body.scans.scan": "scans",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10
@@ -188,7 +201,7 @@ def test_third_party_imports_are_required() -> None:
 def test_locked_versions_cover_the_requirements() -> None:
     folder = ROOT / "requirements"
     locked = {line.split("==")[0] for line in (folder / "lock.txt").read_text().splitlines()}
-    for name in ("runtime", "annotate", "learn", "cluster", "dev", "docs", "build", "ros"):
+    for name in ("runtime", *(set(OPTIONAL.values()) - {"rerun"}), "dev", "docs", "build", "ros"):
         for line in (folder / f"{name}.txt").read_text().splitlines():
             if not line.startswith("#"):
                 assert re.split(r"[=<>\[]", line)[0].lower().replace("_", "-") in {

@@ -24,6 +24,8 @@ VERBS = {
     "replay": "run the nodes' algorithms over a bag, losslessly and reproducibly",
     "report": "make the HTML report of a replayed bag",
     "doctor": "say what can be computed from an input or on this machine, and what to run",
+    "import": "write the videos and the calibration of several cameras into a bag",
+    "calibrate": "refine the calibration and the clocks of several cameras by the people in a bag",
     "export": "write fitted bodies as GLB, BVH, TRC, OBJ or JSON",
     "networks": "list, check and install the keypoint networks",
     "annotate": "pose puppets on images in the browser",
@@ -38,13 +40,16 @@ _INPUT_ARGUMENTS = ("inputs", "input", "images")
 """Names of the arguments of verbs that are inputs."""
 VERB_PACKAGES = ("doctor", "evaluate", "export", "sample")
 """Verbs in folders of their own."""
+_MODULES = {"import": "cameras.import_folder", "calibrate": "cameras.calibrate_bag"}
+"""Verbs whose module is elsewhere."""
 
 
 def import_verb(verb: str) -> ModuleType:
     """Import the module of a verb; InputError if it is not installed."""
     if verb == "bench":
         return _import_benchmarks()
-    return import_module(f"{__name__}.{verb}.verb" if verb in VERB_PACKAGES else f"{__name__}.{verb}")
+    module = f"{verb}.verb" if verb in VERB_PACKAGES else _MODULES.get(verb, verb)
+    return import_module(f"{__name__}.{module}")
 
 
 def _import_benchmarks() -> ModuleType:

@@ -88,6 +88,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the inputs are scans of one person over time, in this order: one shape for all; --joints start the first",
     )
     parser.add_argument(
+        "--camera-info",
+        metavar="FILE|FX,FY,CX,CY",
+        help="the input is a depth image (16-bit .png or .tif in --unit, mm if auto; or .npy) of this camera: a file"
+        " with the fields of a CameraInfo, or four numbers in pixels; all people in it are fitted, in metres",
+    )
+    parser.add_argument(
+        "--color",
+        type=Path,
+        metavar="IMAGE",
+        help="colour image of the same pixels as the depth image or organised cloud: keypoint networks find the people"
+        " in it; an organised .pcd with colours has its own",
+    )
+    parser.add_argument(
         "--joints",
         type=Path,
         metavar="JSON",
@@ -116,6 +129,8 @@ def run(arguments: argparse.Namespace) -> int:
         view=arguments.view,
         viewpoint=arguments.viewpoint,
         scene=arguments.scene,
+        camera_info=_resolve_info(arguments),
+        color=None if arguments.color is None else runner.resolve_path(arguments.color, arguments),
         settings=settings.fitter,
         segmentation=settings.segmentation,
         measure=arguments.measure,
@@ -151,6 +166,14 @@ def run(arguments: argparse.Namespace) -> int:
 
         write_fits(_fits(finished), arguments.rerun)
     return status
+
+
+def _resolve_info(arguments: argparse.Namespace) -> str | None:
+    """Return the numbers of --camera-info, or its file as other processes find it."""
+    given: str | None = arguments.camera_info
+    if given is None or given.count(",") == 3:
+        return given
+    return str(runner.resolve_path(Path(given), arguments))
 
 
 def _parse_viewpoint(text: str) -> tuple[float, float, float]:

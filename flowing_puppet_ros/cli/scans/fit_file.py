@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_fra
 from flowing_puppet_ros.body.measurements.measure import DEFINITIONS, measure_fit
 from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
 from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit, has_size_of_person
+from flowing_puppet_ros.cli.scans.fit_depth import fit_view, read_view
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson, find_people, list_scene_ups
 from flowing_puppet_ros.cli.scans.fit_scene import fit_one_sided_scene
 from flowing_puppet_ros.cli.scans.given_joints import fit_from_joints
@@ -37,15 +38,14 @@ def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str
     started = time.perf_counter()
     fitter = make_fitter(options.model, options.settings)
     refuse_overwriting(source, options)
+    view = read_view(source, options)
+    if view is not None:
+        bodies, notes = fit_view(view, source, fitter, options)
+        return {"input": str(source), "people": _finish_all(source, bodies, notes, fitter, options, started)}
     scan = read_scan(source)
     seen = _find_one_sided(scan, fitter, options) if options.scene else []
     if seen:
-        each = (time.perf_counter() - started) / len(seen)  # found together
-        fits = [
-            write_result(f"{source.stem}-{number}", fitter.model, found, "single", (), each, options)
-            for number, found in enumerate(seen, start=1)
-        ]
-        return {"input": str(source), "people": fits}
+        return {"input": str(source), "people": _finish_all(source, seen, (), fitter, options, started)}
     people = find_people(scan, source, fitter, options)
     if options.joints and len(people) > 1:
         raise InputError(f"{source} shows {len(people)} people and --joints are those of one; cut out one person")
@@ -72,7 +72,12 @@ def make_fitter(model: str, settings: FitterSettings) -> BodyFitter:
 
 def refuse_overwriting(source: Path, options: FitOptions) -> None:
     """Raise InputError when a result would have the name of its input."""
-    if not options.scene and source.suffix in (".npz", ".ply") and source.parent.resolve() == options.out.resolve():
+    if (
+        not options.scene
+        and options.camera_info is None
+        and source.suffix in (".npz", ".ply")
+        and source.parent.resolve() == options.out.resolve()
+    ):
         raise InputError(f"the fit of {source} would overwrite it; choose another folder for --out")
 
 
@@ -148,6 +153,22 @@ def write_result(
         **({"measurements": measured} if measured else {}),
         "seconds": seconds,
     }
+
+
+def _finish_all(
+    source: Path,
+    seen: Sequence[FrameFit],
+    notes: tuple[str, ...],
+    fitter: BodyFitter,
+    options: FitOptions,
+    started: float,
+) -> list[dict[str, Any]]:
+    """Write the fits of people who were found together from one side, and return their summaries."""
+    each = (time.perf_counter() - started) / len(seen)
+    return [
+        write_result(f"{source.stem}-{number}", fitter.model, found, "single", notes, each, options)
+        for number, found in enumerate(seen, start=1)
+    ]
 
 
 def _measure(model: StitchedPuppet, found: FrameFit) -> dict[str, float]:
