@@ -26,6 +26,7 @@ from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.cli.scans.fit_file import fit_file, list_files
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions
+from flowing_puppet_ros.cli.scans.fit_sequence import fit_sequence
 from flowing_puppet_ros.cli.scans.given_joints import read_joints
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.settings import Settings, make_out_folder, nested
@@ -82,6 +83,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " <stem>-1 and so on, the likeliest person first",
     )
     parser.add_argument(
+        "--sequence",
+        action="store_true",
+        help="the inputs are scans of one person over time, in this order: one shape for all; --joints start the first",
+    )
+    parser.add_argument(
         "--camera-info",
         metavar="FILE|FX,FY,CX,CY",
         help="the input is a depth image (16-bit .png or .tif in --unit, mm if auto; or .npy) of this camera: a file"
@@ -133,7 +139,9 @@ def run(arguments: argparse.Namespace) -> int:
     sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in _find_scans(given)]
     several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
     finished: list[dict[str, Any]] = []
-    if arguments.joints is not None and (several or arguments.scene):
+    if arguments.sequence and (arguments.scene or arguments.scheduler is not None):
+        raise InputError("--sequence fits one person in scans one after another; leave --scene and --scheduler")
+    if arguments.joints is not None and (arguments.scene or (several and not arguments.sequence)):
         raise InputError("--joints are those of the person in one scan; give one INPUT, and leave --scene")
     if arguments.rerun is not None:
         from flowing_puppet_ros.report.rerun_file import import_rerun
@@ -145,7 +153,11 @@ def run(arguments: argparse.Namespace) -> int:
         finished.extend([] if "error" in summary else [summary])
 
     verb = runner.Verb("fit", fit_file, list_files, tell)
-    if several:
+    if arguments.sequence:
+        make_out_folder(options.out)
+        fit_sequence(sources, options, tell)
+        status = 0
+    elif several:
         status = runner.run_batch(verb, sources, options, arguments.out, arguments)
     else:
         status = _one(verb, sources[0], options)

@@ -36,8 +36,8 @@ def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str
     `shown` draws a progress bar on stderr. PuppetError if the file cannot be used or shows no person.
     """
     started = time.perf_counter()
-    fitter = _make_fitter(options.model, options.settings)
-    _refuse_overwriting(source, options)
+    fitter = make_fitter(options.model, options.settings)
+    refuse_overwriting(source, options)
     view = read_view(source, options)
     if view is not None:
         bodies, notes = fit_view(view, source, fitter, options)
@@ -65,12 +65,13 @@ def list_files(summary: dict[str, Any]) -> list[Path]:
 
 
 @lru_cache(maxsize=1)
-def _make_fitter(model: str, settings: FitterSettings) -> BodyFitter:
+def make_fitter(model: str, settings: FitterSettings) -> BodyFitter:
     """Make the fitter that all inputs of a process share."""
     return BodyFitter(StitchedPuppet.load(model), settings)
 
 
-def _refuse_overwriting(source: Path, options: FitOptions) -> None:
+def refuse_overwriting(source: Path, options: FitOptions) -> None:
+    """Raise InputError when a result would have the name of its input."""
     if (
         not options.scene
         and options.camera_info is None
@@ -87,7 +88,7 @@ def _fit_person(
     if options.joints:
         found = fit_from_joints(person, dict(options.joints), fitter, options)
         view = "full" if person.sensor is None else "single"
-        return _finish(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
+        return write_result(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
     with tqdm(total=100, desc=stem, unit="%", file=sys.stderr, disable=not shown) as bar:
         found = fit_in_best_frame(
             fitter,
@@ -98,9 +99,9 @@ def _fit_person(
             sensor=person.sensor,
             progress=_progress_on(bar),
         )
-    _refuse_no_person(person, found)
+    refuse_no_person(person, found)
     view = "full" if person.sensor is None else "single"
-    return _finish(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
+    return write_result(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
 
 
 def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list[FrameFit]:
@@ -117,7 +118,7 @@ def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list
     return [FrameFit(frame, unit, fit, True, True, measure_stature(fitter.model, fit.joints)) for fit in fits]
 
 
-def _finish(
+def write_result(
     stem: str,
     model: StitchedPuppet,
     found: FrameFit,
@@ -165,7 +166,7 @@ def _finish_all(
     """Write the fits of people who were found together from one side, and return their summaries."""
     each = (time.perf_counter() - started) / len(seen)
     return [
-        _finish(f"{source.stem}-{number}", fitter.model, found, "single", notes, each, options)
+        write_result(f"{source.stem}-{number}", fitter.model, found, "single", notes, each, options)
         for number, found in enumerate(seen, start=1)
     ]
 
@@ -177,7 +178,7 @@ def _measure(model: StitchedPuppet, found: FrameFit) -> dict[str, float]:
     return {name: value * shrink ** DEFINITIONS[name].dimension for name, value in measured.items()}
 
 
-def _refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
+def refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
     """Raise InputError when a cloud has no person's size and, scaled to one, no person's shape."""
     guessed = found.unit.name == GUESS and len(person.units) > 1
     if guessed and not found.fit.reliable and not has_size_of_person(person.points):

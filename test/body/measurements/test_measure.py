@@ -62,9 +62,13 @@ def people() -> tuple[np.ndarray, list[tuple[np.ndarray, dict[str, np.ndarray]]]
     return anny.triangles, [(rest.vertices, anny.locate_landmarks(rest.vertices, rest.joints)) for rest in rests]
 
 
+def tensor(values: np.ndarray) -> o3d.core.Tensor:
+    return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values))
+
+
 def cut(mesh: o3d.t.geometry.TriangleMesh, level: float) -> list[float]:
     """Return the lengths of tapes around the loops that another library cuts, the longest first."""
-    lines = mesh.slice_plane([0, 0, level], [0, 0, 1], [0.0])
+    lines = mesh.slice_plane(tensor(np.array([0.0, 0.0, level])), tensor(np.array([0.0, 0.0, 1.0])), [0.0])
     points, pairs = lines.point.positions.numpy()[:, :2], lines.line.indices.numpy()
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points), len(points)))
     label = connected_components(graph, directed=False)[1]
@@ -79,7 +83,7 @@ def cut(mesh: o3d.t.geometry.TriangleMesh, level: float) -> list[float]:
 
 def measure_anew(vertices: np.ndarray, faces: np.ndarray) -> dict[str, float]:
     """Measure by the definitions, without anything of the package."""
-    mesh = o3d.t.geometry.TriangleMesh(o3d.core.Tensor(vertices), o3d.core.Tensor(faces.astype(np.int64)))
+    mesh = o3d.t.geometry.TriangleMesh(tensor(vertices), tensor(faces.astype(np.int64)))
     soles, top = vertices[:, 2].min(), vertices[:, 2].max()
     stature = top - soles
     levels = np.arange(soles + 0.36 * stature, soles + 0.80 * stature, LEVEL_STEP_M)
@@ -95,9 +99,9 @@ def measure_anew(vertices: np.ndarray, faces: np.ndarray) -> dict[str, float]:
 
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     scene = o3d.t.geometry.RaycastingScene()
-    scene.add_triangles(o3d.core.Tensor(np.float32(vertices)), o3d.core.Tensor(np.uint32(faces)))
+    scene.add_triangles(tensor(vertices.astype(np.float32)), tensor(faces.astype(np.uint32)))
     draws = np.random.default_rng(0).uniform(low, high, (400_000, 3)).astype(np.float32)
-    inside = float(scene.compute_occupancy(o3d.core.Tensor(draws)).numpy().mean())
+    inside = float(scene.compute_occupancy(tensor(draws)).numpy().mean())
     return {
         "stature": stature,
         "inseam": crotch - soles,
