@@ -29,7 +29,9 @@ ROS_PACKAGES = {
     "builtin_interfaces",
     "std_srvs",
 }
-FOUNDATION = {"arrays", "errors", "extras", "ids", "images", "reporting", "settings", "threads", "units"}
+FOUNDATION = {
+    "arrays", "errors", "extras", "ids", "images", "kernel_cache", "reporting", "settings", "threads", "units",
+}  # fmt: skip
 """Modules beside the rooms, which everything may import."""
 OPTIONAL_PACKAGES = {
     "ai_edge_litert", "anny", "av", "body_models", "dask", "distributed", "flask", "matplotlib", "open3d", "rerun",

@@ -67,7 +67,7 @@ class GraphRun:
     """The components of a graph at work in a pipeline, and the writer behind them.
 
     `warnings` has what components and messages gave reason to say, in the order of the steps; it is complete when the
-    pipeline is done.
+    pipeline is done. So is `writing_seconds`, the time in which messages were compressed and written.
     """
 
     def __init__(
@@ -75,6 +75,7 @@ class GraphRun:
     ) -> None:
         """Find which instance takes outputs of which."""
         self.warnings: list[str] = []
+        self.writing_seconds = 0.0
         self._routes, self._pipeline, self._writer, self._factory = routes, pipeline, writer, factory
         self._sources: dict[Instance, set[Instance]] = {instance: set() for instance in graph.instances}
         for instance in graph.instances:
@@ -130,6 +131,7 @@ class GraphRun:
                 progress.waiting[receiver].append(((*here, index), Call(receiver, port, message)))
 
     def _write_step(self, step: Step, progress: _Progress) -> None:
+        begin = time.perf_counter()
         if step.copied is not None:
             topic, raw = step.copied
             self._writer.write_raw(topic, step.log_time, raw)
@@ -137,6 +139,7 @@ class GraphRun:
         for _, instance, name, message in sorted(progress.made, key=lambda item: item[0]):
             self._write(step.log_time, instance, name, message)
         self.warnings += [sentence for _, sentence in sorted(progress.said, key=lambda item: item[0])]
+        self.writing_seconds += time.perf_counter() - begin
 
     def _write(self, log_time: int, instance: Instance, name: str, message: Any) -> None:
         topic, port = instance.resolve(name), instance.component.find_output(name)

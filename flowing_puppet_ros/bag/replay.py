@@ -21,7 +21,6 @@ from flowing_puppet_ros.bag.foreign.static_frames import find_static_transforms
 from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Graph, Instance, build_graph, find_info_topics
 from flowing_puppet_ros.bag.graph_run import Call, GraphRun, Step
 from flowing_puppet_ros.bag.reader import Record, RecordingLike, open_bag
-from flowing_puppet_ros.bag.stuck_stamps import StuckStamps
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.unused import count_used, explain_unused
 from flowing_puppet_ros.bag.writer import BagWriter
@@ -40,6 +39,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
     TRANSFORMS,
 )
 from flowing_puppet_ros.stream.pipeline import Pipeline
+from flowing_puppet_ros.stream.stuck_stamps import StuckStamps
 from flowing_puppet_ros.threads import MAX_THREADS, one_blas_thread, one_opencv_thread, usable_threads
 
 STATIC_TRANSFORMS = "/tf_static"
@@ -126,6 +126,7 @@ class _Replay:
         self._factory = BagMessageFactory()
         self.warnings: list[str] = list(bag.notes)
         self._stuck = StuckStamps()
+        self._writing_seconds = 0.0
         topics = {self._new_name[name]: kind for name, kind in bag.topics.items()}
         unknown = sorted(set(options.topic_map) - set(bag.topics))
         if unknown:
@@ -258,6 +259,7 @@ class _Replay:
                 bar.update()
             run.flush(log_time)
         self.warnings += run.warnings
+        self._writing_seconds = run.writing_seconds
 
     def _select_time_span(self, records: Iterator[Record]) -> Iterator[Record]:
         """Yield the records of the selected time span; InputError if there are none."""
@@ -343,6 +345,7 @@ class _Replay:
     def summarise(self, source: Path, target: Path, seconds: float, counts: Mapping[str, int]) -> dict[str, Any]:
         """Return the summary of the replay, ready for JSON."""
         instances = self._graph.instances
+        spent_seconds = {instance.name: instance.seconds for instance in instances} | {"writing": self._writing_seconds}
         frames = sum(instance.component.counters["images"] for instance in instances)
         return {
             "input": str(source),
@@ -351,7 +354,7 @@ class _Replay:
             "bodies": sum(instance.component.counters["bodies"] for instance in instances),
             "seconds": round(seconds, 2),
             "frames_per_second": round(frames / seconds, 2),
-            "seconds_of": {instance.name: round(instance.seconds, 2) for instance in instances},
+            "seconds_of": {name: round(spent, 2) for name, spent in spent_seconds.items()},
             "messages": dict(counts),
             **({} if count_used(instances) else {"unused": explain_unused(self._graph, self._recorded, self.warnings)}),
             **self.describe(),

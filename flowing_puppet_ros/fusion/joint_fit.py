@@ -91,21 +91,15 @@ class JointFitter:
         """Fit a body to the person's points, from `start` and with the sides exchanged, whichever is better."""
         coarse = CoarseCloud.of(cloud)
         targets = self.make_targets(joints)
-        found = []
-        for body, pull in ((start, targets), (self.start(swap_lifted(self.model, joints)), self._swap(targets))):
-            fit = self.fitter.assess(self.refine(cloud, body, pull), cloud)
-            cost = self.fitter.hypotheses.pose_bank.cost(fit.state, coarse) * (2 - fit.confidence)
-            found.append((cost, fit))
-        (cost, fit), (swapped_cost, swapped) = found
-        return swapped if swapped_cost < MAX_SWAP_RATIO * cost else fit
-
-    def refine(self, cloud: SingleViewCloud, start: BodyState, pull: JointTargets) -> BodyState:
-        """Return a body after the steps with joints and those without."""
-        terms = [cloud.free_space_term]
         unknown = measure_unknown_share(self.model, start, cloud)
-        body = self.fitter.gauss_newton.run(start, cloud, pull, strengthen_priors(PULLED, unknown), terms)
-        free = strengthen_priors(FREE, unknown)
-        return self.fitter.gauss_newton.run(body, cloud, JointTargets.none(self.model), free, terms)
+        pulled, free = strengthen_priors(PULLED, unknown), strengthen_priors(FREE, unknown)
+        terms, run = [cloud.free_space_term], self.fitter.gauss_newton.run
+        tried = []
+        for body, pull in ((start, targets), (self.start(swap_lifted(self.model, joints)), self._swap(targets))):
+            found = run(body, cloud, pull, pulled, terms)
+            tried.append((self.fitter.hypotheses.pose_bank.cost(found, coarse), found))
+        _, body = tried[tried[1][0] < MAX_SWAP_RATIO * tried[0][0]]
+        return self.fitter.assess(run(body, cloud, JointTargets.none(self.model), free, terms), cloud)
 
     def _swap(self, targets: JointTargets) -> JointTargets:
         other = list(find_other_sides(self.model.joint_names))

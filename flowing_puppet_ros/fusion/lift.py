@@ -40,7 +40,7 @@ MAX_TRUNK_DEPTH_M, MAX_LIMB_DEPTH_M = 0.45, 0.8
 """From the trunk's depth, within which the joints of trunk and limbs are."""
 
 
-_MIDDLE = ("neck", "belly")
+_MIDDLE, _ARM = ("neck", "belly"), ("elbow", "wrist", "hand")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,10 +101,11 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
 def _find_broken(
     model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray, surface: F64
 ) -> Bools:
-    """Return the joints (J,) on the way to which the surface along the limb falls back to something behind it.
+    """Return the joints (J,) on the way to which the surface along the limb breaks off.
 
     Along a limb that is seen the surface goes on. Where it falls back, the pixel has missed the limb, and what is seen
-    there is a neighbour or a wall. It may come nearer, as a hand does that points at the camera.
+    there is a neighbour or a wall. Where it jumps forward, something else stands before the limb, unless it is an arm:
+    a hand that points at the camera is much nearer than the elbow beside it.
     """
     broken = np.zeros(len(model.joint_names), dtype=bool)
     if not len(rows):
@@ -125,7 +126,8 @@ def _find_broken(
         near, index = tree.query(path, k=PATH_POINTS, distance_upper_bound=radius)
         found = np.isfinite(near).all(axis=1)
         along = np.median(depth[index[found]], axis=1)
-        broken[joint] = bool(len(along) > 1 and np.diff(along).max() > MAX_JUMP_M)
+        jumps = np.diff(along)
+        broken[joint] = bool((jumps > MAX_JUMP_M).any() or (kind not in _ARM and (jumps < -MAX_JUMP_M).any()))
     return broken
 
 

@@ -44,7 +44,7 @@ class FusionSettings(Settings):
         0.3, "confidence from which on a body that is not reliable is published", low=0.0, high=1.0, advanced=True
     )
     max_lag: float = setting(
-        0.35, "time between a cloud and the nearest puppets up to which they belong together", unit="s", low=0.0, high=5.0
+        0.35, "time from a cloud to the nearest puppets up to which they belong together", unit="s", low=0.0, high=5.0
     )  # fmt: skip
     wait: int = setting(
         3, "clouds to wait for late puppets before one is used without them", low=0, high=50, advanced=True

@@ -44,7 +44,7 @@ class PuppetJoints:
 
     def swap_sides(self, model: StitchedPuppet) -> PuppetJoints:
         """Return the puppet with left called right."""
-        other = find_other_sides(model.joint_names)
+        other = list(find_other_sides(model.joint_names))
         return replace(self, pixels=self.pixels[other], confidence=self.confidence[other], hidden=self.hidden[other])
 
 

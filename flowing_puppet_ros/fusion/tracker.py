@@ -22,7 +22,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
-from flowing_puppet_ros.body.track.tracked_body import BodyMotion, TrackedBody
+from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.fusion.people_fitter import Claim, PeopleFitter, make_person
@@ -47,7 +47,7 @@ class _PuppetTrack:
     stamp: int
     fitted: int = 0
     proven: bool = False
-    motion: BodyMotion = field(default_factory=BodyMotion)
+    motion: TorsoMotion = field(default_factory=TorsoMotion)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

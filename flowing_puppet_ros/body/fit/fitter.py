@@ -116,7 +116,7 @@ class BodyFitter:
             seed: overrides the settings' seed.
             progress: called with the fraction done, 0 to 1.
             nonrigid: refine the vertices beyond the model where a whole cloud is dense.
-            quick: without initial joints, try a small search first, whose limbs may be wrong.
+            quick: without initial joints, take a close body as it is, whose limbs may be wrong.
 
         Raises:
             InputError: when the cloud cannot be the surface of a person or the initial joints place no body.
@@ -253,7 +253,7 @@ class BodyFitter:
             state,
             vertices,
             self.model.joints(vertices),
-            self.hypotheses.particle_search.energy(state, ExactCloud(cloud.points, cloud.normals, cloud.nearest)),
+            self.hypotheses.energy.measure(state, ExactCloud(cloud.points, cloud.normals, cloud.nearest)),
             quality.part_confidence,
             quality.confidence,
             quality.reliable,

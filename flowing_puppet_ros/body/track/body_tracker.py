@@ -21,6 +21,7 @@ from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, check_cloud
+from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.upright.upright_fit import FEW_POINTS, MIN_MANY_POINTS, UprightFitter, floor_term
@@ -32,6 +33,7 @@ from flowing_puppet_ros.threads import one_blas_thread
 # First and last kernel width in metres: of a usual step, and of a step from which a lost body may come back.
 NARROW_WIDTHS_M, WIDE_WIDTHS_M = (0.10, 0.03), (0.25, 0.03)
 WIDE_STEPS = 20
+ALTERNATE = 2  # a step matches every second vertex and cloud point, the next one the others
 SHAPE_WEIGHT_PER_FRAME = 1e-6  # that each frame adds to `RefineWeights.shape` for the shape of the frames before
 MAX_SHAPE_FRAMES = 30  # that count for the shape: with more, a first mistake would stay
 MIN_VISIBLE = 0.4  # visible fraction, relative to normal, below which the person counts as occluded ...
@@ -219,7 +221,7 @@ class BodyTracker:
             vertices = self._fitter.model.vertices(self._predict(last, points.mean(axis=0), stamp))
             normals = estimate_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
         if on_floor and viewpoint is not None:
-            cloud: Cloud = self._upright.make_cloud(points, viewpoint, np.empty((0, 3)))
+            cloud: Cloud = self._upright.make_cloud(points, viewpoint, None, person.field)
         else:
             cloud = self._fitter.prepare_cloud(points, normals, viewpoint, person.field)
         pull = self._no_joints if targets is None else targets
@@ -327,7 +329,7 @@ class BodyTracker:
 
     def _refine(self, start: BodyState, prepared: _Prepared, widths: tuple[float, float], steps: int) -> BodyFit:
         cloud, floor = prepared.cloud, prepared.floor
-        weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps)
+        weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps, alternate=ALTERNATE)
         terms: list[SurfaceTerm] = []
         if floor is not None:
             weights = replace(FEW_POINTS, sigma_start=widths[0], iterations=steps)
@@ -337,7 +339,9 @@ class BodyTracker:
         # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
         facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint, cloud.field)
         body = self._fitter.gauss_newton.run(start, facing, prepared.targets, weights, terms)
-        return self._fitter.assess(body, cloud)
+        # A limb that left the view stays in its last pose: its motion would go on for ever.
+        last = start if self._state.last is None else self._state.last.fit.state
+        return self._fitter.assess(hang_unseen_parts(self._fitter.model, last, body, cloud), cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
         return fit.two_way_distance > self._settings.lost_ratio * self._state.best + self._settings.lost_distance

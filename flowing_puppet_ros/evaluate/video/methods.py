@@ -149,9 +149,9 @@ def _zero_flow(run: ClipRun, frame: VideoFrame) -> FlowPair:
 
 
 def _track_live(run: ClipRun) -> ClipTrack:
-    return _locate(track_live(
-            run.clip(), run.model, run.settings, worker=run.worker, networks=run.networks, views=run.views
-        ))
+    return _locate(
+        track_live(run.clip(), run.model, run.settings, worker=run.worker, networks=run.networks, views=run.views)
+    )
 
 
 def _track_as_node(run: ClipRun) -> ClipTrack:

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.special import logsumexp
 
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
@@ -84,6 +83,8 @@ class MultiViewStructures:
                 _translation_free_log_density(metres - prior.mean[:, None], prior.covariance + np.diag(noise))
                 - (len(index) - 2) * LOG_SCALES
             )
+        from scipy.special import logsumexp  # loaded here: most who draw or track a puppet know its view
+
         total = logsumexp(evidence, axis=1) + np.log(self.prior)
         return np.asarray(np.exp(total - logsumexp(total)))
 
