@@ -66,7 +66,9 @@ def test_memory_is_that_of_a_process_per_length(monkeypatch: pytest.MonkeyPatch)
     def run(command: list[str], **_: Any) -> subprocess.CompletedProcess[str]:
         with open_bag(command[3]) as bag:
             counts.append(bag.count)
-        return subprocess.CompletedProcess(command, 0, f"something else\n{32 * len(counts)} {200.5 + len(counts)}\n", "")
+        return subprocess.CompletedProcess(
+            command, 0, f"something else\n{32 * len(counts)} {200.5 + len(counts)}\n", ""
+        )
 
     monkeypatch.setattr(replays.subprocess, "run", run)
     rows = replays.measure_memory(0)

@@ -245,6 +245,11 @@ class BodyFitter:
         distance = two_way_distance(vertices, self.model.faces, cloud)
         return replace(fit, vertices=vertices, two_way_distance=distance)
 
+    def assess_surface(self, state: BodyState, cloud: Cloud) -> BodyFit:
+        """Return the fit of a body to a cloud, with refined vertices where the cloud is dense and whole."""
+        fit = self.assess(state, cloud)
+        return self._refine_nonrigid(fit, cloud) if self._is_dense(cloud) else fit
+
     def assess(self, state: BodyState, cloud: Cloud) -> BodyFit:
         """Return the fit of a body to a cloud, with its energy and confidences."""
         vertices = self.model.vertices(state)
