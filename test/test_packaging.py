@@ -26,7 +26,7 @@ OF_EXTRAS = {
     "ai_edge_litert", "anny", "av", "body_models", "dask", "distributed", "flask", "matplotlib", "open3d", "rerun",
     "sklearn", "waitress", "werkzeug",
 }  # fmt: skip
-OF_OTHERS = {"foxglove_msgs", "tf", "vision_msgs", "yolo_msgs", "zed_msgs"}
+OF_OTHERS = {"foxglove_msgs", "people_msgs", "tf", "vision_msgs", "yolo_msgs", "zed_msgs"}
 """Messages that are understood or sent where their package is installed, or read from bags without it."""
 BUNDLED = {"benchmarks"}
 """Of the source tree only, behind a check."""

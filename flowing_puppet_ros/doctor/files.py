@@ -105,7 +105,7 @@ def _inspect_fit(path: Path, kind: Kind, found: Inspection) -> None:
     )
 
 
-def _inspect_depth(path: Path, _: Kind, found: Inspection) -> None:
+def _inspect_depth(path: Path, kind: Kind, found: Inspection) -> None:
     depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if depth is None:
         raise InputError(f"{path} is not a readable image; remove or replace it")
@@ -113,10 +113,14 @@ def _inspect_depth(path: Path, _: Kind, found: Inspection) -> None:
     if not len(known):
         found.add("error", "a depth image of zeros: nothing was measured")
         return
+    near, far = np.percentile(known, [1, 99])
     found.add(
-        "error", f"a depth image of {depth.shape[1]}x{depth.shape[0]}, {np.percentile(known, 1):.4g} to"
-        f" {np.percentile(known, 99):.4g} units, without the camera's calibration: write it as a cloud (.ply, .npy) in"
-        " metres, or record depth images with their camera_info in a bag", "flowing-puppet fit CLOUD --out fits",
+        "note", f"a depth image of {depth.shape[1]}x{depth.shape[0]}, {near:.4g} to {far:.4g} units, which are"
+        " millimetres unless --unit names another",
+    )  # fmt: skip
+    found.add(
+        "ready", "given the camera's calibration, a file of its CameraInfo or four numbers in pixels, people are found"
+        " in it and fitted", make_command(kind, path),
     )  # fmt: skip
 
 

@@ -74,14 +74,14 @@ def test_images_videos_and_keypoints(tmp_path: Path) -> None:
     for name, kind in (kinds | {"depth.png": "depth image"}).items():
         found = inspect_input(tmp_path / name)
         assert found.kind == kind
-        assert found.is_usable is (kind not in ("unknown", "depth image"))
+        assert found.is_usable is (kind != "unknown")
     said = {name: " ".join(each.sentence for each in inspect_input(tmp_path / name).findings) for name in kinds}
     assert "5 frames a second" in said["film.avi"]
     assert "2 people in 1 frames, 1 joints each" in said["keypoints.json"]
-    assert (
-        "1500 to 1500 units, without the camera's calibration"
-        in inspect_input(tmp_path / "depth.png").findings[0].sentence
-    )
+    depth = inspect_input(tmp_path / "depth.png").findings
+    assert "320x240, 1500 to 1500 units" in depth[0].sentence
+    check(shlex.split(depth[1].command))
+    assert depth[1].command.split()[3:5] == ["--camera-info", "FX,FY,CX,CY"]
 
 
 @pytest.mark.parametrize(

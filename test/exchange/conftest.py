@@ -28,7 +28,11 @@ def states(model: StitchedPuppet) -> list[BodyState]:
         rest = model.rest_state()
         state = replace(rest, pose=(1 - share) * rest.pose + share * target, shape=shape.copy())
         for parent, child in model.tree.edges:
-            model._attach_to_parent(state, parent, child)
+            above = model.part_mesh(
+                parent, state.center[parent], state.rotation[parent], state.pose[parent], state.shape[parent]
+            )[model.interfaces[child - 1].parent_index]
+            turn, place = model.stitch(child, parent, above, state.pose[child], state.shape[child])
+            state.rotation[child], state.center[child] = turn, place
         found.append(state)
     return found
 

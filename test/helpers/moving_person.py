@@ -32,7 +32,7 @@ def fit_of(model: StitchedPuppet, state: BodyState) -> BodyFit:
 def write_fit(path: Path, model: StitchedPuppet, state: BodyState, up: np.ndarray, unit: str) -> Path:
     """Write a body as `fit` does for a scan in some unit in which some direction is up."""
     frame = ScanFrame(ScanUnit.named(unit).metres, rotation_to_z_up(up))
-    _write_fit(path, model, FrameFit(frame, ScanUnit.named(unit), fit_of(model, state), True, True, 1.7), 0.0)
+    _write_fit(path, model, FrameFit(frame, ScanUnit.named(unit), fit_of(model, state), True, True, 1.7), 0.0, {})
     return path
 
 

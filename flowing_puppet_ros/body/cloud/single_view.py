@@ -21,8 +21,8 @@ MIN_SENSOR_DISTANCE_M = 0.05
 MIN_DEPTH_TOLERANCE_M, TOLERANCE_PER_NOISE = 0.01, 2.5
 """Distance in front of the seen surface, at least and in multiples of the noise, at which a vertex is not yet pushed
 back. Noise that counts on one side only would push the body away from the sensor."""
-NOISE_NEIGHBOURS = 6
-"""Points by which the noise is measured, with the point itself."""
+NOISE_NEIGHBOURS, MAX_NOISE_POINTS = 6, 1000
+"""Points by which the noise is measured, with the point itself, and points at which it is measured, at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,9 +57,10 @@ class SingleViewCloud(Cloud):
                 f"the sensor at {np.round(viewpoint, 2).tolist()} m stands within the cloud and cannot have seen one"
                 " side of it; check the frame or fit it as a whole cloud"
             )
-        near = find_neighbours(points, NOISE_NEIGHBOURS)
-        apart = np.abs(((points[near] - points[:, None]) * normals[:, None]).sum(axis=2))
-        noise = float(np.median(apart[near != np.arange(len(points))[:, None]]))
+        every = 1 + len(points) // MAX_NOISE_POINTS
+        near, own = find_neighbours(points, NOISE_NEIGHBOURS, every), np.arange(0, len(points), every)
+        apart = np.abs(((points[near] - points[own, None]) * normals[own, None]).sum(axis=2))
+        noise = float(np.median(apart[near != own[:, None]]))
         view = OneSidedView.build(points, viewpoint, unknown, field)
         return cls(
             points,

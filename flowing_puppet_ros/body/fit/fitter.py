@@ -116,7 +116,7 @@ class BodyFitter:
             seed: overrides the settings' seed.
             progress: called with the fraction done, 0 to 1.
             nonrigid: refine the vertices beyond the model where a whole cloud is dense.
-            quick: without initial joints, try a small search first, whose limbs may be wrong.
+            quick: without initial joints, take a close body as it is, whose limbs may be wrong.
 
         Raises:
             InputError: when the cloud cannot be the surface of a person or the initial joints place no body.
@@ -245,6 +245,11 @@ class BodyFitter:
         distance = two_way_distance(vertices, self.model.faces, cloud)
         return replace(fit, vertices=vertices, two_way_distance=distance)
 
+    def assess_surface(self, state: BodyState, cloud: Cloud) -> BodyFit:
+        """Return the fit of a body to a cloud, with refined vertices where the cloud is dense and whole."""
+        fit = self.assess(state, cloud)
+        return self._refine_nonrigid(fit, cloud) if self._is_dense(cloud) else fit
+
     def assess(self, state: BodyState, cloud: Cloud) -> BodyFit:
         """Return the fit of a body to a cloud, with its energy and confidences."""
         vertices = self.model.vertices(state)
@@ -253,7 +258,7 @@ class BodyFitter:
             state,
             vertices,
             self.model.joints(vertices),
-            self.hypotheses.particle_search.energy(state, ExactCloud(cloud.points, cloud.normals, cloud.nearest)),
+            self.hypotheses.energy.measure(state, ExactCloud(cloud.points, cloud.normals, cloud.nearest)),
             quality.part_confidence,
             quality.confidence,
             quality.reliable,

@@ -11,7 +11,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, PosedPoints
+from flowing_puppet_ros.body.refine.normal_equations import NormalEquations
+from flowing_puppet_ros.model.posing import PosedPoints
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 

@@ -33,6 +33,7 @@ from flowing_puppet_ros.threads import one_blas_thread
 # First and last kernel width in metres: of a usual step, and of a step from which a lost body may come back.
 NARROW_WIDTHS_M, WIDE_WIDTHS_M = (0.10, 0.03), (0.25, 0.03)
 WIDE_STEPS = 20
+ALTERNATE = 2  # a step matches every second vertex and cloud point, the next one the others
 SHAPE_WEIGHT_PER_FRAME = 1e-6  # that each frame adds to `RefineWeights.shape` for the shape of the frames before
 MAX_SHAPE_FRAMES = 30  # that count for the shape: with more, a first mistake would stay
 MIN_VISIBLE = 0.4  # visible fraction, relative to normal, below which the person counts as occluded ...
@@ -328,7 +329,7 @@ class BodyTracker:
 
     def _refine(self, start: BodyState, prepared: _Prepared, widths: tuple[float, float], steps: int) -> BodyFit:
         cloud, floor = prepared.cloud, prepared.floor
-        weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps)
+        weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps, alternate=ALTERNATE)
         terms: list[SurfaceTerm] = []
         if floor is not None:
             weights = replace(FEW_POINTS, sigma_start=widths[0], iterations=steps)
@@ -340,7 +341,8 @@ class BodyTracker:
         body = self._fitter.gauss_newton.run(start, facing, prepared.targets, weights, terms)
         # A limb that left the view stays in its last pose: its motion would go on for ever.
         last = start if self._state.last is None else self._state.last.fit.state
-        return self._fitter.assess(hang_unseen_parts(self._fitter.model, last, body, cloud), cloud)
+        body = hang_unseen_parts(self._fitter.model, (last, body), cloud, prepared.targets)
+        return self._fitter.assess(body, cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
         return fit.two_way_distance > self._settings.lost_ratio * self._state.best + self._settings.lost_distance

@@ -32,12 +32,14 @@ class TrueBody:
         joints: (J, 3) m, named by `BodySource.joint_names`.
         hard: whether the pose was drawn from joint limits alone, not from motion capture.
         stature: m, of the person standing.
+        rest: the same person in Anny's rest pose.
     """
 
     vertices: np.ndarray
     joints: np.ndarray
     hard: bool
     stature: float
+    rest: RestBody | None = None
 
     def template_vertices(self, model_name: str) -> np.ndarray:
         """Return the true positions (V, 3) m of the vertices of the shipped Stitched Puppet `model_name`."""
@@ -127,7 +129,7 @@ class BodySource:
         vertices, bones = self._anny.pose(rest, pose)
         named = self._anny.locate_landmarks(vertices, bones)
         return TrueBody(
-            vertices + place, np.stack([named[name] for name in self.joint_names]) + place, hard, rest.stature
+            vertices + place, np.stack([named[name] for name in self.joint_names]) + place, hard, rest.stature, rest
         )
 
     def _draw_sequence(self, rng: np.random.Generator, count: int, min_speed: float) -> tuple[np.ndarray, np.ndarray]:

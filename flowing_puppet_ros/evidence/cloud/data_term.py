@@ -171,7 +171,7 @@ def _sweep(points: np.ndarray, low: np.ndarray, cell: float, nearest: np.ndarray
                                 continue
                             for c in range(-1, 2 if a or b else 0):
                                 z = k + way * c
-                                if 0 <= z < nz and nearest[x, y, z] >= 0:
+                                if 0 <= z < nz and nearest[x, y, z] >= 0 and nearest[x, y, z] != nearest[i, j, k]:
                                     _offer(points, low, cell, nearest, distance, i, j, k, nearest[x, y, z])
 
 

@@ -29,7 +29,7 @@ class NearestPoints:
         self.points = np.ascontiguousarray(points, dtype=np.float64)
         self._turn_length = turn_length
         self._scaled_normals = np.empty((0, 3)) if normals is None else np.ascontiguousarray(turn_length * normals)
-        low, high = self.points.min(axis=0), self.points.max(axis=0)
+        low, high = find_bounds(self.points)
         cell = CELL_SPACINGS * float((high - low).max()) / np.sqrt(len(points))
         cell = max(cell, float(np.prod((high - low) / MAX_CELLS ** (1 / 3))) ** (1 / 3), 1e-9)
         shape = np.floor((high - low) / cell).astype(np.int64) + 1
@@ -60,6 +60,17 @@ class NearestPoints:
 
 def _stack_normals(points: np.ndarray, scaled_normals: np.ndarray) -> np.ndarray:
     return np.hstack([points, scaled_normals]) if len(scaled_normals) else points
+
+
+@njit(cache=True, nogil=True)
+def find_bounds(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the smallest and the largest coordinates (3,) of points (N, 3), much faster than along NumPy's axis 0."""
+    low, high = points[0].copy(), points[0].copy()
+    for row in range(1, len(points)):
+        for axis in range(3):
+            low[axis] = min(low[axis], points[row, axis])
+            high[axis] = max(high[axis], points[row, axis])
+    return low, high
 
 
 @njit(cache=True, nogil=True)

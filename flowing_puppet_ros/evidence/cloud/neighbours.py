@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.evidence.cloud.nearest import gap_beyond_rings, sort_by_cell
+from flowing_puppet_ros.evidence.cloud.nearest import find_bounds, gap_beyond_rings, sort_by_cell
 
 MEAN_SHARE = 0.4
 """Points in a point's own cell, in neighbours, on the mean."""
@@ -23,14 +23,14 @@ MAX_RINGS = 3
 """Rings of cells around a cell that are read before the k-d tree is used."""
 
 
-def find_neighbours(points: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices (N, K) of the K nearest of `points` (N, 3) to each, in any order, itself among them.
+def find_neighbours(points: np.ndarray, count: int, every: int = 1) -> np.ndarray:
+    """Return the indices (M, K) of the K nearest of `points` (N, 3) to each, in any order, itself among them.
 
-    K is `count`, or N where there are fewer points.
+    K is `count`, or N where there are fewer points. M is N, or as many as there are of `every` second, third ... point.
     """
     points = np.ascontiguousarray(points, dtype=np.float64)
     count = min(count, len(points))
-    low, high = points.min(axis=0), points.max(axis=0)
+    low, high = find_bounds(points)
     min_cell = max(float(np.prod((high - low) / MAX_CELLS ** (1 / 3))) ** (1 / 3), 1e-9)
     # First as if the cloud were as wide as high, then by the points that are really in the cells of that size.
     cell = max(float((high - low).max()) * np.sqrt(MEAN_SHARE * count / len(points)), min_cell)
@@ -40,12 +40,13 @@ def find_neighbours(points: np.ndarray, count: int) -> np.ndarray:
     shape, rows, start = _make_grid(points, low, high, cell)
     held = np.diff(start)
     if held.max() <= MAX_SHARE * count:
-        found = _find_in_grid(points[rows], rows, start, low, cell, shape, count)
+        found = _find_in_grid(points[rows], rows, start, low, cell, shape, count, every)
         open_rows = np.flatnonzero(found[:, 0] < 0)
     else:
-        found, open_rows = np.empty((len(points), count), dtype=np.int64), np.arange(len(points))
+        found = np.empty((len(points[::every]), count), dtype=np.int64)
+        open_rows = np.arange(len(found))
     if len(open_rows):
-        found[open_rows] = cKDTree(points).query(points[open_rows], k=count)[1].reshape(-1, count)
+        found[open_rows] = cKDTree(points).query(points[every * open_rows], k=count)[1].reshape(-1, count)
     return found
 
 
@@ -66,9 +67,9 @@ def _make_grid(
 
 
 @njit(cache=True, nogil=True)
-def _find_in_grid(points, rows, start, low, cell, shape, count):  # type: ignore[no-untyped-def]
+def _find_in_grid(points, rows, start, low, cell, shape, count, every):  # type: ignore[no-untyped-def]
     """Return the neighbours of each row; -1 where they may lie beyond the cells around. `points` are sorted by cell."""
-    found = np.full((len(points), count), -1, np.int64)
+    found = np.full(((len(points) + every - 1) // every, count), -1, np.int64)
     nx, ny, nz = shape[0], shape[1], shape[2]
     places, around_xyz = np.empty(len(points), np.int64), np.empty((3, len(points)))
     squared, bins = np.empty(len(points)), np.empty(len(points), np.int64)
@@ -76,7 +77,9 @@ def _find_in_grid(points, rows, start, low, cell, shape, count):  # type: ignore
         for b in range(ny):
             for c in range(nz):
                 home = (a * ny + b) * nz + c
-                missing = start[home + 1] - start[home]
+                missing = 0
+                for own in range(start[home], start[home + 1]):
+                    missing += rows[own] % every == 0
                 for ring in range(1, MAX_RINGS + 1):
                     if missing == 0:
                         break
@@ -91,7 +94,7 @@ def _find_in_grid(points, rows, start, low, cell, shape, count):  # type: ignore
                                     around_xyz[axis, around] = points[place, axis]
                                 around += 1
                     for own in range(start[home], start[home + 1]):
-                        if found[rows[own], 0] >= 0:
+                        if rows[own] % every or found[rows[own] // every, 0] >= 0:
                             continue
                         x, y, z = points[own, 0], points[own, 1], points[own, 2]
                         gap = min(
@@ -104,7 +107,9 @@ def _find_in_grid(points, rows, start, low, cell, shape, count):  # type: ignore
                                 (x - around_xyz[0, k]) ** 2 + (y - around_xyz[1, k]) ** 2 + (z - around_xyz[2, k]) ** 2
                             )
                         limit = min(gap * abs(gap), (2 * ring + 1) ** 2 * 3 * cell * cell)
-                        missing -= _select_smallest(squared[:around], limit, count, bins, places, found[rows[own]])
+                        missing -= _select_smallest(
+                            squared[:around], limit, count, bins, places, found[rows[own] // every]
+                        )
     return found
 
 

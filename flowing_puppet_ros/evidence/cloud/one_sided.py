@@ -20,7 +20,8 @@ from flowing_puppet_ros.evidence.cloud.sensor_field import NO_FIELD, FieldArrays
 
 MAX_CELLS = 60_000  # of the grid of directions
 SPACING_NEIGHBOUR = 4  # the spacing of directions is the distance to this neighbour ...
-SPACING_PERCENTILE = 90  # ... at this percentile over the cloud
+SPACING_PERCENTILE = 90  # ... at this percentile over the cloud, or so many points of it
+MAX_SPACING_POINTS = 1000
 TOLERANCE_SPACINGS = 1.5
 """Spacings of the seen directions beyond which a direction is beside the silhouette."""
 MAX_DISTANCE_M = 0.15
@@ -70,8 +71,9 @@ class OneSidedView:
         """
         axes = _axes(points.mean(axis=0) - viewpoint)
         directions, depth = _project(points, viewpoint, axes)
-        near = find_neighbours(np.pad(directions, ((0, 0), (0, 1))), SPACING_NEIGHBOUR + 1)
-        apart = np.linalg.norm(directions[near] - directions[:, None], axis=2).max(axis=1)
+        every = 1 + len(points) // MAX_SPACING_POINTS
+        near = find_neighbours(np.pad(directions, ((0, 0), (0, 1))), SPACING_NEIGHBOUR + 1, every)
+        apart = np.linalg.norm(directions[near] - directions[::every, None], axis=2).max(axis=1)
         spacing = float(np.percentile(apart, SPACING_PERCENTILE))
         low, high = directions.min(axis=0) - 4 * spacing, directions.max(axis=0) + 4 * spacing
         cell = max(spacing / 2, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))

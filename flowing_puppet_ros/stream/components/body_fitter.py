@@ -156,10 +156,18 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         if initial is not None and initial.bodies:
             bodies = self._fit_initial(scene, to_z_up, initial, seed, progress)
         else:
-            bodies = self._scene.fit_once(scene, seed, progress)
+            bodies = self._publish_ids(self._scene.fit_once(scene, seed, progress))
         bodies = [body.rotate(to_z_up.T) for body in bodies]
         messages = [make_body(self.factory, self._model, body) for body in bodies]
         return make_bodies(self.factory, cloud.header, messages), bodies
+
+    def _step_scene(self, scene: SceneCloud, seed: int) -> tuple[list[TrackedBody], list[str]]:
+        """Return the bodies of everybody in a cloud alone, and the ids of those out of sight."""
+        bodies, occluded = self._scene.step(scene, seed, self.background)
+        return self._publish_ids(bodies), [self.publish_id(own) for own in occluded]
+
+    def _publish_ids(self, bodies: list[TrackedBody]) -> list[TrackedBody]:
+        return [replace(body, id=self.publish_id(body.id)) for body in bodies]
 
     def _decode(self, cloud: Any, of_depth: bool) -> tuple[SceneCloud, F64]:
         """Return the points of a cloud message in the region of interest, z up, and the rotation (3, 3) to there.
@@ -211,7 +219,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
                 seed=seed,
                 progress=progress,
             )
-            bodies.append(TrackedBody(body.id or f"b{number}", fit))
+            bodies.append(TrackedBody(body.id or self.publish_id(f"b{number}"), fit))
         return sorted(bodies, key=lambda body: id_sort_key(body.id))
 
     def seed_of(self, stamp: int) -> int:
@@ -294,13 +302,13 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         """
         seed = self.seed_of(stamp)
         if "puppets" not in self._expected or not self.settings.scene:
-            return self._scene.step(scene, seed, self.background)
+            return self._step_scene(scene, seed)
         try:
             paired = self._puppets.find(header, stamp, to_z_up)
         except InputError as error:
             self.report.warn(str(error))
             self.counters["clouds without puppets"] += 1
-            return self._scene.step(scene, seed, self.background)
+            return self._step_scene(scene, seed)
         self._puppets.drop_until(stamp)
         self._scene.check(scene)
         seen = SeenCloud.of(scene.points, paired.camera)
@@ -314,7 +322,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             )
         outside = ~seen.in_view & ~own
         if outside.mean() > MIN_OUTSIDE_SHARE:
-            others, hidden = self._scene.step(scene.take(outside), seed, self.background)
+            others, hidden = self._step_scene(scene.take(outside), seed)
             bodies, occluded = [*bodies, *others], [*occluded, *hidden]
         return bodies, occluded
 

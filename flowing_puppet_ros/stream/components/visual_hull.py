@@ -158,7 +158,7 @@ class VisualHullComponent(Component[VisualHullSettings]):
             return []
         segmented = [(person.id, self._segment(frames, person, puppets)) for person, puppets in people]
         header = make_header(self.factory, stamp, self._frame)
-        bodies = [self._make_body(identity, person) for identity, person in segmented]
+        bodies = [self._make_body(self.publish_id(identity), person) for identity, person in segmented]
         headers = {name: complete[name][1]["image"].header for name in frames}
         outputs = self._make_silhouettes(header, bodies, [person for _, person in segmented], headers)
         return outputs + self._make_hull(header, bodies, [person for _, person in segmented]) if carve else outputs

@@ -34,6 +34,7 @@ def test_the_neighbours_are_the_nearest_points(points: np.ndarray, count: int) -
     assert (np.diff(np.sort(found, axis=1), axis=1) > 0).all(), "no point twice"
     distance = np.sort(np.linalg.norm(points[found] - points[:, None], axis=2), axis=1)
     expected = cKDTree(points).query(points, k=count)[0].reshape(len(points), count)
+    np.testing.assert_array_equal(np.sort(find_neighbours(points[: len(points)], count, 3)), np.sort(found[::3]))
     np.testing.assert_allclose(distance, expected, atol=1e-12)
 
 
