@@ -11,7 +11,6 @@ from threading import Condition, Thread
 from types import TracebackType
 from typing import Self
 
-
 SWITCH_INTERVAL_S = 0.0005
 """Time after which a thread takes the interpreter from another one. With Python's 5 ms, threads that leave it for short
 work in libraries wait for most of their time to come back."""
