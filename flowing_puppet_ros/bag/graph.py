@@ -125,7 +125,7 @@ def build_graph(
     made again. InputError lists the topics if nothing can be used.
     """
     of_depth = {name for name, sample in samples.items() if holds_depth(name, sample.encoding)}
-    cameras = _find_cameras({name: kind for name, kind in topics.items() if name not in of_depth})
+    cameras = find_cameras({name: kind for name, kind in topics.items() if name not in of_depth})
     clouds = [topic for topic, kind in topics.items() if kind == POINT_CLOUD and not topic.endswith("/body_vertices")]
     depths, depth_notes = select_depth_topics(samples, infos, clouds)
     if not cameras and not clouds and not depths:
@@ -196,7 +196,8 @@ def _find_skeletons(listing: str, topics: Mapping[str, str]) -> list[str]:
     return sorted(name for name, kind in topics.items() if kind == SKELETON_2D and find_body_id(listing, name))
 
 
-def _find_cameras(topics: Mapping[str, str]) -> list[CameraTopics]:
+def find_cameras(topics: Mapping[str, str]) -> list[CameraTopics]:
+    """Return the cameras whose images are among the topics (name -> type), by namespace."""
     found: dict[str, str] = {}
     for base in IMAGE_NAMES:
         for topic, kind in topics.items():

@@ -115,7 +115,8 @@ class GraphRun:
         def work() -> None:
             for place, call in sorted(progress.waiting.pop(instance), key=lambda item: item[0]):
                 outputs = _run_timed(call)
-                progress.said += [(place, sentence) for sentence in instance.component.report.drain_warnings()]
+                said = instance.component.report.drain_warnings()
+                progress.said += [(place, f"{instance.name}: {sentence}") for sentence in said]
                 self._pass_on(instance, place, outputs, progress)
 
         return work

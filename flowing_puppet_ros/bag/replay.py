@@ -153,7 +153,8 @@ class _Replay:
             {name: detail.type for name, detail in self._recorded.items() if detail.count}
         )
         self._outputs = self._graph.find_outputs()
-        self._shared = SharedImages(MAX_STEPS_PER_TOPIC * len(self._routes))
+        cameras = [name for name in self._recorded if len(self._find_pictures(name)) > 1]
+        self._shared = SharedImages(MAX_STEPS_PER_TOPIC * len(cameras))
         copied = {self._new_name[name] for name, kind in bag.topics.items() if kind in _COPIED_TYPES}
         self._copied = (copied | {self._new_name[record.topic] for record in self._static}) - set(self._outputs)
         for instance in self._graph.instances:
@@ -317,12 +318,20 @@ class _Replay:
             return step
         if any(self._needs_time(instance, port) for instance, port in routes):
             step.warnings += self._stuck.advance(topic, record.log_time, message)
-        pictures = [route for route in routes if _is_picture(*route)]
-        shared = self._shared.share(message) if len(pictures) > 1 else message
+        pictures = self._find_pictures(topic)
+        shared = self._shared.share(message, len(pictures)) if len(pictures) > 1 else message
         for instance, port in routes:
             given = shared if (instance, port) in pictures else name_body(instance.resolve(port), topic, message)
             step.calls.append(Call(instance, port, given))
         return step
+
+    def _find_pictures(self, topic: str) -> list[tuple[Instance, str]]:
+        """Return the inputs that a topic feeds with pictures, and not depth."""
+        return [
+            (instance, name)
+            for instance, name in self._routes.get(topic, [])
+            if any(port.name == name and port.transport == COMPRESSED for port in instance.component.inputs)
+        ]
 
     def _needs_time(self, instance: Instance, port: str) -> bool:
         """Return whether messages of an input must follow one another in time; not if partners have their stamps."""
@@ -359,11 +368,6 @@ class _Replay:
             **({} if count_used(instances) else {"unused": explain_unused(self._graph, self._recorded, self.warnings)}),
             **self.describe(),
         }
-
-
-def _is_picture(instance: Instance, port: str) -> bool:
-    """Return whether an input takes pictures, and not depth."""
-    return any(each.name == port and each.transport == COMPRESSED for each in instance.component.inputs)
 
 
 def _rename_topics(topics: Mapping[str, str], topic_map: Mapping[str, str]) -> dict[str, str]:

@@ -34,6 +34,12 @@ FREE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.06, sig
 MAX_FIT_POINTS = 4000
 MAX_SWAP_RATIO = 0.9
 """Cost of the body with exchanged sides, in costs of the other, below which it is kept: networks are mostly right."""
+WIDE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=15)
+"""Without joints, where they were so wrong that the body is not reliable."""
+REACH = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=12)
+MIN_REACH_M, REACH_STRENGTH, MAX_REACH_RATIO = 0.08, 0.05, 1.02
+"""Distance of an arm's joint from where it was lifted to, from which the joints of arms pull in all directions, how
+strongly, and the two-way distance, in that of the body before, up to which the result is kept."""
 HIDDEN_SHARE = 0.25
 """Of the weight, for joints that the puppet itself hides."""
 MIN_START_CONFIDENCE, MIN_LIMB_CONFIDENCE = 0.1, 0.3
@@ -99,7 +105,33 @@ class JointFitter:
             found = run(body, cloud, pull, pulled, terms)
             tried.append((self.fitter.hypotheses.pose_bank.cost(found, coarse), found))
         _, body = tried[tried[1][0] < MAX_SWAP_RATIO * tried[0][0]]
-        return self.fitter.assess(run(body, cloud, JointTargets.none(self.model), free, terms), cloud)
+        none = JointTargets.none(self.model)
+        fit = self.fitter.assess(run(body, cloud, none, free, terms), cloud)
+        if not fit.reliable:
+            wide = self.fitter.assess(run(fit.state, cloud, none, strengthen_priors(WIDE, unknown), terms), cloud)
+            fit = min(fit, wide, key=lambda found: found.two_way_distance)
+        return self._reach_for_hands(
+            fit, cloud, joints if body is tried[0][1] else swap_lifted(self.model, joints), unknown
+        )
+
+    def _reach_for_hands(self, fit: BodyFit, cloud: SingleViewCloud, joints: LiftedJoints, unknown: float) -> BodyFit:
+        """Return the body with arms that point at the camera where the cloud is, if that is closer.
+
+        Seen from the front such an arm has few points, and across the rays it lies as well before the belly: only the
+        depth of elbow and wrist tells.
+        """
+        gap = np.linalg.norm(fit.joints - joints.points, axis=1)
+        arm = np.array([name.endswith(("elbow", "wrist", "hand")) for name in self.model.joint_names])
+        sure = arm & joints.found & ~joints.hidden & (joints.confidence >= MIN_LIMB_CONFIDENCE)
+        if not (sure & (gap > MIN_REACH_M)).any():
+            return fit
+        targets = JointTargets(np.nan_to_num(joints.points), np.where(sure, REACH_STRENGTH * joints.confidence, 0.0))
+        weights = strengthen_priors(REACH, unknown)
+        terms, run = [cloud.free_space_term], self.fitter.gauss_newton.run
+        body = run(fit.state, cloud, targets, weights, terms)
+        free = strengthen_priors(FREE, unknown)
+        reached = self.fitter.assess(run(body, cloud, JointTargets.none(self.model), free, terms), cloud)
+        return reached if reached.two_way_distance <= MAX_REACH_RATIO * fit.two_way_distance else fit
 
     def _swap(self, targets: JointTargets) -> JointTargets:
         other = list(find_other_sides(self.model.joint_names))

@@ -121,7 +121,7 @@ def test_each_body_of_the_start_is_fitted_and_a_lost_one_is_deleted(inputs: dict
     component.handle("initial", FACTORY.make(BODIES, header=header, bodies=start))
     made = dict(component.handle("points", two))
     one, another = made["bodies"].bodies
-    assert [one.id, another.id] == ["b1", "someone"]
+    assert [one.id, another.id] == [inputs["/hull/joints"][0].bodies[0].id, "someone"]
     np.testing.assert_allclose((places(another) - places(one)).mean(axis=0), aside, atol=0.05)
     assert [marker.id for marker in made["body_meshes"].markers] == [1, 2]
     assert len(made["part_poses"].poses) == 32

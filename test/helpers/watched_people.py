@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from capsule_man import Joints, cloud_of, joints_of
+from capsule_man import Joints, cloud_of
 
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorProjection

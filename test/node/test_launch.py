@@ -142,6 +142,24 @@ def test_bodies_from_a_cloud_or_from_depth(tmp_path: Path) -> None:
     assert parameters_of(fitter)["use_sim_time"] is True
 
 
+def test_colour_and_depth_of_a_camera_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, info = ["sensor_msgs/msg/Image"], ["sensor_msgs/msg/CameraInfo"]
+    seen = {
+        "/cam/rgb/image_rect_color": image, "/cam/rgb/camera_info": info,
+        "/cam/depth_registered/image": image, "/other/image_raw": image,
+    }  # fmt: skip
+    monkeypatch.setattr("flowing_puppet_ros.node.launching.rgbd_topics.list_topics", lambda kind: seen)
+    tracker, fitter = described("rgbd", camera="/cam", namespace="robot")
+    assert (tracker.named["executable"], tracker.named["namespace"]) == ("puppet_tracker", "robot")
+    assert tracker.named["remappings"] == [("image", "/cam/rgb/image_rect_color")]
+    assert dict(fitter.named["remappings"]) == {
+        "depth": "/cam/depth_registered/image",
+        "camera_info": "/cam/rgb/camera_info",
+        "puppets/camera_info": "/cam/rgb/camera_info",
+    }
+    assert parameters_of(fitter)["fusion.rectified"] is True
+
+
 def test_bodies_from_cameras() -> None:
     nodes = described("cameras", cameras="a,b", image="image_raw", namespace="rig")
     started = [(node.named["executable"], node.named["namespace"]) for node in nodes]

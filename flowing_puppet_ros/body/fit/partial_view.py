@@ -8,7 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
+from flowing_puppet_ros.body.fit.initialisation import FAR_JOINT
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
+from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 UNKNOWN_SHARES = (0.05, 0.3, 0.6)
@@ -40,12 +42,15 @@ def strengthen_priors(weights: RefineWeights, share: float) -> RefineWeights:
     )
 
 
-def hang_unseen_parts(model: StitchedPuppet, before: BodyState, after: BodyState, cloud: Cloud) -> BodyState:
+def hang_unseen_parts(
+    model: StitchedPuppet, frames: tuple[BodyState, BodyState], cloud: Cloud, targets: JointTargets
+) -> BodyState:
     """Return a body whose parts out of the sensor's sight have the pose that they had before, on parents that moved.
 
-    Gauss-Newton leaves them to the priors alone, in which they drift from frame to frame. `before` and `after` are the
-    body in the last frame and in that of the cloud.
+    Gauss-Newton leaves them to the priors alone, in which they drift from frame to frame, unless a target of their far
+    joint places them. `frames` are the body in the last frame and in that of the cloud.
     """
+    before, after = frames
     if cloud.field is None:
         return after
     unknown = cloud.field.find_unknown(model.vertices(after))
@@ -53,7 +58,7 @@ def hang_unseen_parts(model: StitchedPuppet, before: BodyState, after: BodyState
     share = np.bincount(owner, unknown, parts) / np.bincount(owner, minlength=parts)
     state = BodyState(after.center.copy(), after.rotation.copy(), after.pose.copy(), after.shape)
     for part in range(1, parts):
-        if share[part] < MIN_UNSEEN_SHARE:
+        if share[part] < MIN_UNSEEN_SHARE or _is_placed(model, part, targets):
             continue
         parent, interface = model.tree.parents[part], model.interfaces[part - 1]
         state.pose[part] = before.pose[part]
@@ -64,3 +69,10 @@ def hang_unseen_parts(model: StitchedPuppet, before: BodyState, after: BodyState
         )
         state.center[part] = state.center[parent] + state.rotation[parent] @ above - state.rotation[part] @ own
     return state
+
+
+def _is_placed(model: StitchedPuppet, part: int, targets: JointTargets) -> bool:
+    """Return whether there is a target for the far joint of a part."""
+    side, _, kind = model.tree.names[part].partition("_")
+    joint = f"{side}_{FAR_JOINT[kind]}" if kind else "face"
+    return joint in model.joint_names and bool(targets.weight[model.joint_names.index(joint)] > 0)

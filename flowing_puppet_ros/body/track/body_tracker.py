@@ -341,7 +341,8 @@ class BodyTracker:
         body = self._fitter.gauss_newton.run(start, facing, prepared.targets, weights, terms)
         # A limb that left the view stays in its last pose: its motion would go on for ever.
         last = start if self._state.last is None else self._state.last.fit.state
-        return self._fitter.assess(hang_unseen_parts(self._fitter.model, last, body, cloud), cloud)
+        body = hang_unseen_parts(self._fitter.model, (last, body), cloud, prepared.targets)
+        return self._fitter.assess(body, cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:
         return fit.two_way_distance > self._settings.lost_ratio * self._state.best + self._settings.lost_distance

@@ -23,6 +23,7 @@ from flowing_puppet_ros.body.scans.unit import UNITS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorProjection
+from flowing_puppet_ros.extras import import_extra
 from flowing_puppet_ros.multiview.camera import Camera
 
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff")
@@ -112,8 +113,7 @@ def read_organised(path: Path, metres: float) -> DepthView | None:
     shape = _read_shape(path)
     if shape is None:
         return None
-    import open3d as o3d
-
+    o3d = import_extra("open3d", "scans", "reading .pcd files")
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
     points = metres * np.asarray(cloud.points)

@@ -178,10 +178,12 @@ def _find_camera_axes(local: F64) -> F64 | None:
     mean = (few / np.maximum(np.linalg.norm(few, axis=1, keepdims=True), 1e-9)).mean(axis=0)
     ahead = int(np.abs(mean).argmax())
     forward = np.eye(3)[ahead] * np.sign(mean[ahead])
-    depth = local @ forward
-    others = np.delete(np.abs(local), ahead, axis=1).max(axis=1)
-    if not (others < MAX_CAMERA_TANGENT * depth).all():
-        return None
+    i, j = (axis for axis in range(3) if axis != ahead)
+    # A few points tell most LiDARs.
+    for some in (few, local):
+        limit = MAX_CAMERA_TANGENT * np.sign(mean[ahead]) * some[:, ahead]
+        if not ((np.abs(some[:, i]) < limit) & (np.abs(some[:, j]) < limit)).all():
+            return None
     down = np.array([0.0, 0.0, -1.0]) if ahead != 2 else np.array([-1.0, 0.0, 0.0])
     return np.stack([np.cross(down, forward), down, forward])
 

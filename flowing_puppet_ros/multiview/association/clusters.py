@@ -92,11 +92,12 @@ def find_clusters(
         )
         if mismatch < settings.max_mismatch:
             pairs.append((mismatch, one, other))
-    proposals = [
-        cluster
-        for _, one, other in sorted(pairs)
-        if (cluster := _grow(people, free, one, other, settings, triangulation)) is not None
-    ]
+    proposals: list[ViewCluster] = []
+    for _, one, other in sorted(pairs):
+        # A pair within a person who was proposed already would grow into the same.
+        if not any({one, other} <= set(cluster.views.items()) for cluster in proposals):
+            cluster = _grow(people, free, one, other, settings, triangulation)
+            proposals += [cluster] if cluster is not None else []
     proposals.sort(key=lambda cluster: (-len(cluster.views), cluster.mismatch))
     found: list[ViewCluster] = []
     taken: set[Key] = set()

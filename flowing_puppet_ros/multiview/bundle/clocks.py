@@ -81,11 +81,11 @@ def _measure_distance(
     both = np.minimum(weight, their_weight)
     if (both > 0).any(axis=1).mean() < _MIN_SHARE:
         return np.inf
-    first, second = (
+    rays = [
         np.concatenate([each, np.ones((*each.shape[:-1], 1))], axis=-1) @ camera.rotation
         for each, camera in ((plane, one), (their_plane, other))
-    )
-    normal = np.cross(first, second)
+    ]
+    normal = np.cross(rays[0], rays[1])
     length = np.linalg.norm(normal, axis=-1)
     distance = np.abs(normal @ (other.centre - one.centre)) / np.maximum(length, 1e-9)
     return float((both * np.minimum(distance, _MAX_DISTANCE_M)).sum() / both.sum())

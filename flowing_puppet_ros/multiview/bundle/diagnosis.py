@@ -11,13 +11,18 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.multiview.association.clusters import find_clusters
+from flowing_puppet_ros.multiview.association.height import measure_height
 from flowing_puppet_ros.multiview.association.settings import AssociationSettings
 from flowing_puppet_ros.multiview.association.view import PersonInView, calibrate_views
+from flowing_puppet_ros.multiview.bundle.gauge import scale_to
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
 
 MIN_AGREEMENT = 0.4
-"""Minimum share of the views of people that belong to somebody in space, for a calibration to be right."""
+"""Minimum share of the pairs of views that agree, for a calibration to be right."""
+MIN_HEIGHT_M, MAX_HEIGHT_M, USUAL_HEIGHT_M = 0.9, 2.4, 1.7
+_BASELINES_M = (4.0, 2.0, 8.0, 1.0, 0.5, 16.0)  # tried as the median distance of cameras
+_INSTANTS = 3  # at which mistakes are tried
 _MIN_GAIN = 0.25  # in that share, for a mistake to be the reason
 _ASSOCIATION = AssociationSettings()
 _TRIANGULATION = TriangulationSettings()
@@ -28,7 +33,13 @@ type People = Mapping[str, Sequence[PersonInView]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AgreementOfViews:
-    """How many views agree: `share` of all views, `by_camera`, and the people's `joints` (T, J, 3) m."""
+    """How many views of people agree.
+
+    Attributes:
+        share: of the pairs of views that could show one person, those that do.
+        by_camera: share of a camera's views that agree with any other.
+        joints: (T, J, 3) m of the people.
+    """
 
     share: float
     by_camera: dict[str, float]
@@ -38,29 +49,62 @@ class AgreementOfViews:
 def measure_agreement_of_views(cameras: Mapping[str, Camera], instants: Sequence[People]) -> AgreementOfViews:
     """Return how many views of people, at several instants, belong to somebody whom several cameras see."""
     agreeing, total = dict.fromkeys(cameras, 0), dict.fromkeys(cameras, 0)
+    pairs, possible = 0, 0
     joints = []
     for people in instants:
         views = calibrate_views(cameras, people, _TRIANGULATION.min_confidence)
         free = {(name, k) for name, group in views.items() for k in range(len(group))}
         for name, group in views.items():
             total[name] += len(group)
+        possible += sum(min(len(views[one]), len(views[other])) for one, other in combinations(views, 2))
         for cluster in find_clusters(views, free, _ASSOCIATION, _TRIANGULATION):
             joints.append(cluster.joints)
+            pairs += len(cluster.views) * (len(cluster.views) - 1) // 2
             for name in cluster.views:
                 agreeing[name] += 1
     by_camera = {name: agreeing[name] / total[name] for name in cameras if total[name]}
-    share = sum(agreeing.values()) / max(1, sum(total.values()))
-    return AgreementOfViews(share, by_camera, np.stack(joints) if joints else np.zeros((0, 0, 3)))
+    return AgreementOfViews(pairs / max(1, possible), by_camera, np.stack(joints) if joints else np.zeros((0, 0, 3)))
 
 
-def explain_disagreement(cameras: Mapping[str, Camera], instants: Sequence[People]) -> str:
-    """Return in one sentence which mistake in the calibration would explain why views do not agree; "" if none does."""
-    before = measure_agreement_of_views(cameras, instants).share
-    best, reason = before + _MIN_GAIN, ""
-    for sentence, changed, people in _list_mistakes(cameras, instants):
-        share = measure_agreement_of_views(changed, people).share
-        if share > best:
-            best, reason = share, sentence
+def find_size(
+    cameras: Mapping[str, Camera], names: Sequence[str], instants: Sequence[People]
+) -> tuple[float, AgreementOfViews]:
+    """Return the factor at which most views agree on people as tall as people are, and how they agree.
+
+    Distances between rays grow with the unit, and the association knows people in metres only.
+    """
+    centres = np.array([camera.centre for camera in cameras.values()])
+    gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2)[np.triu_indices(len(centres), 1)]
+    median = float(np.median(gaps[gaps > 0]))
+    best: tuple[bool, float, float, AgreementOfViews] | None = None
+    for baseline in _BASELINES_M:
+        factor = baseline / median
+        seen = measure_agreement_of_views(scale_to(cameras, factor), instants)
+        tall = measure_height(names, seen.joints) if len(seen.joints) else np.nan
+        candidate = bool(MIN_HEIGHT_M < tall < MAX_HEIGHT_M), seen.share, factor, seen
+        if best is None or candidate[:2] > best[:2]:
+            best = candidate
+        if candidate[0] and seen.share >= MIN_AGREEMENT:
+            # Once more at a usual height, where the limits of the association fit.
+            exact = factor * USUAL_HEIGHT_M / tall
+            again = measure_agreement_of_views(scale_to(cameras, exact), instants)
+            return (exact, again) if again.share >= seen.share else (factor, seen)
+    assert best is not None
+    return best[2], best[3]
+
+
+def explain_disagreement(
+    cameras: Mapping[str, Camera], names: Sequence[str], instants: Sequence[People], share: float
+) -> str:
+    """Return in one sentence which mistake in the calibration would explain why views do not agree; "" if none does.
+
+    `share` of them agree as it is.
+    """
+    best, reason = share + _MIN_GAIN, ""
+    for sentence, changed, people in _list_mistakes(cameras, instants[:: max(1, len(instants) // _INSTANTS)]):
+        found = find_size(changed, names, people)[1].share
+        if found > best:
+            best, reason = found, sentence
     return reason
 
 

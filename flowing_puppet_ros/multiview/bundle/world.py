@@ -11,21 +11,20 @@ from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.association.height import find_up, measure_height
 from flowing_puppet_ros.multiview.bundle.diagnosis import (
+    MAX_HEIGHT_M,
     MIN_AGREEMENT,
+    MIN_HEIGHT_M,
+    USUAL_HEIGHT_M,
     AgreementOfViews,
     People,
     explain_disagreement,
-    measure_agreement_of_views,
+    find_size,
 )
-from flowing_puppet_ros.multiview.bundle.gauge import scale_to
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.rig.rig import UNITS, CameraRig
 
 AXES = {f"{sign}{name}": np.eye(3)[axis] * (-1 if sign else 1) for axis, name in enumerate("xyz") for sign in ("", "-")}
 """Directions by name."""
-_MIN_HEIGHT_M, _MAX_HEIGHT_M = 0.9, 2.4
-_USUAL_HEIGHT_M = 1.7
-_BASELINES_M = (4.0, 2.0, 8.0, 1.0, 0.5, 16.0)  # tried as the median distance of cameras
 _MIN_ALIGNED = np.cos(np.radians(30.0))  # of the upright direction with an axis of the world
 _MIN_TOLD = np.cos(np.radians(60.0))  # of the upright direction with the axis that was told
 
@@ -58,8 +57,8 @@ def settle_world(
     told = unit if unit != "auto" else rig.unit
     if not any(sum(bool(group) for group in people.values()) >= 2 for people in instants):
         return _settle_without_people(rig, told, up, note)
-    factor, seen = _find_size(cameras, names, instants)
-    _check_agreement(scale_to(cameras, factor), instants, seen, note)
+    factor, seen = find_size(cameras, names, instants)
+    _check_agreement(cameras, names, instants, seen, note)
     tall = measure_height(names, seen.joints) / factor  # in the unit of the file
     if not np.isfinite(tall):
         return _settle_without_people(rig, told, up, note)
@@ -76,40 +75,17 @@ def _settle_without_people(rig: CameraRig, told: str, up: str, note: Callable[[s
     return rig.rotate_world(_rotate_to_z(AXES[up])) if up != "auto" else rig
 
 
-def _find_size(
-    cameras: dict[str, Camera], names: Sequence[str], instants: Sequence[People]
-) -> tuple[float, AgreementOfViews]:
-    """Return the factor at which most views agree on people as tall as people are, and how they agree.
-
-    Distances between rays grow with the unit, and the association knows people in metres only.
-    """
-    centres = np.array([camera.centre for camera in cameras.values()])
-    gaps = np.linalg.norm(centres[:, None] - centres[None], axis=2)[np.triu_indices(len(centres), 1)]
-    median = float(np.median(gaps[gaps > 0]))
-    best: tuple[bool, float, float, AgreementOfViews] | None = None
-    for baseline in _BASELINES_M:
-        factor = baseline / median
-        seen = measure_agreement_of_views(scale_to(cameras, factor), instants)
-        tall = measure_height(names, seen.joints) if len(seen.joints) else np.nan
-        candidate = bool(_MIN_HEIGHT_M < tall < _MAX_HEIGHT_M), seen.share, factor, seen
-        if best is None or candidate[:2] > best[:2]:
-            best = candidate
-        if candidate[0] and seen.share >= MIN_AGREEMENT:
-            # Once more at a usual height, where the limits of the association fit.
-            exact = factor * _USUAL_HEIGHT_M / tall
-            again = measure_agreement_of_views(scale_to(cameras, exact), instants)
-            return (exact, again) if again.share >= seen.share else (factor, seen)
-    assert best is not None
-    return best[2], best[3]
-
-
 def _check_agreement(
-    cameras: dict[str, Camera], instants: Sequence[People], seen: AgreementOfViews, note: Callable[[str], None]
+    cameras: dict[str, Camera],
+    names: Sequence[str],
+    instants: Sequence[People],
+    seen: AgreementOfViews,
+    note: Callable[[str], None],
 ) -> None:
     alone = [name for name, share in seen.by_camera.items() if share < MIN_AGREEMENT / 2]
     if not alone and seen.share >= MIN_AGREEMENT:
         return
-    reason = explain_disagreement(cameras, instants)
+    reason = explain_disagreement(cameras, names, instants, seen.share)
     if reason:
         raise InputError(reason)
     if seen.share < MIN_AGREEMENT / 2:
@@ -125,7 +101,7 @@ def _check_agreement(
 
 def _choose_metres(tall: float, told: str, unit: str, note: Callable[[str], None]) -> float:
     """Return metres in the unit in which people are so `tall`; InputError if the unit that was told is wrong."""
-    fitting = [name for name, metres in UNITS.items() if _MIN_HEIGHT_M < tall * metres < _MAX_HEIGHT_M]
+    fitting = [name for name, metres in UNITS.items() if MIN_HEIGHT_M < tall * metres < MAX_HEIGHT_M]
     if told in UNITS and told in fitting:
         return UNITS[told]
     if unit != "auto":
@@ -138,10 +114,10 @@ def _choose_metres(tall: float, told: str, unit: str, note: Callable[[str], None
     if told in UNITS or not told:
         raise InputError(
             f"people would be {tall * UNITS[told or 'm']:.3g} m tall: the unit of the calibration is not m, cm or mm; "
-            f"--person-height {_USUAL_HEIGHT_M} fixes the scale"
+            f"--person-height {USUAL_HEIGHT_M} fixes the scale"
         )
-    note(f"the unit of the calibration is arbitrary: people are taken to be {_USUAL_HEIGHT_M} m tall (--person-height)")
-    return _USUAL_HEIGHT_M / tall
+    note(f"the unit of the calibration is arbitrary: people are taken to be {USUAL_HEIGHT_M} m tall (--person-height)")
+    return USUAL_HEIGHT_M / tall
 
 
 def _choose_rotation(upward: F64, up: str, note: Callable[[str], None]) -> F64:

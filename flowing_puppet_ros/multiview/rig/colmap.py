@@ -72,7 +72,7 @@ def _read_camera(
         coefficients = dict(zip(names, rest, strict=True))
     except ValueError as error:
         raise InputError(f"{folder / CAMERAS}: the {model} camera of {name} has the wrong number of values") from error
-    matrix = np.array([[focal[0], 0.0, cx - 0.5], [0.0, focal[-1], cy - 0.5], [0.0, 0.0, 1.0]])
+    matrix = np.array([[focal[0], 0, cx - 0.5], [0, focal[-1], cy - 0.5], [0, 0, 1]])
     lens = [coefficients.get(key, 0.0) for key in _LENS]
     return make_rig_camera(f"{name} in {folder}", matrix, lens, (width, height), rotation, moved)
 

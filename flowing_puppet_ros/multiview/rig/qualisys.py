@@ -60,8 +60,9 @@ def _read_camera(path: Path, node: ElementTree.Element) -> RigCamera:
     except (KeyError, ValueError) as error:
         raise InputError(f"{name} has an entry that is missing or not a number: {error}") from error
     rotation = _TO_OPTICAL @ axes
-    matrix = np.array([[fu, 0.0, cu - left], [0.0, fv, cv - top], [0.0, 0.0, 1.0]])
-    return make_rig_camera(name, matrix, lens, size, rotation, -rotation @ centre)
+    return make_rig_camera(
+        name, np.array([[fu, 0, cu - left], [0, fv, cv - top], [0, 0, 1]]), lens, size, rotation, -rotation @ centre
+    )
 
 
 def write_qualisys_rig(rig: CameraRig, path: Path) -> None:

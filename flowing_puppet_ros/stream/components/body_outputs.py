@@ -65,7 +65,9 @@ class BodyOutputSettings(Settings):
     )
     part_frames: bool = setting(True, "publish a TF frame <part>_<id> for every part of a body")
     frame_prefix: str = setting("", "in front of the names of TF frames, where robots share a tree", advanced=True)
-    person: str = setting("", "id of the person on `person_pose`; empty: the nearest to the frame's origin")
+    person: str = setting(
+        "", "id of the person on `person_pose`; empty: the nearest to the frame's origin", advanced=True
+    )
 
 
 class BodyOutputs:

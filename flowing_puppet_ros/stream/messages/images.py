@@ -76,16 +76,16 @@ _DEPTH = {"16uc1": ("u2", 0.001), "mono16": ("u2", 0.001), "32fc1": ("f4", 1.0)}
 
 
 class SharedImages:
-    """Images that several components decode: each is decoded once while it is among the newest `max_images`."""
+    """Images that several components decode: once for all, while they are among the newest `max_images`."""
 
     def __init__(self, max_images: int) -> None:
         """Keep at most `max_images` decoded images."""
         self._max_images = max_images
         self._kept: deque[SharedImage] = deque()
 
-    def share(self, message: Any) -> SharedImage:
-        """Return an image message in a form that `decode_image` decodes once for all."""
-        return SharedImage(message, self._keep)
+    def share(self, message: Any, readers: int) -> SharedImage:
+        """Return an image message in a form that `decode_image` decodes once for that many readers."""
+        return SharedImage(message, readers, self._keep)
 
     def _keep(self, image: SharedImage) -> None:
         self._kept.append(image)
@@ -94,12 +94,12 @@ class SharedImages:
 
 
 class SharedImage:
-    """An image message whose pixels are kept once it is decoded; nobody may change them."""
+    """An image message whose pixels are kept from its first reader to its last; nobody may change them."""
 
-    def __init__(self, message: Any, keep: Callable[[SharedImage], None]) -> None:
+    def __init__(self, message: Any, readers: int, keep: Callable[[SharedImage], None]) -> None:
         """Wrap a message; `keep` is called with every image that holds pixels from now on."""
         self.header = message.header
-        self._message, self._keep = message, keep
+        self._message, self._readers, self._keep = message, readers, keep
         self._pixels: U8 | None = None
         self._lock = Lock()
 
@@ -110,6 +110,9 @@ class SharedImage:
             if pixels is None:
                 self._pixels = pixels = decode_image(self._message)
                 self._keep(self)
+            self._readers -= 1
+            if self._readers <= 0:
+                self.forget()
             return pixels
 
     def forget(self) -> None:
@@ -137,9 +140,11 @@ def decode_image(message: Any) -> U8:
     if conversion is None:
         # Kernels are compiled for writeable arrays, which all other conversions return.
         return np.array(pixels)
+    if channels == 2 and pixels.shape[1] % 2:  # two pixels share their colours; not every OpenCV minds
+        raise _not_whole(message)
     try:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
-    except cv2.error as error:  # packed formats need an even width, Bayer patterns two rows
+    except cv2.error as error:  # Bayer patterns need two rows
         raise _not_whole(message) from error
 
 

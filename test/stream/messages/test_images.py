@@ -56,7 +56,7 @@ def test_packed_colours_come_back_exactly() -> None:
 def test_a_shared_image_is_decoded_once_while_it_is_kept() -> None:
     shelf = images.SharedImages(max_images=2)
     pictures = [ramp() + k for k in range(3)]
-    first, *others = [shelf.share(message(picture, "rgb8")) for picture in pictures]
+    first, *others = [shelf.share(message(picture, "rgb8"), readers=4) for picture in pictures]
     decoded = images.decode_image(first)
     np.testing.assert_array_equal(decoded, pictures[0])
     assert first.header is HEADER
@@ -66,7 +66,9 @@ def test_a_shared_image_is_decoded_once_while_it_is_kept() -> None:
     again = images.decode_image(first)
     assert again is not decoded, "two newer ones are kept in its place"
     np.testing.assert_array_equal(again, decoded)
-    broken = shelf.share(message(pictures[0], "no encoding"))
+    assert images.decode_image(first) is again, "its last reader"
+    assert images.decode_image(first) is not again
+    broken = shelf.share(message(pictures[0], "no encoding"), readers=2)
     for _ in range(2):
         with pytest.raises(InputError, match="no encoding"):
             images.decode_image(broken)
