@@ -24,6 +24,14 @@ def test_log_undoes_exp(angle: float) -> None:
     np.testing.assert_allclose(rotation.log(rotation.exp(angle * AXES)), angle * AXES, atol=1e-9)
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-7, 1e-3, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-9])
+def test_compiled_loops_have_the_same_exp_and_log(angle: float) -> None:
+    for vector in angle * AXES:
+        matrix = rotation.exp_one(vector)
+        np.testing.assert_allclose(matrix, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
+        np.testing.assert_allclose(rotation.log_one(matrix), vector, atol=1e-9)
+
+
 def test_half_turns_have_an_axis() -> None:
     turned = rotation.exp(np.pi * AXES)
     vectors = rotation.log(turned)

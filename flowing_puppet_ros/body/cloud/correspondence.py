@@ -11,6 +11,7 @@ from numba.extending import register_jitable
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
+from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 
 # Weight of a pair's squared length beside its squared distance along the cloud's normal.
 TANGENTIAL_WEIGHT = 0.05
@@ -30,23 +31,26 @@ class Cloud:
         normals: (N, 3) unit normals, outward.
         nearest: index of `points`.
         viewpoint: (3,) position of the sensor in metres, None when the body was seen from all sides.
+        field: what the sensor at the viewpoint can know, None where it sees everything.
     """
 
     points: np.ndarray
     normals: np.ndarray
     nearest: NearestPoints
     viewpoint: np.ndarray | None
+    field: SensorField | None
 
     @classmethod
     def of(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray | None = None) -> Cloud:
         """Index a cloud."""
-        return cls(points, normals, NearestPoints(points), viewpoint)
+        return cls(points, normals, NearestPoints(points), viewpoint, None)
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return which vertices (V,) face the viewpoint; all of them when there is none."""
+        """Return which vertices (V,) face the viewpoint and are in its field; all when there is no viewpoint."""
         if self.viewpoint is None:
             return np.ones(len(vertices), dtype=bool)
-        return ((self.viewpoint - vertices) * normals).sum(axis=1) > 0
+        facing = ((self.viewpoint - vertices) * normals).sum(axis=1) > 0
+        return facing if self.field is None else facing & ~self.field.find_unknown(vertices)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,14 +69,21 @@ class VertexQuadratic:
 class TwoWayCorrespondence:
     """Correspondences in both directions between a cloud and the bodies of one fit."""
 
-    def __init__(self, cloud: Cloud, max_points: int | None = None) -> None:
-        """Index a cloud; of more than `max_points` points only every second, third ... is matched to a vertex."""
+    def __init__(self, cloud: Cloud, max_points: int | None = None, alternate: int = 1) -> None:
+        """Index a cloud; of more than `max_points` points only every second, third ... is matched to a vertex.
+
+        `alternate` is the number of sets that `attract` takes in turns.
+        """
         self._cloud = cloud
         self._nearest = NearestPoints(cloud.points, cloud.normals, NORMAL_LENGTH_M)
         step = 1 if max_points is None else max(1, -(-len(cloud.points) // max_points))
         self._matched = np.arange(0, len(cloud.points), step)
+        self._alternate = alternate
+        # The last answers, from which the next body's are found faster.
+        self._to_cloud = np.empty(0, dtype=np.int64)
+        self._to_body = np.zeros(len(self._matched), dtype=np.int64)
 
-    def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float) -> VertexQuadratic:
+    def attract(self, vertices: np.ndarray, faces: np.ndarray, sigma: float, turn: int = 0) -> VertexQuadratic:
         """Match both ways and return the quadratic that attracts the vertices to the cloud.
 
         Every vertex that the sensor sees is matched to its closest cloud point, every cloud point to its closest
@@ -84,13 +95,17 @@ class TwoWayCorrespondence:
             vertices: (V, 3) metres.
             faces: (F, 3), outward.
             sigma: width of the robust kernel, metres.
+            turn: number of the step; where sets alternate, it chooses the one that is matched.
         """
-        cloud, matched = self._cloud, self._matched
+        cloud, first, step = self._cloud, turn % self._alternate, self._alternate
         normals = vertex_normals(vertices, faces)
-        seen = np.flatnonzero(cloud.sees(vertices, normals))
-        to_cloud = self._nearest.query(vertices[seen], normals[seen])[1]
-        body = NearestPoints(vertices, normals, NORMAL_LENGTH_M)
-        to_body = body.query(cloud.points[matched], cloud.normals[matched])[1]
+        seen = first + step * np.flatnonzero(cloud.sees(vertices[first::step], normals[first::step]))
+        if len(self._to_cloud) != len(vertices):
+            self._to_cloud = np.zeros(len(vertices), dtype=np.int64)
+        to_cloud = self._nearest.query(vertices[seen], normals[seen], self._to_cloud[seen])[1]
+        body, matched = NearestPoints(vertices, normals, NORMAL_LENGTH_M), self._matched[first::step]
+        to_body = body.query(cloud.points[matched], cloud.normals[matched], self._to_body[first::step])[1]
+        self._to_cloud[seen], self._to_body[first::step] = to_cloud, to_body
         quadratic = VertexQuadratic(np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3)))
         for pairs in ((seen, to_cloud), (to_body, matched)):
             _add_pairs(
@@ -146,16 +161,55 @@ def _add_pairs(pairs, body, cloud, squared_width, share, quadratic):  # type: ig
                 matrix[v, i, j] += weight * point_normals[p, i] * point_normals[p, j]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceDistances:
+    """Distances in metres between a cloud of N points and a body's surface points: V vertices, then F face centres.
+
+    Attributes:
+        seen: (V + F,) which surface points the sensor sees.
+        to_cloud: distances of those to the cloud, in their order.
+        nearest: indices of the cloud's points nearest to them.
+        to_body: (N,) distances of the cloud's points to the nearest surface point, seen or not.
+        to_vertex: (N,) distances of the cloud's points to the nearest vertex, or the nearest of the nearest face.
+    """
+
+    seen: np.ndarray
+    to_cloud: np.ndarray
+    nearest: np.ndarray
+    to_body: np.ndarray
+    to_vertex: np.ndarray
+
+    @property
+    def two_way(self) -> float:
+        """Mean distance over both directions, metres; infinite when nothing is seen."""
+        to_cloud = self.to_cloud.mean() if len(self.to_cloud) else np.inf
+        return float((to_cloud + self.to_body.mean()) / 2)
+
+
+def measure_distances(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray, cloud: Cloud) -> SurfaceDistances:
+    """Measure how far a body and a cloud are apart.
+
+    Args:
+        vertices: (V, 3) metres.
+        normals: (V, 3) unit normals of the vertices.
+        faces: (F, 3), outward.
+        cloud: the cloud.
+    """
+    corners = vertices[faces]
+    surface = np.concatenate([vertices, corners.mean(axis=1)])
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    seen = cloud.sees(surface, np.concatenate([normals, face_normals]))
+    to_cloud, nearest = cloud.nearest.query(surface[seen])
+    to_body, place = NearestPoints(surface).query(cloud.points)
+    to_vertex, at_face = to_body.copy(), np.flatnonzero(place >= len(vertices))
+    gaps = corners[place[at_face] - len(vertices)] - cloud.points[at_face][:, None]
+    to_vertex[at_face] = np.sqrt((gaps**2).sum(axis=2).min(axis=1))
+    return SurfaceDistances(seen, to_cloud, nearest, to_body, to_vertex)
+
+
 def two_way_distance(vertices: np.ndarray, faces: np.ndarray, cloud: Cloud) -> float:
     """Return the mean distance in metres, over both directions, between the body's surface points and the cloud.
 
     The surface is sampled at vertices and face centres; for a one-sided cloud only where it faces the sensor.
     """
-    normals = vertex_normals(vertices, faces)
-    corners = vertices[faces]
-    surface = np.concatenate([vertices, corners.mean(axis=1)])
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    seen = cloud.sees(surface, np.concatenate([normals, face_normals]))
-    to_cloud = cloud.nearest.query(surface[seen])[0].mean() if seen.any() else np.inf
-    to_body = NearestPoints(surface).query(cloud.points)[0].mean()
-    return float((to_cloud + to_body) / 2)
+    return measure_distances(vertices, vertex_normals(vertices, faces), faces, cloud).two_way

@@ -48,7 +48,8 @@ def _vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
             normals[faces[face, corner], 1] += y
             normals[faces[face, corner], 2] += z
     for vertex in range(len(vertices)):
-        length = np.sqrt((normals[vertex] ** 2).sum())
+        x, y, z = normals[vertex, 0], normals[vertex, 1], normals[vertex, 2]
+        length = np.sqrt(x * x + y * y + z * z)
         if length > 0:
-            normals[vertex] /= length
+            normals[vertex, 0], normals[vertex, 1], normals[vertex, 2] = x / length, y / length, z / length
     return normals

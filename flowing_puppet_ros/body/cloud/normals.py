@@ -4,18 +4,25 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import sum_groups
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints, find_bounds
+from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours, fit_normals
 
+MIN_VOXELS, MIN_GROWTH = 400, 1.05  # first voxels along the longest side, and the factor by which they grow at least
 MIN_NEIGHBOURS, MAX_NEIGHBOURS = 9, 24  # points by which a normal is estimated
 POINTS_PER_NEIGHBOUR = 100  # points of a cloud for each of them
+MIN_SPREAD = 1e-6  # of points across their widest plane, for one along it; they lie in that plane below it
 ORIENTATION_RADIUS_M = 0.12  # neighbourhood whose mean lies inside a limb
 
 
 def downsample(points: np.ndarray, normals: np.ndarray | None, max_points: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Replace the points of each voxel by their mean, in growing voxels, until at most `max_points` are left.
+    """Replace the points of each voxel by their mean, in voxels so large that at most `max_points` are left.
 
     Args:
         points: (N, 3) in any unit.
@@ -27,24 +34,53 @@ def downsample(points: np.ndarray, normals: np.ndarray | None, max_points: int) 
     """
     if len(points) <= max_points:
         return points, normals
-    kept = points if normals is None else np.concatenate([points, normals], axis=1)
-    size, weight = float(np.ptp(points, axis=0).max()) / 400, np.ones(len(points))
-    while len(kept) > max_points:
-        cells = np.floor((kept[:, :3] - kept[:, :3].min(axis=0)) / size).astype(np.int64)
-        _, group = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_inverse=True)
-        total = np.bincount(group, weight)
-        kept, weight = sum_groups(kept * weight[:, None], group) / total[:, None], total
-        size *= max(1.05, np.sqrt(len(kept) / max_points))
+    places = np.ascontiguousarray(points, dtype=np.float64)
+    low, high = find_bounds(places)
+    size = float((high - low).max()) / MIN_VOXELS
+    while (count := _count_voxels(cells := _find_cells(places, low, high, size))) > max_points:
+        size *= max(MIN_GROWTH, np.sqrt(count / max_points))
+    group = np.unique(cells, return_inverse=True)[1]
+    held = np.bincount(group)[:, None]
+    kept = sum_groups(places, group) / held
     if normals is None:
         return kept, None
-    length = np.linalg.norm(kept[:, 3:], axis=1, keepdims=True)
-    return np.ascontiguousarray(kept[:, :3]), kept[:, 3:] / np.where(length > 1e-9, length, 1)
+    mean = sum_groups(normals, group) / held
+    length = np.linalg.norm(mean, axis=1, keepdims=True)
+    return kept, mean / np.where(length > 1e-9, length, 1)
+
+
+@njit(cache=True, nogil=True)
+def _find_cells(points: np.ndarray, low: np.ndarray, high: np.ndarray, size: float) -> np.ndarray:
+    """Return the number (N,) of the voxel of each point."""
+    ny, nz = int((high[1] - low[1]) / size) + 1, int((high[2] - low[2]) / size) + 1
+    cells = np.empty(len(points), np.int64)
+    for row in range(len(points)):
+        i, j = int((points[row, 0] - low[0]) / size), int((points[row, 1] - low[1]) / size)
+        cells[row] = (i * ny + j) * nz + int((points[row, 2] - low[2]) / size)
+    return cells
+
+
+@njit(cache=True, nogil=True)
+def _count_voxels(cells: np.ndarray) -> int:
+    """Count different numbers (N,), by a hash table."""
+    slots = 16
+    while slots < 2 * len(cells):
+        slots *= 2
+    table, count = np.full(slots, -1, np.int64), 0
+    for cell in cells:
+        slot = (cell * 2654435761 >> 16) & (slots - 1)
+        while table[slot] >= 0 and table[slot] != cell:
+            slot = (slot + 1) & (slots - 1)
+        if table[slot] < 0:
+            table[slot] = cell
+            count += 1
+    return count
 
 
 def estimate_normals(
     points: np.ndarray, viewpoint: np.ndarray | None, surface: tuple[np.ndarray, np.ndarray] | None = None
 ) -> np.ndarray:
-    """Estimate the outward unit normals (N, 3) of a cloud (N, 3) in metres, with Open3D.
+    """Estimate the outward unit normals (N, 3) of a cloud (N, 3) in metres, by the planes through the nearest points.
 
     Normals of a single view are oriented towards `viewpoint` (3,). Near a known `surface`, its points (M, 3) and
     outward normals (M, 3), they are oriented as those of its nearest points, in a fraction of the time. Otherwise they
@@ -53,31 +89,18 @@ def estimate_normals(
     Raises:
         InputError: when the points lie in a plane or on a line, where no side is outside.
     """
-    import open3d as o3d
-
-    # The Delaunay graph behind the consistent orientation loses precision far from the origin.
+    # Covariances lose precision far from the origin.
     center = points.mean(axis=0)
     points = points - center
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     # A neighbourhood must stay smaller than a limb, however few the points are.
-    neighbours = int(np.clip(len(points) // POINTS_PER_NEIGHBOUR, MIN_NEIGHBOURS, MAX_NEIGHBOURS))
-    cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(neighbours))
+    count = int(np.clip(len(points) // POINTS_PER_NEIGHBOUR, MIN_NEIGHBOURS, MAX_NEIGHBOURS))
+    normals = fit_normals(points, find_neighbours(points, count))
     if viewpoint is not None:
-        cloud.orient_normals_towards_camera_location(viewpoint - center)
-        return np.asarray(cloud.normals).copy()
+        return _turn_along(normals, viewpoint - center - points)
     if surface is not None:
         surface_points, surface_normals = surface
-        normals = np.asarray(cloud.normals).copy()
-        cosine = (normals * surface_normals[cKDTree(surface_points - center).query(points)[1]]).sum(axis=1)
-        return normals * np.where(cosine < 0, -1.0, 1.0)[:, None]
-    try:
-        cloud.orient_normals_consistent_tangent_plane(neighbours // 2 + 2)
-    except RuntimeError as error:
-        raise InputError(
-            f"the {len(points)} points of the cloud lie in a plane or on a line, so their normals are unknown;"
-            " give the surface of a person"
-        ) from error
-    normals = np.asarray(cloud.normals).copy()
+        return _turn_along(normals, surface_normals[NearestPoints(surface_points - center).query(points)[1]])
+    normals = _orient_consistently(points, normals, find_neighbours(points, count // 2 + 2))
     # Around a limb the mean of a neighbourhood lies inside it, so that outward normals point away from it.
     near = cKDTree(points).query_ball_point(points[:: max(1, len(points) // 500)], ORIENTATION_RADIUS_M)
     outward = [
@@ -85,3 +108,50 @@ def estimate_normals(
         for index, rows in zip(range(0, len(points), max(1, len(points) // 500)), near, strict=True)
     ]
     return normals if np.sum(outward) >= 0 else -normals
+
+
+def _turn_along(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Return the normals (N, 3), with those flipped that point against their direction (N, 3)."""
+    return np.asarray(normals * np.where((normals * directions).sum(axis=1) < 0, -1.0, 1.0)[:, None])
+
+
+def _orient_consistently(points: np.ndarray, normals: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
+    """Return the normals (N, 3), flipped where that makes them agree along a tree of the most parallel `neighbours`.
+
+    The tree starts at the topmost point, whose normal points up.
+    """
+    spread = np.linalg.svd(points.T @ points, compute_uv=False)
+    if spread[2] <= MIN_SPREAD**2 * spread[0]:
+        raise InputError(
+            f"the {len(points)} points of the cloud lie in a plane or on a line, so their normals are unknown;"
+            " give the surface of a person"
+        )
+    count = len(points)
+    pairs = np.stack([np.repeat(np.arange(count), neighbours.shape[1]), neighbours.ravel()], axis=1)
+    pairs = np.concatenate([pairs, _bridge_gaps(points, pairs)])
+    pairs = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
+    first, second = np.divmod(np.unique(pairs[:, 0] * count + pairs[:, 1]), count)
+    # From 1, because an edge without weight would be none; that changes no tree.
+    weight = 2.0 - np.abs((normals[first] * normals[second]).sum(axis=1))
+    tree = minimum_spanning_tree(csr_matrix((weight, (first, second)), shape=(count, count)))
+    top = int(points[:, 2].argmax())
+    order, parents = breadth_first_order(tree, top, directed=False)
+    agree = np.where((normals[order[1:]] * normals[parents[order[1:]]]).sum(axis=1) < 0, -1.0, 1.0)
+    sign = np.ones(count)
+    sign[top] = -1.0 if normals[top, 2] < 0 else 1.0
+    for point, same in zip(order[1:].tolist(), agree.tolist(), strict=True):
+        sign[point] = same * sign[parents[point]]
+    return normals * sign[:, None]
+
+
+def _bridge_gaps(points: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Return the shortest pairs (K, 2) between the largest group of points that `pairs` connect and each other one."""
+    graph = coo_matrix((np.ones(len(pairs), dtype=np.int8), pairs.T), shape=(len(points), len(points)))
+    label = connected_components(graph, directed=False)[1]
+    largest = np.bincount(label).argmax()
+    main, others = np.flatnonzero(label == largest), np.flatnonzero(label != largest)
+    distance, nearest = cKDTree(points[main]).query(points[others])
+    closest = others[np.lexsort((distance, label[others]))]
+    chosen = np.flatnonzero(np.diff(label[closest], prepend=-1))
+    bridge = closest[chosen]
+    return np.stack([bridge, main[nearest[np.searchsorted(others, bridge)]]], axis=1)

@@ -6,12 +6,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic, geman_mcclure
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
+from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours
 from flowing_puppet_ros.evidence.cloud.one_sided import OneSidedView
+from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 
 MAX_VIEW_POINTS = 4000
 """More points of one side add time and no accuracy."""
@@ -20,8 +21,8 @@ MIN_SENSOR_DISTANCE_M = 0.05
 MIN_DEPTH_TOLERANCE_M, TOLERANCE_PER_NOISE = 0.01, 2.5
 """Distance in front of the seen surface, at least and in multiples of the noise, at which a vertex is not yet pushed
 back. Noise that counts on one side only would push the body away from the sensor."""
-NOISE_NEIGHBOURS = 6
-"""Points by which the noise is measured, with the point itself."""
+NOISE_NEIGHBOURS, MAX_NOISE_POINTS = 6, 1000
+"""Points by which the noise is measured, with the point itself, and points at which it is measured, at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,7 +39,12 @@ class SingleViewCloud(Cloud):
 
     @classmethod
     def seen_from(
-        cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray, unknown: np.ndarray | None = None
+        cls,
+        points: np.ndarray,
+        normals: np.ndarray,
+        viewpoint: np.ndarray,
+        unknown: np.ndarray | None = None,
+        field: SensorField | None = None,
     ) -> SingleViewCloud:
         """Index a cloud; the arguments are those of `Cloud`, `unknown` that of `OneSidedView.build`.
 
@@ -51,20 +57,23 @@ class SingleViewCloud(Cloud):
                 f"the sensor at {np.round(viewpoint, 2).tolist()} m stands within the cloud and cannot have seen one"
                 " side of it; check the frame or fit it as a whole cloud"
             )
-        near = points[cKDTree(points).query(points, k=min(NOISE_NEIGHBOURS, len(points)))[1]]
-        noise = float(np.median(np.abs(((near - points[:, None]) * normals[:, None]).sum(axis=2)[:, 1:])))
-        view = OneSidedView.build(points, viewpoint, unknown)
+        every = 1 + len(points) // MAX_NOISE_POINTS
+        near, own = find_neighbours(points, NOISE_NEIGHBOURS, every), np.arange(0, len(points), every)
+        apart = np.abs(((points[near] - points[own, None]) * normals[own, None]).sum(axis=2))
+        noise = float(np.median(apart[near != own[:, None]]))
+        view = OneSidedView.build(points, viewpoint, unknown, field)
         return cls(
             points,
             normals,
             NearestPoints(points),
             viewpoint,
+            field,
             view,
             max(MIN_DEPTH_TOLERANCE_M, TOLERANCE_PER_NOISE * noise),
         )
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return which vertices (V,) face the sensor and are not hidden by what it saw."""
+        """Return which vertices (V,) face the sensor, are in its field and not hidden by what it saw."""
         facing = ((self.view.viewpoint - vertices) * normals).sum(axis=1) > 0
         return np.asarray(facing & ~self.view.find_hidden(vertices))
 

@@ -16,10 +16,12 @@ import numpy as np
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.initialisation import flip_heading, sample_bodies
+from flowing_puppet_ros.body.fit.partial_view import measure_unknown_share, strengthen_priors
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
 from flowing_puppet_ros.body.fit.quality import MAX_UNCOVERED, FitQuality, assess_fit
 from flowing_puppet_ros.body.fit.single_view_search import ROUGH, SingleViewSearch
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
+from flowing_puppet_ros.body.search.body_energy import BodyEnergy
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.limb_search import SINGLE_LIMBS, LimbSearch, limb_groups
@@ -44,18 +46,22 @@ MAX_REPAIRABLE_COST_M = 0.06
 # Cost of the best limb hypothesis, in costs of the body that it came from, for another repair round; the second where
 # so much of the cloud is uncovered that the whole body is probably wrong.
 MAX_COST_RATIO, MAX_COST_RATIO_IF_WRONG, MIN_WRONG_UNCOVERED = 0.98, 0.9, 0.25
+# Gauss-Newton from initial joints where the sensor sees a part of the person only.
+PARTIAL = RefineWeights(sigma_start=0.2, sigma_end=0.03, iterations=20)
 # Bodies that are refined to compare frames.
 ROUGH_STARTS = 4
-# Shares of the particles and rounds in a quick search, and in one for the warm-up.
-QUICK_SHARE, WARM_UP_SHARE = 0.5, 0.1
+# Share of the particles and rounds in a search for the warm-up.
+WARM_UP_SHARE = 0.1
+# Cost of a body turned to the other heading, in costs of the body itself, from which on no search around it helps.
+MAX_TURNED_RATIO = 1.3
 
 
 @dataclass(frozen=True, slots=True)
 class FitterSettings(Settings):
     """Settings of `BodyFitter`; the defaults are fast, the thesis has 80 particles and 120 iterations."""
 
-    particles: int = setting(40, "particles per part", low=4, high=1000)
-    iterations: int = setting(50, "iterations of the search when the pose is unknown", low=1, high=10000)
+    particles: int = setting(20, "particles per part", low=4, high=1000)
+    iterations: int = setting(25, "iterations of the search when the pose is unknown", low=1, high=10000)
     local_particles: int = setting(
         20, "particles per part when the pose is roughly known", low=4, high=1000, advanced=True
     )
@@ -110,7 +116,9 @@ class BodyHypotheses:
         self._settings = settings
         self._threads = usable_threads(settings.threads)
         points = build_part_points(model)
-        self.particle_search = BodyParticleSearch(model, points, SearchWeights(lm_steps=settings.levenberg_steps))
+        weights = SearchWeights(lm_steps=settings.levenberg_steps)
+        self.particle_search = BodyParticleSearch(model, points, weights)
+        self.energy = BodyEnergy(model, points, weights.stitch, weights.mismatch)
         self.gauss_newton = GaussNewton(model)
         self._proposer = Proposer(model, points)
         self.limb_search = LimbSearch(model, self.particle_search, self._proposer)
@@ -124,7 +132,7 @@ class BodyHypotheses:
 
         Cases:
             single view: the search from the pose bank, by itself; what follows is for whole clouds.
-            quick: half of the particles and rounds first; enough if the body is close, whatever its limbs do.
+            quick: enough if the first search is close, whatever its limbs do.
             restarts: 1 + `restarts` searches, each in both headings, until a body is close.
             repair: suspect limbs of each candidate are searched again before it is compared.
         """
@@ -132,16 +140,15 @@ class BodyHypotheses:
             return self._single_view_search.run(cloud, rng, self._settings.gauss_newton_steps, progress)
         grid = CloudGrid.build(cloud.points, cloud.normals)
         none, steps = JointTargets.none(self._model), self._settings.gauss_newton_steps
-        if quick:
-            best = self._search_both_headings(cloud, grid, rng, sub_progress(progress, 0.0, 0.3), QUICK_SHARE)[0]
-            if self._is_close(best):
-                return self.refine(best.state, cloud, none, steps)
         tries = 1 + self._settings.restarts
         tried: list[BodyCandidate] = []
         for number in range(tries):
-            for candidate in self._search_both_headings(
+            candidates = self._search_both_headings(
                 cloud, grid, rng, sub_progress(progress, number / tries, (number + 0.7) / tries)
-            ):
+            )
+            if quick and self._is_close(candidates[0]):
+                return self.refine(candidates[0].state, cloud, none, steps)
+            for candidate in candidates:
                 tried.append(self.repair_limbs(candidate, cloud, grid, rng))
                 best = min(tried, key=lambda candidate: candidate.cost)
                 if self._is_close(best):
@@ -188,15 +195,20 @@ class BodyHypotheses:
             start, grid, targets, stages, iterations, rng, progress, threads=self._threads
         ).state
 
-    def refine(self, body: BodyState, cloud: Cloud, targets: JointTargets, steps: int) -> BodyState:
-        """Return the body after `steps` Gauss-Newton steps over all parts."""
+    def refine(self, body: BodyState, cloud: Cloud, targets: JointTargets, steps: int, alternate: int = 1) -> BodyState:
+        """Return the body after `steps` Gauss-Newton steps over all parts; `alternate` is that of `RefineWeights`."""
         terms = [cloud.free_space_term] if isinstance(cloud, SingleViewCloud) else []
-        return self.gauss_newton.run(body, cloud, targets, RefineWeights(iterations=steps), terms)
+        return self.gauss_newton.run(body, cloud, targets, RefineWeights(iterations=steps, alternate=alternate), terms)
+
+    def refine_partial(self, body: BodyState, cloud: SingleViewCloud, targets: JointTargets) -> BodyState:
+        """Return a body that lies roughly on the seen part of a person after Gauss-Newton steps over all parts."""
+        weights = strengthen_priors(PARTIAL, measure_unknown_share(self._model, body, cloud))
+        return self.gauss_newton.run(body, cloud, targets, weights, [cloud.free_space_term])
 
     def evaluate(self, body: BodyState, cloud: Cloud) -> BodyCandidate:
         """Refine a hypothesis briefly and assess it."""
         steps = min(MAX_HYPOTHESIS_STEPS, self._settings.gauss_newton_steps)
-        state = self.refine(body, cloud, JointTargets.none(self._model), steps)
+        state = self.refine(body, cloud, JointTargets.none(self._model), steps, alternate=2)
         return BodyCandidate(state, assess_fit(self._model, self._model.vertices(state), cloud))
 
     def _search_both_headings(
@@ -218,37 +230,45 @@ class BodyHypotheses:
             start, grid, none, stages, iterations, rng, sub_progress(progress, 0.0, 0.8), threads=self._threads
         )
         body = self.evaluate(found.state, cloud)
-        flipped = self.search_near(
-            flip_heading(self._model, body.state), grid, none, rng, sub_progress(progress, 0.8, 1.0)
-        )
-        return sorted([body, self.evaluate(flipped, cloud)], key=lambda candidate: candidate.cost)
+        turned = flip_heading(self._model, body.state)
+        flipped = self.evaluate(turned, cloud)
+        if flipped.cost < MAX_TURNED_RATIO * body.cost:
+            near = self.search_near(turned, grid, none, rng, sub_progress(progress, 0.8, 1.0))
+            flipped = min(flipped, self.evaluate(near, cloud), key=lambda candidate: candidate.cost)
+        return sorted([body, flipped], key=lambda candidate: candidate.cost)
 
     def repair_limbs(
         self, body: BodyCandidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator
     ) -> BodyCandidate:
-        """Search suspect limbs of a body again, round after round, while that brings it closer to the cloud."""
+        """Search suspect limbs of a body again, round after round, while that brings it closer to the cloud.
+
+        First one by one, then, where much of the cloud stays uncovered, also several at once.
+        """
+        several = False
         for _ in range(self._settings.max_limb_repairs):
             if not body.quality.limb_suspect or body.cost > MAX_REPAIRABLE_COST_M:
                 break
-            states = [body.state, *self._propose_limbs(body, cloud, grid, rng)]
+            states = self._propose_limbs(body, cloud, grid, rng, several)
             candidates = parallel_map(lambda state: self.evaluate(state, cloud), states, self._threads)
-            closest = min(candidates, key=lambda candidate: candidate.cost)
-            wrong = body.quality.uncovered > MIN_WRONG_UNCOVERED
-            body, before = min(body, closest, key=lambda candidate: candidate.cost), body
-            if closest.cost > (MAX_COST_RATIO_IF_WRONG if wrong else MAX_COST_RATIO) * before.cost:
+            before, body = body, min([body, *candidates], key=lambda candidate: candidate.cost)
+            wrong = before.quality.uncovered > MIN_WRONG_UNCOVERED
+            helped = body.cost <= (MAX_COST_RATIO_IF_WRONG if wrong else MAX_COST_RATIO) * before.cost
+            uncovered = body.quality.uncovered > MAX_UNCOVERED
+            if not helped and (several or not uncovered):
                 break
+            several = uncovered
         return body
 
     def _propose_limbs(
-        self, body: BodyCandidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator
+        self, body: BodyCandidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator, several: bool
     ) -> list[BodyState]:
         """Return the closest bodies with limbs searched again, and those with a doubtful limb at its mean pose.
 
-        Several limbs are searched at once when much of the cloud is uncovered.
+        `several` limbs are also searched at once.
         """
         groups = limb_groups(self._model.tree)
         limbs = groups[:SINGLE_LIMBS]
-        if body.quality.uncovered <= MAX_UNCOVERED:
+        if not several:
             groups = limbs
         found = parallel_map(
             lambda pair: self.limb_search.run(body.state, pair[0], cloud, grid, pair[1]),

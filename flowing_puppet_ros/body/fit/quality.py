@@ -7,9 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, geman_mcclure, two_way_distance
-from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, geman_mcclure, measure_distances
+from flowing_puppet_ros.body.cloud.mesh_geometry import sum_groups, vertex_normals
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 KERNEL_WIDTH_M = 0.04  # distance to the other surface at which a vertex or point counts a quarter
@@ -87,21 +86,22 @@ def assess_fit(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> Fit
     4 cm; vertices not at all where the normals disagree.
     """
     normals = vertex_normals(vertices, model.faces)
-    distance, index = cloud.nearest.query(vertices)
-    weight = geman_mcclure(distance**2, KERNEL_WIDTH_M**2)
-    weight *= (normals * cloud.normals[index]).sum(axis=1) > 0
-    seen = cloud.sees(vertices, normals)
+    distances = measure_distances(vertices, normals, model.faces, cloud)
+    seen = np.flatnonzero(distances.seen[: len(vertices)])
+    weight = geman_mcclure(distances.to_cloud[: len(seen)] ** 2, KERNEL_WIDTH_M**2)
+    weight *= (normals[seen] * cloud.normals[distances.nearest[: len(seen)]]).sum(axis=1) > 0
     owner, parts = model.part_of_vertex, len(model.tree)
     count, size = np.bincount(owner[seen], minlength=parts), np.bincount(owner, minlength=parts)
-    share = np.bincount(owner[seen], weight[seen], minlength=parts) / np.maximum(count, 1)
-    to_body = NearestPoints(vertices).query(cloud.points)[0]
-    centers = np.stack([vertices[owner == part].mean(axis=0) for part in range(parts)])
-    distances = [np.linalg.norm(centers[parent] - centers[child]) for parent, child in model.tree.edges]
+    share = np.bincount(owner[seen], weight, minlength=parts) / np.maximum(count, 1)
+    to_vertex = distances.to_vertex
+    centers = sum_groups(vertices, owner, parts) / size[:, None]
+    edges = np.array(model.tree.edges)
+    apart = np.linalg.norm(centers[edges[:, 0]] - centers[edges[:, 1]], axis=1)
     return FitQuality(
         share,
         count >= MIN_SEEN_SHARE * size,
-        float(geman_mcclure(to_body**2, KERNEL_WIDTH_M**2).mean()),
-        float((to_body > MAX_COVERED_DISTANCE_M).mean()),
-        int(np.sum(np.array(distances) < MIN_DISJOINT_DISTANCE_M)),
-        two_way_distance(vertices, model.faces, cloud),
+        float(geman_mcclure(to_vertex**2, KERNEL_WIDTH_M**2).mean()),
+        float((to_vertex > MAX_COVERED_DISTANCE_M).mean()),
+        int(np.count_nonzero(apart < MIN_DISJOINT_DISTANCE_M)),
+        distances.two_way,
     )

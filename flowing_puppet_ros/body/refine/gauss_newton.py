@@ -10,14 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from scipy.linalg import solve
+from numba import njit
+from scipy.linalg import LinAlgError
+from scipy.linalg.lapack import dposv
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic, geman_mcclure
-from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, PosedPoints, System
-from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.model import rotation as so3
+from flowing_puppet_ros.body.refine.joint_rows import JointRows
+from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, System
+from flowing_puppet_ros.body.search.energy import RAY_SHARE, JointTargets
+from flowing_puppet_ros.model.posing import PosedPoints
+from flowing_puppet_ros.model.rotation import exp_one
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 MAX_COEFFICIENT = 3.5  # standard deviations
@@ -47,6 +52,7 @@ class RefineWeights:
         sigma_start: first width of the robust kernel, metres.
         sigma_end: last width of the robust kernel, metres.
         iterations: number of steps.
+        alternate: sets that vertices and matched cloud points are divided into; a step asks one set for its matches.
         shape_center: (S,) expected shape in standard deviations, such as that of earlier frames; None for 0.
     """
 
@@ -57,6 +63,7 @@ class RefineWeights:
     sigma_start: float = 0.10
     sigma_end: float = 0.03
     iterations: int = 25
+    alternate: int = 1
     shape_center: np.ndarray | None = None
 
 
@@ -70,9 +77,7 @@ class GaussNewton:
     def __init__(self, model: StitchedPuppet) -> None:
         self._model = model
         self._equations = NormalEquations(model)
-        self._regressor = np.zeros((len(model.joint_names), len(model.part_of_vertex)))
-        for row, (index, weight) in enumerate(zip(model.joint_index, model.joint_weight, strict=True)):
-            np.add.at(self._regressor[row], index, weight)
+        self._joints = JointRows(model, self._equations)
 
     def run(
         self,
@@ -92,15 +97,16 @@ class GaussNewton:
             state.pose.copy(),
             np.tile(state.shape.mean(axis=0), (len(state.shape), 1)),
         )
-        all_terms = list(terms)
-        if cloud is not None:
-            matches = TwoWayCorrespondence(cloud, MAX_MATCHED_POINTS)
-            all_terms.append(lambda vertices, sigma: matches.attract(vertices, self._model.faces, sigma))
+        matches = None if cloud is None else TwoWayCorrespondence(cloud, MAX_MATCHED_POINTS, weights.alternate)
         ratio = weights.sigma_end / weights.sigma_start
         for step in range(weights.iterations):
             sigma = weights.sigma_start * ratio ** (step / max(weights.iterations - 1, 1))
-            state = self._step(state, all_terms, targets, weights, sigma)
+            turns = [] if matches is None else [partial(self._attract, matches, step)]
+            state = self._step(state, [*terms, *turns], targets, weights, sigma)
         return state
+
+    def _attract(self, matches: TwoWayCorrespondence, turn: int, vertices: np.ndarray, sigma: float) -> VertexQuadratic:
+        return matches.attract(vertices, self._model.faces, sigma, turn)
 
     def _step(
         self,
@@ -120,7 +126,7 @@ class GaussNewton:
         equations.add_joint_prior(weights.pairwise, state, system)
         self._add_priors(state, weights, system)
         hessian[np.diag_indices(equations.size)] += 1e-9 + 1e-3 * hessian.diagonal()
-        return self._retract(state, solve(hessian, -gradient, lower=True, assume_a="pos", overwrite_a=True))
+        return self._retract(state, _solve_lower(hessian, -gradient))
 
     def _add_joints(
         self, targets: JointTargets, width: float, posed: PosedPoints, rotation: np.ndarray, system: System
@@ -129,13 +135,13 @@ class GaussNewton:
         chosen = np.flatnonzero(targets.weight > 0)
         if not len(chosen):
             return
-        gap = self._regressor[chosen] @ posed.vertices - targets.points[chosen]
+        gap = self._joints.find_joints(chosen, posed.vertices) - targets.points[chosen]
+        rows = self._joints.derive(chosen, posed, rotation)
+        if targets.rays is not None:
+            ray = targets.rays[chosen]
+            squeeze = np.eye(3) - (1 - RAY_SHARE) * ray[:, :, None] * ray[:, None, :]
+            gap, rows = np.squeeze(squeeze @ gap[:, :, None], axis=2), squeeze @ rows
         trust = geman_mcclure((gap**2).sum(axis=1), width**2)
-        rows = np.zeros((len(chosen), 3, len(gradient)))
-        for part, jacobian in enumerate(self._equations.compute_jacobians(posed)):
-            vertex = self._model.part_vertices[part]
-            share = self._regressor[np.ix_(chosen, vertex)] * self._equations.share[vertex]
-            rows[:, :, self._equations.unknowns(part)] += rotation[part] @ np.tensordot(share, jacobian, 1)
         flat = rows.reshape(-1, len(gradient))
         weight = np.repeat(trust * targets.weight[chosen], 3)
         hessian += (flat * weight[:, None]).T @ flat
@@ -153,13 +159,33 @@ class GaussNewton:
 
     def _retract(self, state: BodyState, step: np.ndarray) -> BodyState:
         first, (rows, parts, numbers) = self._equations.first, self._equations.coefficients
-        pose = state.pose.copy()
-        rigid = step[first[:-1, None] + np.arange(6)]
-        turn, translation = rigid[:, :3], rigid[:, 3:]
-        angle = np.linalg.norm(turn, axis=1, keepdims=True)
-        turn = turn * np.minimum(1.0, MAX_ROTATION_STEP_RAD / np.maximum(angle, 1e-12))
-        center = state.center + np.squeeze(state.rotation @ translation[:, :, None], axis=2)
+        center, rotation, pose = state.center.copy(), np.ascontiguousarray(state.rotation), state.pose.copy()
         pose[parts, numbers] += step[rows]
+        rotation = _move_parts(center, rotation, step, first)
         shape = np.clip(state.shape + step[first[-1] :], -MAX_COEFFICIENT, MAX_COEFFICIENT)
         pose = np.clip(pose, -MAX_COEFFICIENT, MAX_COEFFICIENT)
-        return BodyState(center, state.rotation @ so3.exp(turn), pose, shape)
+        return BodyState(center, rotation, pose, shape)
+
+
+@njit(cache=True, nogil=True)
+def _move_parts(center: np.ndarray, rotation: np.ndarray, step: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Move the centres (N, 3) by the steps' translations and return the rotations (N, 3, 3) turned by their turns."""
+    turned = np.empty_like(rotation)
+    for part in range(len(center)):
+        turn, translation = step[first[part] : first[part] + 3].copy(), step[first[part] + 3 : first[part] + 6]
+        angle = np.sqrt(turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
+        turn *= min(1.0, MAX_ROTATION_STEP_RAD / max(angle, 1e-12))
+        center[part] += rotation[part] @ translation
+        turned[part] = rotation[part] @ exp_one(turn)
+    return turned
+
+
+def _solve_lower(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a positive definite system of which only the lower triangle is filled; `matrix` (U, U) is overwritten.
+
+    LAPACK itself, because `scipy.linalg.solve` takes as long again to copy the matrix and to estimate its condition.
+    """
+    solution, failed = dposv(matrix.T, right, lower=0, overwrite_a=True)[1:]
+    if failed:
+        raise LinAlgError("the normal equations are not positive definite")
+    return np.asarray(solution)

@@ -8,16 +8,14 @@ filled.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
-
 import numpy as np
 from numba import njit
 
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.refine.joint_prior import joint_quadratic
 from flowing_puppet_ros.model import rotation as so3
-from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+from flowing_puppet_ros.model.posing import PosedPoints
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet, body_points
 
 PRIOR_RIDGE = 0.05
 """Standard deviation added to a joint's rotation (radians) and coefficients, which bounds the precision."""
@@ -27,21 +25,6 @@ PRIOR_RIDGE = 0.05
 LayoutArrays = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 # Hessian (U, U), of which the lower triangle is filled, and gradient (U,).
 System = tuple[np.ndarray, np.ndarray]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PosedPoints:
-    """A body's points in metres.
-
-    Attributes:
-        local: (M, 3) points of all parts, one part after the other, in the parts' own frames.
-        world: (M, 3) the same points in the common frame.
-        vertices: (V, 3) of the body in the common frame, means of the copies in different parts.
-    """
-
-    local: np.ndarray
-    world: np.ndarray
-    vertices: np.ndarray
 
 
 class NormalEquations:
@@ -55,27 +38,17 @@ class NormalEquations:
     """
 
     def __init__(self, model: StitchedPuppet) -> None:
-        self._model = model
-        poses = np.array([model.pose_count(part) for part in range(len(model.tree))])
-        self._starts = np.concatenate([[0], np.cumsum([len(rows) for rows in model.part_vertices])])
-        self._rows = np.concatenate(model.part_vertices).astype(np.int64)
-        self.share = 1.0 / np.bincount(self._rows, minlength=len(model.part_of_vertex))
-        self._mean = np.concatenate([model.mean_shape[i] + model.mean_pose[i] for i in range(len(poses))])
-        self._basis = np.zeros((len(self._rows), 3, poses.max() + model.shape_count))
-        for part, count in enumerate(poses):
-            own = self._basis[self._starts[part] : self._starts[part + 1]]
-            own[:, :, :count], own[:, :, count : count + model.shape_count] = (
-                model.pose_basis[part], model.shape_basis[part],
-            )  # fmt: skip
-        self._poses = poses
+        self._points = body_points(model)
+        self.share = self._points.share
+        poses, starts = self._points.poses, self._points.starts
         self.first = np.concatenate([[0], np.cumsum(6 + poses)])
         self.size = int(self.first[-1]) + model.shape_count
-        self._layout: LayoutArrays = (self._basis, poses, self._starts, self._rows, self.share, self.first)
+        self._layout: LayoutArrays = (self._points.basis, poses, starts, self._points.rows, self.share, self.first)
         edges = model.tree.edges
         self._edges = np.array(edges, np.int64).reshape(-1, 2)
         ends = np.cumsum([0, *(len(interface.weight) for interface in model.interfaces)])
-        above = [self._starts[p] + part.parent_index for (p, _), part in zip(edges, model.interfaces, strict=True)]
-        below = [self._starts[c] + part.child_index for (_, c), part in zip(edges, model.interfaces, strict=True)]
+        above = [starts[p] + part.parent_index for (p, _), part in zip(edges, model.interfaces, strict=True)]
+        below = [starts[c] + part.child_index for (_, c), part in zip(edges, model.interfaces, strict=True)]
         pairs = np.stack([np.concatenate(above), np.concatenate(below)], axis=1).astype(np.int64)
         weight = np.concatenate([interface.weight / interface.weight.sum() for interface in model.interfaces])
         self._stitches = (ends, pairs, weight)
@@ -98,19 +71,9 @@ class NormalEquations:
         own = np.arange(self.first[part], self.first[part + 1])
         return np.concatenate([own, np.arange(self.first[-1], self.size)])
 
-    def compute_jacobians(self, posed: PosedPoints) -> list[np.ndarray]:
-        """Return for each part the derivatives (N_i, 3, unknowns) of its points in its own frame."""
-        shapes, made = self.size - int(self.first[-1]), []
-        for part, (start, end) in enumerate(pairwise(self._starts)):
-            jacobian = np.empty((end - start, 3, 6 + self._poses[part] + shapes))
-            _fill_jacobians(jacobian, posed.local[start:end], self._basis[start:end])
-            made.append(jacobian)
-        return made
-
     def pose_points(self, state: BodyState) -> PosedPoints:
-        """Return the points of a body, whose shape is that of its first part."""
-        body = (state.center, state.rotation, state.pose, state.shape[0])
-        return PosedPoints(*_pose_points(body, self._mean, self._layout))
+        """Return the points of a body."""
+        return self._points.pose(state)
 
     def add_surface(self, term: VertexQuadratic, posed: PosedPoints, rotation: np.ndarray, system: System) -> None:
         """Add a quadratic of every vertex for parts with `rotation` (N, 3, 3); a zero matrix costs nothing."""
@@ -123,38 +86,8 @@ class NormalEquations:
 
     def add_joint_prior(self, strength: float, state: BodyState, system: System) -> None:
         """Add half the squared Mahalanobis distance of every edge to its Gaussian (Eq. 49), times `strength`."""
-        parents, children = self._edges[:, 0], self._edges[:, 1]
-        relative = so3.log(state.rotation[parents].transpose(0, 2, 1) @ state.rotation[children])
-        _add_joint_prior(strength, (relative, state.pose), self._joint_priors, self._edges, self._layout, system)
-
-
-@njit(cache=True, nogil=True)
-def _pose_points(body, mean, layout):  # type: ignore[no-untyped-def]
-    """Return `PosedPoints` of a body (centres, rotations, pose and shape coefficients) with template points `mean`."""
-    center, rotation, pose, shape = body
-    basis, poses, starts, rows, share, _ = layout
-    local, world = np.empty_like(mean), np.empty_like(mean)
-    vertices = np.zeros((len(share), 3))
-    amounts = np.zeros(basis.shape[2])
-    for part in range(len(poses)):
-        used = poses[part] + len(shape)
-        amounts[: poses[part]] = pose[part, : poses[part]]
-        amounts[poses[part] : used] = shape
-        for k in range(starts[part], starts[part + 1]):
-            for i in range(3):
-                total = mean[k, i]
-                for column in range(used):
-                    total += basis[k, i, column] * amounts[column]
-                local[k, i] = total
-            row = rows[k]
-            for i in range(3):
-                world[k, i] = center[part, i] + (
-                    rotation[part, i, 0] * local[k, 0]
-                    + rotation[part, i, 1] * local[k, 1]
-                    + rotation[part, i, 2] * local[k, 2]
-                )
-                vertices[row, i] += share[row] * world[k, i]
-    return local, world, vertices
+        body = (np.ascontiguousarray(state.rotation), state.pose)
+        _add_joint_prior(strength, body, self._joint_priors, self._edges, self._layout, system)
 
 
 @njit(cache=True, inline="always")
@@ -169,12 +102,6 @@ def _fill_jacobian(jacobian, local, basis, k, columns):  # type: ignore[no-untyp
         jacobian[i, 3 + i] = 1.0
         for column in range(columns):
             jacobian[i, 6 + column] = basis[k, i, column]
-
-
-@njit(cache=True, nogil=True)
-def _fill_jacobians(jacobians, local, basis):  # type: ignore[no-untyped-def]
-    for k in range(len(local)):
-        _fill_jacobian(jacobians[k], local, basis, k, jacobians.shape[2] - 6)
 
 
 @njit(cache=True, nogil=True)
@@ -298,8 +225,8 @@ def _add_stitching(strength, points, rotations, edges, stitches, layout, system)
 
 @njit(cache=True, nogil=True)
 def _add_joint_prior(strength, body, priors, edges, layout, system):  # type: ignore[no-untyped-def]
-    """Add the priors (means and precisions of the edges) of a body (relative rotations, pose coefficients)."""
-    (relative, pose), (mean, precision) = body, priors
+    """Add the priors (means and precisions of the edges) of a body (rotations, pose coefficients)."""
+    (rotations, pose), (mean, precision) = body, priors
     _, poses, _, _, _, first = layout
     hessian, gradient = system
     rows = np.empty(6 + precision.shape[1], np.int64)
@@ -308,11 +235,12 @@ def _add_joint_prior(strength, body, priors, edges, layout, system):  # type: ig
         up, down = poses[parent], poses[child]
         count = 3 + up + down
         deviation = np.empty(count)
-        deviation[:3] = relative[edge]
+        relative = so3.log_one(np.ascontiguousarray(rotations[parent].T) @ rotations[child])
+        deviation[:3] = relative
         deviation[3 : 3 + up] = pose[parent, :up]
         deviation[3 + up :] = pose[child, :down]
         deviation -= mean[edge, :count]
-        block, slope = joint_quadratic(relative[edge], deviation, np.ascontiguousarray(precision[edge, :count, :count]))
+        block, slope = joint_quadratic(relative, deviation, np.ascontiguousarray(precision[edge, :count, :count]))
         for k in range(3):
             rows[k], rows[3 + k] = first[parent] + k, first[child] + k
         for k in range(up):

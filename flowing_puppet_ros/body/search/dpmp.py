@@ -11,10 +11,10 @@ import numpy as np
 from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles, stitching_costs
 from flowing_puppet_ros.body.search.levenberg import levenberg_marquardt
 from flowing_puppet_ros.body.search.part_points import PartPoints
-from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
+from flowing_puppet_ros.body.search.particles import Particles, particles_to_state
 from flowing_puppet_ros.body.search.proposals import Proposer
 from flowing_puppet_ros.body.search.schedule import Stage, four_stages
-from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, DataCost
+from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.inference.diverse import select_diverse
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product, message_foundation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -161,15 +161,6 @@ class BodyParticleSearch:
         for part in proposed:
             scored[part] = scored[part].take(self._select(part, counts[part], result, edges, stage.greedy))
         return scored
-
-    def energy(self, state: BodyState, cloud: DataCost) -> float:
-        """Return the energy of one body (Eq. 50), with every weight as in the last stage of the search."""
-        none = JointTargets.none(self._model)
-        scored = [
-            ScoredParticles.score(points, group, cloud, none)
-            for points, group in zip(self._points, states_to_particles(self._model, [state]), strict=True)
-        ]
-        return self._solve(scored, four_stages(self._model.tree)[-1])[0].cost
 
     def _propose(
         self, part: int, scored: list[ScoredParticles], best: np.ndarray, stage: Stage, rng: np.random.Generator

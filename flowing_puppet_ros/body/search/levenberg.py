@@ -13,6 +13,8 @@ cloud's count less, joint targets count too, and a weak prior keeps the deformat
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numba import njit
 
@@ -20,6 +22,7 @@ from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.part_points import PartPoints
 from flowing_puppet_ros.body.search.particles import Particles
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, look_up
+from flowing_puppet_ros.model.rotation import exp_one
 from flowing_puppet_ros.model.sp import MAX_DEVIATIONS
 
 INITIAL_DAMPING = 0.1  # relative to the diagonal of J J^T
@@ -66,12 +69,18 @@ def prepare_part(
     mean = np.concatenate(
         [surface.apply_shape(particles.shape)[:, :count], joints.apply_shape(particles.shape)], axis=1
     )
-    basis = np.concatenate([surface.pose_basis[:count], joints.pose_basis]).transpose(0, 2, 1).copy()
+    return mean, _share_part(points, targets, count)
+
+
+@lru_cache(maxsize=64)
+def _share_part(points: PartPoints, targets: JointTargets, count: int) -> PartArrays:
+    """Return what all particles of a part share, made once in a search."""
+    basis = np.concatenate([points.surface.pose_basis[:count], points.joints.pose_basis]).transpose(0, 2, 1).copy()
     weight = np.concatenate([np.full(count, 1.0 / count), targets.weight[points.joint_index]])
     first = np.tensordot(weight, basis, 1)
     second = np.tensordot(basis * weight[:, None, None], basis, axes=([0, 2], [0, 2]))
     target = np.ascontiguousarray(targets.points[points.joint_index])
-    return mean, (basis, np.ascontiguousarray(points.normals[:count]), weight, target, first, second)
+    return basis, np.ascontiguousarray(points.normals[:count]), weight, target, first, second
 
 
 @njit(cache=True, nogil=True)
@@ -97,7 +106,7 @@ def _optimise_all(
             if angle > MAX_ROTATION_STEP_RAD:
                 step *= MAX_ROTATION_STEP_RAD / angle
             new_center = center[p] + rotation[p] @ step[3:6]
-            new_rotation = rotation[p] @ _exp(step[:3])
+            new_rotation = rotation[p] @ exp_one(step[:3])
             new_pose = np.minimum(np.maximum(pose[p] + step[6:], -MAX_DEVIATIONS), MAX_DEVIATIONS)
             new_cost = assemble(new_center, new_rotation, new_pose, mean[p], part, cloud, new_hessian, new_gradient)
             if new_cost < cost:
@@ -252,16 +261,3 @@ def _solve(hessian: np.ndarray, gradient: np.ndarray, damping: float, factor: np
         for k in range(row + 1, unknowns):
             step[row] -= factor[k, row] * step[k]
         step[row] /= factor[row, row]
-
-
-@njit(cache=True, nogil=True)
-def _exp(vector: np.ndarray) -> np.ndarray:
-    """Return the rotation (3, 3) of one rotation vector (3,) by Rodrigues' formula."""
-    angle = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
-    cross = np.zeros((3, 3))
-    cross[0, 1], cross[0, 2] = -vector[2], vector[1]
-    cross[1, 0], cross[1, 2] = vector[2], -vector[0]
-    cross[2, 0], cross[2, 1] = -vector[1], vector[0]
-    first = np.sin(angle) / angle if angle > 1e-8 else 1.0
-    second = (1 - np.cos(angle)) / angle**2 if angle > 1e-8 else 0.5
-    return np.eye(3) + first * cross + second * (cross @ cross)

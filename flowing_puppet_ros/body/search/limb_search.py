@@ -30,9 +30,10 @@ LEG_PARTS = ("upper_leg", "lower_leg", "foot")
 MAX_EXPLAINED_DISTANCE_M = 0.03
 # Share of the cloud that must be left for a limb: a person's arm has about 9 %, a leg 17 %.
 MIN_UNEXPLAINED_SHARE = 0.01
+MAX_GAP_POINTS = 400  # vertices and cloud points by which a limb's poses are compared
 MAX_GAP_M = 0.1  # larger distances count as this one
 # Poses in which each part is attached to its parent, particles of them that are kept, and rounds of the search.
-ATTACHMENTS, PARTICLES, ITERATIONS = 120, 30, 14
+ATTACHMENTS, PARTICLES, ITERATIONS = 60, 15, 8
 
 
 def limb_groups(tree: PartTree) -> tuple[tuple[int, ...], ...]:
@@ -122,7 +123,11 @@ class LimbSearch:
 
 
 def _limb_gap(limb: np.ndarray, points: np.ndarray, cloud: Cloud) -> float:
-    """Return the mean distance of a limb's vertices (V, 3) to the cloud plus that of the points (M, 3) to the limb."""
+    """Return the mean distance of a limb's vertices (V, 3) to the cloud plus that of the points (M, 3) to the limb.
+
+    Some hundreds of each are enough to compare poses.
+    """
+    points, limb = (places[:: -(-len(places) // MAX_GAP_POINTS)] for places in (points, limb))
     to_cloud = cloud.nearest.query(limb)[0]
     to_limb = cKDTree(limb).query(points, distance_upper_bound=MAX_GAP_M)[0]
     return float(np.minimum(to_cloud, MAX_GAP_M).mean() + np.minimum(to_limb, MAX_GAP_M).mean())

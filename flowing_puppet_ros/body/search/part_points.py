@@ -69,6 +69,7 @@ class PartPoints:
 
     Attributes:
         surface: points spread evenly over the part, as any number of the first ones is.
+        rows: (K,) local indices of `surface` among the part's vertices.
         normals: (K, 3) outward normals of `surface` in the part's frame.
         interfaces: for each edge at this part the interface points, in the edge's order.
         joints: joints whose position this part determines alone.
@@ -76,6 +77,7 @@ class PartPoints:
     """
 
     surface: PointSet
+    rows: np.ndarray
     normals: np.ndarray
     interfaces: dict[int, PointSet]
     joints: PointSet
@@ -99,6 +101,7 @@ def _build_part(model: StitchedPuppet, part: int, count: int, normals: np.ndarra
     joints, joint_index = _find_own_joints(model, part)
     return PartPoints(
         PointSet.of_part(model, part, rows),
+        rows,
         np.ascontiguousarray(normals[model.part_vertices[part][rows]]),
         interfaces,
         joints,

@@ -85,10 +85,7 @@ class CloudGrid:
         low, high = points.min(axis=0) - margin, points.max(axis=0) + margin
         cell = max(cell, float(np.prod(high - low) / MAX_CELLS) ** (1 / 3))
         shape = np.ceil((high - low) / cell).astype(np.int64) + 1
-        nearest = np.full(shape, -1, dtype=np.int32)
-        distance = np.full(shape, np.inf)
-        _scatter(points, low, cell, nearest, distance)
-        _sweep(points, low, cell, nearest, distance)
+        nearest = fill_nearest(points, low, cell, shape)
         return cls(points, np.ascontiguousarray(normals, dtype=np.float64), low, cell, nearest)
 
     def data_cost(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -106,6 +103,21 @@ class CloudGrid:
         points = np.ascontiguousarray(points, dtype=np.float64)
         normals = np.ascontiguousarray(normals, dtype=np.float64)
         return _data_cost(self.points, self.normals, self.nearest, self.origin, self.cell, points, normals)
+
+
+def fill_nearest(points: np.ndarray, low: np.ndarray, cell: float, shape: np.ndarray) -> np.ndarray:
+    """Return for each cell of a grid (shape, int32) the point nearest to its centre, give or take some millimetres.
+
+    Args:
+        points: (N, 3), within the grid.
+        low: (3,) centre of the first cell.
+        cell: edge of a cell.
+        shape: (3,) number of cells along each axis.
+    """
+    nearest, distance = np.full(shape, -1, dtype=np.int32), np.full(shape, np.inf)
+    _scatter(points, low, cell, nearest, distance)
+    _sweep(points, low, cell, nearest, distance)
+    return nearest
 
 
 @njit(cache=True, nogil=True)
@@ -159,7 +171,7 @@ def _sweep(points: np.ndarray, low: np.ndarray, cell: float, nearest: np.ndarray
                                 continue
                             for c in range(-1, 2 if a or b else 0):
                                 z = k + way * c
-                                if 0 <= z < nz and nearest[x, y, z] >= 0:
+                                if 0 <= z < nz and nearest[x, y, z] >= 0 and nearest[x, y, z] != nearest[i, j, k]:
                                     _offer(points, low, cell, nearest, distance, i, j, k, nearest[x, y, z])
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -19,6 +19,7 @@ from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.image.video.live_tracker import LiveTracker, make_live_tracker
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
+from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, nested, setting
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
@@ -88,7 +89,12 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         """Load the body model."""
         super().__init__(settings, factory)
         self._model = DeformableStructures.load(settings.model, settings.parts)
-        self._tracker = FlowingPuppetTracker(self._model, settings.tracker, settings.flow)
+        self._tracker = FlowingPuppetTracker(
+            self._model,
+            settings.tracker,
+            settings.flow,
+            MultiViewStructures.load(settings.model, settings.parts),
+        )
         self._live = make_live_tracker(self._tracker, settings.detection, self.counters)
         self._line = PendingQueue()
         self._shelves = {port.name: StampBuffer() for port in self.inputs if port.optional}
@@ -234,7 +240,8 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
             return None
 
     def _publish(self, header: Any, earlier: Any, image: U8, result: TrackResult) -> Output:
-        puppets = make_puppets(self.factory, header, self._model, result.puppets)
+        named = [replace(puppet, id=self.publish_id(puppet.id)) for puppet in result.puppets]
+        puppets = make_puppets(self.factory, header, self._model, named)
         outputs: Output = [("puppets", puppets)]
         if self._humans.enabled:
             made = make_image_messages(self.factory, header, image, puppets.puppets)

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.track.scene_tracker import ONLY_ID
+from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitter, SilhouetteFitterSettings
 from flowing_puppet_ros.stream.components.body_outputs import id_sort_key
@@ -28,16 +28,18 @@ class SilhouetteBodies:
         """Prepare to fit `model`."""
         self._fitter = SilhouetteFitter(model, settings)
         self._last: dict[str, tuple[int, BodyState]] = {}
+        self._motions: dict[str, TorsoMotion] = {}
         self._header: Any = None
         self._missing: set[str] = set()
-        self._fits: list[tuple[str, BodyFit]] = []
+        self._bodies: list[TrackedBody] = []
 
     def reset(self) -> None:
         """Forget all people and what is collected."""
         self._last.clear()
+        self._motions.clear()
         self._header = None
         self._missing.clear()
-        self._fits.clear()
+        self._bodies.clear()
 
     @property
     def is_complete(self) -> bool:
@@ -55,16 +57,16 @@ class SilhouetteBodies:
         if self._header is None:
             self._header, self._missing = message.header, {*message.people, _find_id(message)}
         self._missing.discard(_find_id(message))
-        self._fits.append(self.fit(message))
+        self._bodies.append(self.fit(message))
 
-    def collect(self) -> tuple[Any, list[tuple[str, BodyFit]]]:
+    def collect(self) -> tuple[Any, list[TrackedBody]]:
         """Return the header (None if there is nothing) and the bodies of the sets collected, and begin anew."""
-        header, fits = self._header, sorted(self._fits, key=lambda entry: id_sort_key(entry[0]))
-        self._header, self._missing, self._fits = None, set(), []
-        return header, fits
+        header, bodies = self._header, sorted(self._bodies, key=lambda body: id_sort_key(body.id))
+        self._header, self._missing, self._bodies = None, set(), []
+        return header, bodies
 
-    def fit(self, message: Any) -> tuple[str, BodyFit]:
-        """Fit the person in a SilhouetteSet; return the id and the body. InputError when it cannot be fitted."""
+    def fit(self, message: Any) -> TrackedBody:
+        """Fit the person in a SilhouetteSet. InputError when it cannot be fitted."""
         identity, stamp = _find_id(message), stamp_ns(message)
         last_stamp, last_state = self._last.get(identity, (stamp, None))
         if not 0 <= stamp - last_stamp <= _MAX_AGE_NS:
@@ -72,7 +74,7 @@ class SilhouetteBodies:
         fit = self._fitter.fit(decode_silhouettes(message), decode_body_joints(message.person), last_state)
         if fit.reliable:
             self._last[identity] = stamp, fit.state
-        return identity, fit
+        return self._motions.setdefault(identity, TorsoMotion()).add(identity, stamp, fit)
 
 
 def _find_id(message: Any) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.association.people_tracker import PersonInSpace
 from flowing_puppet_ros.multiview.association.settings import AssociationSettings
@@ -157,7 +158,7 @@ class VisualHullComponent(Component[VisualHullSettings]):
             return []
         segmented = [(person.id, self._segment(frames, person, puppets)) for person, puppets in people]
         header = make_header(self.factory, stamp, self._frame)
-        bodies = [self._make_body(identity, person) for identity, person in segmented]
+        bodies = [self._make_body(self.publish_id(identity), person) for identity, person in segmented]
         headers = {name: complete[name][1]["image"].header for name in frames}
         outputs = self._make_silhouettes(header, bodies, [person for _, person in segmented], headers)
         return outputs + self._make_hull(header, bodies, [person for _, person in segmented]) if carve else outputs
@@ -171,7 +172,9 @@ class VisualHullComponent(Component[VisualHullSettings]):
         return self._builder.segment(views, person.id)
 
     def _make_body(self, identity: str, person: MultiViewPerson) -> Any:
-        joints = make_joints(self.factory, self._matcher.joint_names, person.joints, person.confidence)
+        names = self._matcher.joint_names
+        seen = [Visibility.SEEN] * len(names)
+        joints = make_joints(self.factory, names, person.joints, person.confidence, seen)
         confidence = float(person.confidence.mean())
         return self.factory.make("flowing_puppet_msgs/msg/Body", id=identity, confidence=confidence, joints=joints)
 

@@ -117,6 +117,20 @@ def test_a_moved_body_is_pulled_back(ball: Ball) -> None:
     np.testing.assert_allclose(step, -move, atol=0.006)
 
 
+def test_sets_that_take_turns_pull_alike_and_together_reach_every_vertex(ball: Ball) -> None:
+    vertices, faces, cloud = ball
+    move = np.array([0.02, -0.01, 0.03])
+    matches, reached = TwoWayCorrespondence(cloud, alternate=3), np.zeros(len(vertices), dtype=bool)
+    for turn in range(6):
+        quadratic = matches.attract(vertices + move, faces, 0.1, turn)
+        step = np.linalg.solve(quadratic.matrix.sum(axis=0), -quadratic.vector.sum(axis=0))
+        np.testing.assert_allclose(step, -move, atol=0.006)
+        pulled = quadratic.matrix.any(axis=(1, 2))
+        assert pulled[turn % 3 :: 3].all() and pulled.mean() < 0.9
+        reached |= pulled
+    assert reached.all()
+
+
 def test_contradicting_normals_and_far_points_do_not_pull(ball: Ball) -> None:
     vertices, faces, _ = ball
     inside_out = Cloud.of(vertices, -vertices)

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
+from flowing_puppet_ros.body.search.body_energy import BodyEnergy
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
-from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles, stitching_costs
 from flowing_puppet_ros.body.search.limb_search import LimbSearch, limb_groups
 from flowing_puppet_ros.body.search.part_points import PartPoints
 from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
@@ -58,13 +59,34 @@ def test_parts_with_one_particle_stay_and_every_mode_holds_its_own_particle(
     np.testing.assert_array_equal([mode.center[foot] for mode in modes], found.scored[foot].particles.center)
     assert any(np.array_equal(mode.center, found.state.center) for mode in modes)
     # No body of other particles above the foot has less energy than the mode with that foot.
+    energy = BodyEnergy(model, points, SearchWeights().stitch, SearchWeights().mismatch)
     for mode in modes[:2]:
-        lowest = search.energy(mode, grid)
+        lowest = energy.measure(mode, grid)
         for thigh in range(5):
             other = mode.center.copy(), mode.rotation.copy(), mode.pose.copy(), mode.shape.copy()
             for values, own in zip(other, astuple(found.scored[leg[0]].particles, thigh), strict=True):
                 values[leg[0]][: len(own)] = own
-            assert search.energy(BodyState(*other), grid) >= lowest - 1e-9
+            assert energy.measure(BodyState(*other), grid) >= lowest - 1e-9
+
+
+def test_the_energy_of_a_body_is_the_sum_over_its_parts_and_edges(
+    model: StitchedPuppet, points: tuple[PartPoints, ...], body: BodyState, grid: CloudGrid
+) -> None:
+    center = body.center.copy()
+    center[3], center[5] = center[model.tree.parents[3]] + 0.01, center[5] + 0.1
+    state = BodyState(center, body.rotation, body.pose, body.shape + 0.3)
+    scored = [
+        ScoredParticles.score(own, group, grid, JointTargets.none(model))
+        for own, group in zip(points, states_to_particles(model, [state]), strict=True)
+    ]
+    expected = sum(float(part.distance[0] + 0.3 * part.mismatch[0]) for part in scored)
+    for edge, (parent, child) in enumerate(model.tree.edges):
+        a, b = scored[parent], scored[child]
+        centers = a.particles.center, b.particles.center
+        weight = model.interfaces[edge].weight
+        expected += 0.5 * float(stitching_costs(weight, a.interfaces[edge], b.interfaces[edge], centers, 4.0)[0, 0])
+    assert BodyEnergy(model, points, 4.0, 0.3).measure(state, grid) == pytest.approx(expected)
+    assert expected > 0.5 + BodyEnergy(model, points, 4.0, 0.3).measure(body, grid), "two centres in one place cost 1/2"
 
 
 def astuple(particles: Particles, index: int) -> tuple[np.ndarray, ...]:

@@ -41,3 +41,14 @@ def test_directions_count_as_lengths() -> None:
     assert (index >= 400).all()
     tree = cKDTree(np.hstack([points, 0.03 * normals]))
     np.testing.assert_allclose(distance, tree.query(np.hstack([queries, 0.03 * looks]))[0])
+
+
+def test_a_guess_changes_the_time_and_not_the_answer() -> None:
+    rng = np.random.default_rng(2)
+    queries, wild = SPHERE[::2] + 0.05 * rng.normal(size=(1000, 3)), rng.integers(0, len(SPHERE), 1000)
+    for index, directions in ((NearestPoints(SPHERE), None), (NearestPoints(SPHERE, SPHERE, 0.03), SPHERE[::2])):
+        plain = index.query(queries, directions)
+        for guess in (wild, plain[1]):
+            distance, found = index.query(queries, directions, guess)
+            np.testing.assert_array_equal(found, plain[1])
+            np.testing.assert_allclose(distance, plain[0], atol=1e-12)
