@@ -4,7 +4,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from capsule_man import Joints, cloud_of
+from capsule_man import cloud_of  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorProjection
@@ -22,6 +22,9 @@ PUPPET_JOINTS = (
     *("neck", "belly", "face", "right_shoulder", "left_shoulder", "right_hip", "left_hip", "right_elbow"),
     *("left_elbow", "right_knee", "left_knee", "right_wrist", "left_wrist", "right_ankle", "left_ankle"),
 )
+
+
+Joints = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)

@@ -229,7 +229,11 @@ def test_latched_messages_are_not_dropped_while_the_worker_is_busy(
     _, session = open_session()
     session.worker.limit, busy, handled = 1, Event(), []
     monkeypatch.setattr(session, "_handle", lambda port, topic, message: handled.append((port, message.data)))
-    session.worker.call(lambda: busy.wait(10) and None)
+
+    def wait() -> None:
+        busy.wait(10)
+
+    session.worker.call(wait)
     for number in range(3):
         session._on_message(Port("names", TEXT, "latched"), "/names", String(data=str(number)))
         session._on_message(Port("other", TEXT, "sensor"), "/other", String(data=str(number)))
