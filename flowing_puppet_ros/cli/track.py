@@ -38,6 +38,7 @@ from flowing_puppet_ros.image.video.clip import (
     track_clip,
     track_live,
 )
+from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
@@ -107,14 +108,24 @@ def _track(
     def progress(frames: Iterable[DetectedFrame], title: str) -> Iterable[DetectedFrame]:
         return tqdm(frames, title, total=source.count or None, unit="frame", disable=None)
 
+    views = MultiViewStructures.load(model.gender, len(model.tree))
     if arguments.live:
-        return track_live(source.clip, model, settings, networks=networks, warn=source.warnings, progress=progress)
+        return track_live(
+            source.clip,
+            model,
+            settings,
+            networks=networks,
+            views=views,
+            warn=source.warnings,
+            progress=progress,
+        )
     return track_clip(
         source.clip,
         model,
         settings,
         method=arguments.method,
         networks=networks,
+        views=views,
         warn=source.warnings,
         progress=progress,
     )

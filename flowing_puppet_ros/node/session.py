@@ -296,7 +296,11 @@ class Session[C: Component[Any]]:
         self._diagnostics.count_received(port.name)
         if port.alternatives and hasattr(message, "ids"):
             self._bodies[port.name].follow(topic, message.ids)
-        self.worker.put(port.name, partial(self._handle, port.name, topic, message))
+        task = partial(self._handle, port.name, topic, message)
+        if port.qos == "latched":  # sent once, and each says something of its own
+            self.worker.call(task)
+        else:
+            self.worker.put(port.name, task)
 
     def _on_skeleton(self, port: str, topic: str, skeleton: BodySkeleton) -> None:
         self.worker.put(port, partial(self._handle, port, topic, skeleton), skeleton.id)

@@ -4,11 +4,16 @@
 from __future__ import annotations
 
 import heapq
+import sys
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from threading import Condition, Thread
 from types import TracebackType
 from typing import Self
+
+SWITCH_INTERVAL_S = 0.0005
+"""Time after which a thread takes the interpreter from another one. With Python's 5 ms, threads that leave it for short
+work in libraries wait for most of their time to come back."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +58,10 @@ class Pipeline:
         self._unfinished = 0
         self._error: BaseException | None = None
         self._closed = False
+        self._switch_interval = sys.getswitchinterval()
         count = threads if threads > 1 else 0
+        if count:
+            sys.setswitchinterval(min(SWITCH_INTERVAL_S, self._switch_interval))
         self._threads = [Thread(target=self._serve, name=f"pipeline-{k}", daemon=True) for k in range(count)]
         for thread in self._threads:
             thread.start()
@@ -133,6 +141,7 @@ class Pipeline:
             self._state.notify_all()
         for thread in self._threads:
             thread.join()
+        sys.setswitchinterval(self._switch_interval)
         if kind is None:
             self._raise_error()
 

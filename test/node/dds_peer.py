@@ -68,6 +68,7 @@ class Puppet(IdlStruct, typename=OWN + "Puppet_"):
     id: str
     model: str
     view: str
+    heading: float32
     scale: float32
     energy: float32
     confidence: float32

@@ -101,7 +101,7 @@ def test_a_camera_that_is_not_plain_is_one_sentence() -> None:
         choose_rgbd(two, "")
     with pytest.raises(InputError, match=r"no depth images below /left/ .* are /left/color/image_raw;"):
         choose_rgbd(two, "left")
-    with pytest.raises(InputError, match="no colour images below /c/ .* are none;"):
+    with pytest.raises(InputError, match=r"no colour images below /c/ .* are none;"):
         choose_rgbd({}, "/c")
     with pytest.raises(InputError, match="nobody publishes /camera/color/camera_info"):
         choose_rgbd(ORBBEC, "/camera")

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from pathlib import Path
+from threading import Event
 from typing import Any
 
 import pytest
@@ -220,3 +221,20 @@ def test_outputs_of_optional_packages_are_made_where_these_are_installed_and_wan
         node.destroy_node()
         other.destroy_node()
         rclpy.try_shutdown()
+
+
+def test_latched_messages_are_not_dropped_while_the_worker_is_busy(
+    open_session: Callable[..., tuple[Node, Session[Names]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _, session = open_session()
+    session.worker.limit, busy, handled = 1, Event(), []
+    monkeypatch.setattr(session, "_handle", lambda port, topic, message: handled.append((port, message.data)))
+    session.worker.call(lambda: busy.wait(10) and None)
+    for number in range(3):
+        session._on_message(Port("names", TEXT, "latched"), "/names", String(data=str(number)))
+        session._on_message(Port("other", TEXT, "sensor"), "/other", String(data=str(number)))
+    done = Event()
+    session.worker.call(done.set)
+    busy.set()
+    assert done.wait(10)
+    assert handled == [("names", "0"), ("names", "1"), ("names", "2"), ("other", "2")]

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -64,6 +65,15 @@ def test_stages_run_at_the_same_time() -> None:
         pipeline.add([Task("a", meet)])
         pipeline.add([Task("b", meet)])
     assert not meeting.broken
+
+
+def test_threads_take_short_turns_and_the_interpreters_own_come_back() -> None:
+    before = sys.getswitchinterval()
+    with Pipeline(1, max_sequences=4):
+        assert sys.getswitchinterval() == before
+    with Pipeline(2, max_sequences=4):
+        assert sys.getswitchinterval() == pytest.approx(0.0005)
+    assert sys.getswitchinterval() == pytest.approx(before)
 
 
 def test_adding_waits_while_too_much_is_unfinished() -> None:

@@ -33,6 +33,7 @@ from flowing_puppet_ros.image.video.detection_worker import DetectionWorker
 from flowing_puppet_ros.image.video.pending_detection import FRAME_NS
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.image.video.tracklets import FIRST
+from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 MAX_PEOPLE = 80
@@ -85,13 +86,14 @@ class ClipRun:
     given: PeopleByFrame | None
     settings: ClipSettings
     networks: KeypointSource | None = None
+    views: MultiViewStructures | None = None
 
     @classmethod
     def load(cls, frames: Sequence[VideoFrame], given: PeopleByFrame | None, settings: ClipSettings) -> ClipRun:
         """Load the shipped model, detector and likelihood."""
         model = DeformableStructures.load()
         worker = DetectionWorker(_CachedDetector(PartDetector.load()), ArmEvidenceModel(model, PartLikelihood.load()))
-        return cls(model, frames, worker, given, settings)
+        return cls(model, frames, worker, given, settings, views=MultiViewStructures.load())
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -112,6 +114,7 @@ class ClipRun:
                 method=method,
                 worker=self.worker,
                 networks=self.networks,
+                views=self.views,
                 flow_of=flow_of,
             )
         )
@@ -146,7 +149,9 @@ def _zero_flow(run: ClipRun, frame: VideoFrame) -> FlowPair:
 
 
 def _track_live(run: ClipRun) -> ClipTrack:
-    return _locate(track_live(run.clip(), run.model, run.settings, worker=run.worker, networks=run.networks))
+    return _locate(
+        track_live(run.clip(), run.model, run.settings, worker=run.worker, networks=run.networks, views=run.views)
+    )
 
 
 def _track_as_node(run: ClipRun) -> ClipTrack:
@@ -160,7 +165,13 @@ def _track_as_node(run: ClipRun) -> ClipTrack:
     played = [*run.frames, *run.frames[::-1], *run.frames]
     stamped = [replace(frame, index=k, stamp_ns=k * FRAME_NS) for k, frame in enumerate(played)]
     frames = track_live(
-        Clip.of(stamped), run.model, settings, LiveDetectionSettings(), worker=run.worker, networks=run.networks
+        Clip.of(stamped),
+        run.model,
+        settings,
+        LiveDetectionSettings(),
+        worker=run.worker,
+        networks=run.networks,
+        views=run.views,
     )
     return _locate(frames)[-len(run.frames) :]
 

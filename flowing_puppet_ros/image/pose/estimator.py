@@ -30,9 +30,6 @@ from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
 from flowing_puppet_ros.threads import one_blas_thread
 
-MIN_SIDE_PROBABILITY = 0.97
-"""Probability of a side view from which the model of that view is used instead of the frontal one."""
-
 VIEW_CONFIDENCE_FACTOR = 0.3
 """Factor on the confidence of detected joints when the view is estimated: detectors err more than the model."""
 
@@ -181,9 +178,8 @@ class PoseEstimator:
             return self._front, None
         mirror = np.array([1.0 if view == "front" else -1.0, 1.0])
         probability = self._side_models[0].posterior(joints * mirror, confidence * VIEW_CONFIDENCE_FACTOR)
-        best = int(probability.argmax())
-        middle = len(probability) // 2
-        if probability[middle - 1 : middle + 2].sum() > 1.0 - MIN_SIDE_PROBABILITY:
+        best = self._side_models[0].find_side(probability)
+        if best is None:
             return self._front, None
         return tuple(side.views[best] for side in self._side_models), best
 

@@ -43,18 +43,27 @@ class ImageScale:
         return np.asarray((points + 0.5) / self.factor - 0.5)
 
 
-def render_label_map(model: DeformableStructures, shapes: Sequence[PuppetShape], grid: ImageScale) -> U16:
+def render_label_map(
+    model: DeformableStructures, shapes: Sequence[PuppetShape], headings: Sequence[float], grid: ImageScale
+) -> U16:
     """Draw labels (h, w) on the working grid: with P parts, part i of person k is k * P + i + 1; 0 is background.
 
-    Larger people are drawn last, as the nearer ones.
+    `headings` (rad) tell which limbs of a person seen from the side are behind the torso. Larger people are drawn
+    last, as the nearer ones.
     """
     width, height = grid.work
     labels = np.zeros((height, width), dtype=np.uint16)
     for k in sorted(range(len(shapes)), key=lambda k: shapes[k].scale):
         contours = tuple(grid.to_work(contour) for contour in shapes[k].contours)
-        own = render_labels(contours, depth_order(model, shapes[k].view), (height, width))
+        own = render_labels(contours, depth_order(model, shapes[k].view, headings[k]), (height, width))
         np.copyto(labels, own + np.uint16(k * len(model.tree)), where=own > 0)
     return labels
+
+
+def render_tracks(model: DeformableStructures, tracks: Sequence[Track], grid: ImageScale) -> U16:
+    """Draw the label map of the people who are tracked."""
+    drawn = [(track.shape, track.side_heading) for track in tracks if track.shape is not None]
+    return render_label_map(model, [shape for shape, _ in drawn], [heading for _, heading in drawn], grid)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,7 +91,7 @@ def propagate_tracks(
     visible parts of half the squared misfit in pixels plus the share of pixels that do not support the motion.
     """
     count = len(model.tree)
-    labels = render_label_map(model, [track.shape for track in tracks if track.shape is not None], grid)
+    labels = render_tracks(model, tracks, grid)
     forest = tuple(
         parent + k * count if parent >= 0 else -1 for k in range(len(tracks)) for parent in model.tree.parents
     )

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, I64, Bools
+from flowing_puppet_ros.image.tracking.heading import HeadingFilter
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PuppetShape, View
 from flowing_puppet_ros.settings import Settings, setting
@@ -72,7 +73,8 @@ class Track:
     (J, 3) is this image's detection as x, y and confidence, `detection` its index among the detections, or None.
     `detector_id` is the detector's own id of the last matched detection that had one.
     `unseen` and `missed` count images and detector runs without a match. `appearance` are the colours of the torso (see
-    `appearance`) or None; `overlapped` is set if another torso overlapped with it since the last detection.
+    `appearance`) or None; `overlapped` is set if another torso overlapped with it since the last detection. `heading`
+    tells from which side the person is seen, None where only front and back are told apart.
     """
 
     id: str
@@ -95,12 +97,22 @@ class Track:
     shape: PuppetShape | None = None
     appearance: F64 | None = None
     overlapped: bool = False
+    heading: HeadingFilter | None = None
 
     @classmethod
     def start(
-        cls, identity: str, model: DeformableStructures, joints: F64, confidence: F64, settings: TrackerSettings
+        cls,
+        identity: str,
+        model: DeformableStructures,
+        joints: F64,
+        confidence: F64,
+        settings: TrackerSettings,
+        heading: HeadingFilter | None = None,
     ) -> Track:
-        """Start a track at a detection: `joints` (J, 2) px with NaN where unknown, `confidence` (J,)."""
+        """Start a track at a detection: `joints` (J, 2) px with NaN where unknown, `confidence` (J,).
+
+        With a `heading` it is drawn by the puppet of the side from which the person is seen.
+        """
         scale = model.estimate_scale(joints, confidence)
         view = model.estimate_view(joints, confidence)
         count = len(joints)
@@ -119,7 +131,10 @@ class Track:
             view=view,
             detected=np.column_stack([joints, confidence]),
             view_votes=MIN_TURN_VOTES if view == "front" else -MIN_TURN_VOTES,
+            heading=heading,
         )
+        if heading is not None:
+            heading.update(joints, confidence, view)
         track.complete_and_redraw(model)
         return track
 
@@ -140,9 +155,19 @@ class Track:
         """Return which joints (J,) lie outside of the image (width, height)."""
         return ((self.mean < -0.5) | (self.mean > np.array(image_size) - 0.5)).any(axis=1)
 
+    @property
+    def side_heading(self) -> float:
+        """Angle in rad by which the drawn puppet is turned to the right, 0 for front and back."""
+        return 0.0 if self.heading is None else self.heading.side_heading
+
+    def choose_model(self, model: DeformableStructures) -> DeformableStructures:
+        """Return the puppet of the side from which the person is seen, `model` from front and back."""
+        side = None if self.heading is None else self.heading.side_model
+        return model if side is None else side
+
     def complete_and_redraw(self, model: DeformableStructures) -> None:
         """Place the unknown joints by the body model and draw the puppet for the joints, scale and view."""
-        unknown = self.unknown
+        unknown, model = self.unknown, self.choose_model(model)
         weight = np.where(unknown, 0.0, np.maximum(self.quality, 0.05))
         if unknown.any():
             known = np.where(unknown[:, None], np.nan, self.mean)
@@ -153,7 +178,7 @@ class Track:
         """Follow the scale slowly, and flip between front and back only on repeated evidence."""
         joints = np.where(self.unknown[:, None], np.nan, self.mean)
         confidence = np.where(self.unknown, 0.0, self.quality)
-        scale = model.estimate_scale(joints, confidence)
+        scale = self.choose_model(model).estimate_scale(joints, confidence)
         self.scale *= float(np.clip(scale / self.scale, 0.5, 2.0)) ** SCALE_GAIN
         vote = 1.0 if model.estimate_view(joints, confidence) == "front" else -1.0
         self.view_votes = float(np.clip(self.view_votes + vote, -MAX_VIEW_VOTES, MAX_VIEW_VOTES))
@@ -161,6 +186,8 @@ class Track:
             self.view = "front"
         elif self.view_votes <= -MIN_TURN_VOTES:
             self.view = "back"
+        if self.heading is not None:
+            self.heading.update(joints, confidence, self.view)
 
     def override_joint(self, joint: int, place: F64, confidence: float, settings: TrackerSettings) -> None:
         """Move a joint to a known position `place` (2,) px unless it is close; a NaN `confidence` keeps the old one."""

@@ -27,10 +27,18 @@ from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.tracking.appearance import TorsoAppearance, find_overlapping, torso_appearances
 from flowing_puppet_ros.image.tracking.association import Detection, associate, joint_distance
-from flowing_puppet_ros.image.tracking.propagation import ImageScale, Propagation, propagate_tracks, render_label_map
+from flowing_puppet_ros.image.tracking.heading import HeadingFilter
+from flowing_puppet_ros.image.tracking.propagation import (
+    ImageScale,
+    Propagation,
+    propagate_tracks,
+    render_label_map,
+    render_tracks,
+)
 from flowing_puppet_ros.image.tracking.shot_boundary import colour_histogram, is_cut
 from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
 from flowing_puppet_ros.images import as_image
+from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order
 from flowing_puppet_ros.model.ds.shape import PuppetShape, View
@@ -53,9 +61,11 @@ class TrackedPuppet:
 
     `joints` (J, 2) are in the order of the model's joint_names. `confidence` (J,) in [0, 1] is already multiplied by
     `visible` (J,), which is below 1 for joints that are occluded or outside the image. `scale` is in px/m, `view` front
-    or back; `contours` (K_i, 2) per part, `depth` (P,) the drawing order of each part, 0 farthest. `energy` is the
-    negative log of the body prior plus the flow's misfit and the distance of the detection, up to a constant; lower is
-    better. `detected` (J, 3) is this image's detection as x, y and confidence, and `detection` its index, or None.
+    or back, `heading` where the torso faces (rad, 0 to the camera, pi/2 to the right of the image; NaN unknown).
+    `drawing` is the model of the side, turned by `side_heading`, whose puppet is drawn; `contours` (K_i, 2) per part,
+    `depth` (P,) the drawing order of each part, 0 farthest. `energy` is the negative log of the body prior plus the
+    flow's misfit and the distance of the detection, up to a constant; lower is better. `detected` (J, 3) is this
+    image's detection as x, y and confidence, and `detection` its index, or None.
     """
 
     id: str
@@ -65,6 +75,9 @@ class TrackedPuppet:
     visible: F64
     scale: float
     view: View
+    heading: float
+    side_heading: float
+    drawing: DeformableStructures
     energy: float
     contours: tuple[F64, ...]
     depth: tuple[int, ...]
@@ -93,7 +106,8 @@ class TrackResult:
         """Draw the part labels (H, W) of all people: part index + 1, 0 background; `shape` as the image by default."""
         height, width = shape or (self.grid.image[1], self.grid.image[0])
         grid = ImageScale(self.grid.image, (width, height))
-        labels = render_label_map(self._model, [puppet.shape for puppet in self.puppets], grid)
+        shapes, headings = ([getattr(each, name) for each in self.puppets] for name in ("shape", "side_heading"))
+        labels = render_label_map(self._model, shapes, headings, grid)
         parts = len(self._model.tree)
         return np.where(labels > 0, (labels - 1) % parts + 1, 0).astype(np.uint8)
 
@@ -124,8 +138,11 @@ class FlowingPuppetTracker:
         model: DeformableStructures,
         settings: TrackerSettings | None = None,
         flow_settings: FlowSettings | None = None,
+        views: MultiViewStructures | None = None,
     ) -> None:
+        """Track with puppets of `model`, from the side with those of `views`, if they are given."""
         self.model = model
+        self._views = views
         self.settings = settings or TrackerSettings()
         self.optical_flow = OpticalFlow(flow_settings)
         self.tracks: list[Track] = []
@@ -287,9 +304,10 @@ class FlowingPuppetTracker:
             if len(self.tracks) >= self.settings.max_people:
                 warnings.append(f"more than {self.settings.max_people} people: the others are left out (max_people)")
                 continue
+            heading = None if self._views is None else HeadingFilter(self._views)
             identity = letters_of_seed(self.settings.seed) + str(self._started + 1)
             try:
-                self.tracks.append(Track.start(identity, self.model, joints, confidence, self.settings))
+                self.tracks.append(Track.start(identity, self.model, joints, confidence, self.settings, heading))
             except InputError as error:
                 warnings.append(f"a detected person is left out: {error}")
                 continue
@@ -313,7 +331,8 @@ class FlowingPuppetTracker:
     def _make_puppet(self, track: Track, hidden: Bools, size: tuple[int, int]) -> TrackedPuppet:
         shape = track.shape
         assert shape is not None
-        depth = np.argsort(depth_order(self.model, track.view))
+        depth = np.argsort(depth_order(self.model, track.view, track.side_heading))
+        drawing = track.choose_model(self.model)
         visible = np.where(hidden, HIDDEN_CONFIDENCE, 1.0) * np.where(track.find_outside(size), OUTSIDE_CONFIDENCE, 1.0)
         return TrackedPuppet(
             id=track.id,
@@ -323,7 +342,10 @@ class FlowingPuppetTracker:
             visible=visible,
             scale=track.scale,
             view=track.view,
-            energy=float(self.model.energy(shape) + track.flow_energy + track.detection_energy),
+            heading=np.nan if track.heading is None else track.heading.heading,
+            side_heading=track.side_heading,
+            drawing=drawing,
+            energy=float(drawing.energy(shape) + track.flow_energy + track.detection_energy),
             contours=shape.contours,
             depth=tuple(int(rank) for rank in depth),
             shape=shape,
@@ -336,7 +358,7 @@ def find_hidden_joints(model: DeformableStructures, tracks: Sequence[Track], gri
     """Return which joints (J,) of each track lie behind the puppet of a nearer person."""
     if len(tracks) < 2:
         return [np.zeros(len(model.joint_names), dtype=bool) for _ in tracks]
-    labels = render_label_map(model, [track.shape for track in tracks if track.shape is not None], grid)
+    labels = render_tracks(model, tracks, grid)
     height, width = labels.shape
     hidden = []
     for k, track in enumerate(tracks):

@@ -37,6 +37,7 @@ from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
 from flowing_puppet_ros.image.video.offline_smoother import OfflineSmoother
 from flowing_puppet_ros.image.video.settings import EVERY_IMAGE, ClipDetectionSettings, LiveDetectionSettings
 from flowing_puppet_ros.image.video.tracklets import Tracklet, TrackletLinker
+from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, nested
 from flowing_puppet_ros.threads import one_opencv_thread
@@ -109,6 +110,7 @@ def track_clip(
     method: Method = "smoothed",
     worker: DetectionWorker | None = None,
     networks: KeypointSource | None = None,
+    views: MultiViewStructures | None = None,
     flow_of: Callable[[VideoFrame], FlowPair] | None = None,
     warn: Callable[[str], None] | None = None,
     progress: Progress = lambda frames, title: frames,
@@ -124,6 +126,7 @@ def track_clip(
             the loop of the thesis's video chapter (Eqs. 33-37), a slow reference.
         worker: the detector, and the model that scores arms; the package's own when not given.
         networks: find the people instead of the detector.
+        views: puppets for people who are seen from the side; `model` for everybody when not given.
         flow_of: (forward, backward) flow to a frame from the one before; computed when not given.
         warn: is told of what is left out; without it the first unusable frame is an error.
         progress: shows how far the passes over the frames are.
@@ -135,7 +138,7 @@ def track_clip(
         InputError: when a frame cannot be used and `warn` is not given.
     """
     settings = settings or ClipSettings()
-    run = _ClipRun(clip, model, settings, method, flow_of, warn)
+    run = _ClipRun(clip, model, views, settings, method, flow_of, warn)
     collector = run.collector()
     stamps = []
     if clip.has_keypoints:
@@ -159,6 +162,7 @@ def track_live(
     *,
     worker: DetectionWorker | None = None,
     networks: KeypointSource | None = None,
+    views: MultiViewStructures | None = None,
     warn: Callable[[str], None] | None = None,
     progress: Progress = lambda frames, title: frames,
 ) -> Iterator[TrackedFrame]:
@@ -166,7 +170,7 @@ def track_live(
 
     Arguments are those of `track_clip`; `detection` says when the detector runs, by default in every image.
     """
-    run = _ClipRun(clip, model, settings or ClipSettings(), "smoothed", None, warn)
+    run = _ClipRun(clip, model, views, settings or ClipSettings(), "smoothed", None, warn)
     tracker = run.make_tracker()
     live: LiveTracker | NetworkTracker
     if networks is None:
@@ -201,6 +205,7 @@ class _ClipRun:
 
     clip: Clip
     model: DeformableStructures
+    views: MultiViewStructures | None
     settings: ClipSettings
     method: Method
     flow_of: Callable[[VideoFrame], FlowPair] | None
@@ -286,7 +291,7 @@ class _ClipRun:
 
     def make_tracker(self) -> FlowingPuppetTracker:
         """Return a tracker that has seen nothing."""
-        return FlowingPuppetTracker(self.model, self.settings.tracker, self.settings.flow)
+        return FlowingPuppetTracker(self.model, self.settings.tracker, self.settings.flow, self.views)
 
     def _load_likelihood(self) -> PartLikelihood | None:
         return PartLikelihood.load() if self.method == "thesis" else None

@@ -59,7 +59,7 @@ class OfflineSmoother:
             if sights is not None:
                 history = self._arms.setdefault(puppet.id, ArmSmoother(self.path))
                 history.add(sights[puppet.id], result.flow if track else None, result.grid)
-            energy = self.model.energy(puppet.shape)
+            energy = puppet.drawing.energy(puppet.shape)
             bare = replace(puppet, contours=(), shape=replace(puppet.shape, contours=()))
             track.append(_PuppetObservation(self.images, bare, energy, motion, trust))
         self.images += 1
@@ -116,8 +116,8 @@ class OfflineSmoother:
     def _puppet(self, moment: _PuppetObservation, joints: F64, right: F64) -> TrackedPuppet:
         puppet = moment.puppet
         confidence = np.where(np.isfinite(right), right * puppet.visible, puppet.confidence)
-        shape = self.model.puppet_from_joints(joints, puppet.scale, puppet.view)
-        energy = puppet.energy - moment.body_energy + self.model.energy(shape)
+        shape = puppet.drawing.puppet_from_joints(joints, puppet.scale, puppet.view)
+        energy = puppet.energy - moment.body_energy + puppet.drawing.energy(shape)
         return replace(
             puppet, joints=joints, confidence=confidence, contours=shape.contours, shape=shape, energy=energy
         )

@@ -27,6 +27,9 @@ VIEW_NAMES = ("W", "WSW", "SW", "SSW", "S", "SSE", "SE", "ESE", "E")
 VIEW_HEADINGS = tuple(float(angle) for angle in np.radians(np.linspace(-90.0, 90.0, len(VIEW_NAMES))))
 """Angle in radians by which the torso of each view is rotated from the camera towards the right of the image."""
 
+MIN_SIDE_PROBABILITY = 0.97
+"""Probability of a side view from which the model of that view is used instead of the frontal one."""
+
 LOG_SCALES = np.linspace(-0.3, 0.3, 13)
 """Logarithms of the scales, relative to the frontal estimate, over which `MultiViewStructures.posterior` averages."""
 
@@ -74,17 +77,27 @@ class MultiViewStructures:
         evidence = np.empty((len(self.views), len(LOG_SCALES)))
         for row, view in enumerate(self.views):
             prior = view.joint_prior.marginal(index)
-            for column, factor in enumerate(np.exp(LOG_SCALES)):
-                metres = (joints[known] / (scale * factor)).ravel()
-                evidence[row, column] = _translation_free_log_density(
-                    metres - prior.mean, prior.covariance + np.diag(noise)
-                )
-                # A density over pixels: metres shrink as the scale grows.
-                evidence[row, column] -= (len(index) - 2) * np.log(factor)
+            metres = (joints[known] / scale).reshape(-1, 1) / np.exp(LOG_SCALES)
+            # A density over pixels: metres shrink as the scale grows.
+            evidence[row] = (
+                _translation_free_log_density(metres - prior.mean[:, None], prior.covariance + np.diag(noise))
+                - (len(index) - 2) * LOG_SCALES
+            )
         from scipy.special import logsumexp  # loaded here: most who draw or track a puppet know its view
 
         total = logsumexp(evidence, axis=1) + np.log(self.prior)
         return np.asarray(np.exp(total - logsumexp(total)))
+
+    def frontal_probability(self, probability: Array) -> float:
+        """Return the sum of the probabilities (9,) of the views in which the frontal puppet is right."""
+        middle = len(probability) // 2
+        return float(probability[middle - 1 : middle + 2].sum())
+
+    def find_side(self, probability: Array) -> int | None:
+        """Return the likeliest view, by its index, if a side is nearly certain by `probability` (9,), else None."""
+        if self.frontal_probability(probability) > 1.0 - MIN_SIDE_PROBABILITY:
+            return None
+        return int(probability.argmax())
 
     @classmethod
     def from_arrays(cls, gender: str, parts: int, arrays: Mapping[str, Array]) -> Self:
@@ -133,12 +146,12 @@ def _unpack_symmetric(triangles: Array) -> Array:
     return full
 
 
-def _translation_free_log_density(deviation: Array, covariance: Array) -> float:
-    """Return the log density of a deviation (2K,), up to a constant, under a flat prior over a common translation."""
+def _translation_free_log_density(deviation: Array, covariance: Array) -> Array:
+    """Return the log density of deviations (2K, S), up to a constant, under a flat prior over a common translation."""
     shift = np.tile(np.eye(2), (len(deviation) // 2, 1))
     factor = np.linalg.cholesky(covariance)
     white, place = np.linalg.solve(factor, deviation), np.linalg.solve(factor, shift)
     precision = place.T @ place
     fitted = np.linalg.solve(precision, place.T @ white)
     volume = np.log(np.diagonal(factor)).sum() + 0.5 * np.linalg.slogdet(precision)[1]
-    return float(-0.5 * ((white - place @ fitted) ** 2).sum() - volume)
+    return np.asarray(-0.5 * ((white - place @ fitted) ** 2).sum(axis=0) - volume)

@@ -82,6 +82,6 @@ def _choose(images: set[str], camera: str, names: Sequence[str], what: str) -> s
             return found[0]
     listed = ", ".join(sorted(image for image in images if image.startswith(below))) or "none"
     raise InputError(
-        f"there are no {what} images below {below} under a name that is known ({', '.join(names)}); the images there are"
+        f"there are no {what} images below {below} under a known name ({', '.join(names)}); the images there are"
         f" {listed}; start the driver, or start camera.launch.py and lidar.launch.py with the names"
     )

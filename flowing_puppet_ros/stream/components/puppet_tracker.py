@@ -19,6 +19,7 @@ from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.image.video.live_tracker import LiveTracker, make_live_tracker
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
+from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, nested, setting
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
@@ -88,7 +89,12 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         """Load the body model."""
         super().__init__(settings, factory)
         self._model = DeformableStructures.load(settings.model, settings.parts)
-        self._tracker = FlowingPuppetTracker(self._model, settings.tracker, settings.flow)
+        self._tracker = FlowingPuppetTracker(
+            self._model,
+            settings.tracker,
+            settings.flow,
+            MultiViewStructures.load(settings.model, settings.parts),
+        )
         self._live = make_live_tracker(self._tracker, settings.detection, self.counters)
         self._line = PendingQueue()
         self._shelves = {port.name: StampBuffer() for port in self.inputs if port.optional}

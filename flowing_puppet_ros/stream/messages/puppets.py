@@ -61,6 +61,7 @@ def _make_puppet(factory: MessageFactory, model: DeformableStructures, puppet: T
         id=puppet.id,
         model=puppet.model,
         view=puppet.view,
+        heading=puppet.heading,
         scale=puppet.scale,
         energy=puppet.energy,
         confidence=puppet.confidence.mean(),
