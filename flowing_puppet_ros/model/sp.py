@@ -201,7 +201,7 @@ class StitchedPuppet:
     def vertices(self, state: BodyState) -> Array:
         """Return the vertices (..., V, 3) of the whole body; where parts share a vertex, the mean of their copies."""
         if state.center.ndim == 2:
-            return body_points(self).pose(state).vertices
+            return body_points(self).pose(*_arrays_of(state)).vertices
         total = np.zeros((*state.center.shape[:-2], len(self.part_of_vertex), 3))
         copies = np.zeros(len(self.part_of_vertex))
         for ids, mesh in zip(self.part_vertices, self.parts(state), strict=True):
@@ -291,7 +291,8 @@ def _arrays_of(state: BodyState) -> tuple[Array, Array, Array, Array]:
 @lru_cache(maxsize=4)
 def body_points(model: StitchedPuppet) -> BodyPoints:
     """Return the points of all parts of a model, made once."""
-    return BodyPoints(model)
+    means = [shape + pose for shape, pose in zip(model.mean_shape, model.mean_pose, strict=True)]
+    return BodyPoints(model.part_vertices, means, model.pose_basis, model.shape_basis)
 
 
 @lru_cache(maxsize=4)

@@ -73,7 +73,7 @@ class NormalEquations:
 
     def pose_points(self, state: BodyState) -> PosedPoints:
         """Return the points of a body."""
-        return self._points.pose(state)
+        return self._points.pose(state.center, state.rotation, state.pose, state.shape)
 
     def add_surface(self, term: VertexQuadratic, posed: PosedPoints, rotation: np.ndarray, system: System) -> None:
         """Add a quadratic of every vertex for parts with `rotation` (N, 3, 3); a zero matrix costs nothing."""

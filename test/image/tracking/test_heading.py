@@ -12,6 +12,7 @@ from flowing_puppet_ros.image.tracking.heading import HeadingFilter
 from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.ds.shape import View
 
 FIGURE = {
     "neck": (0.0, 0.0, 1.48), "face": (0.10, 0.0, 1.62), "belly": (0.06, 0.0, 1.15),
@@ -49,7 +50,7 @@ def test_the_heading_is_that_of_the_figure(views: MultiViewStructures, degrees: 
     heading, names = np.radians(degrees), views.views[4].joint_names
     rng = np.random.default_rng(0)
     found = HeadingFilter(views)
-    view = "front" if abs(degrees) <= 90 else "back"
+    view: View = "front" if abs(degrees) <= 90 else "back"
     for _ in range(20):
         found.update(
             seen_joints(names, heading) + rng.normal(scale=1.5, size=(len(names), 2)), np.ones(len(names)), view
