@@ -19,13 +19,13 @@ from flowing_puppet_ros.multiview.bundle.joint_tracks import PeopleTracks
 from flowing_puppet_ros.multiview.camera import Camera
 
 _MAX_INSTANTS = 60
-_SCALES_PX = (20.0, 10.0, 6.0, 5.0, 5.0)  # of the robust loss, round by round, at 1000 px focal length
+_SCALES_PX = (20.0, 10.0, 6.0, *[5.0] * 9)  # of the robust loss, round by round, at 1000 px focal length
 _TRIANGULATION_STEPS = 4
 _MIN_DEPTH_M = 0.1  # of a joint in front of a camera
-_MAX_EVALUATIONS = 8  # of derivatives in a round
+_MAX_EVALUATIONS = 3  # of derivatives in a round: new weights help more than many steps
 # How far a camera is expected to be from where the former calibration has it: this keeps what the joints leave free,
 # and is robust, so that a camera that was pushed is not held back.
-_TURN, _MOVE_M, _CLOCK_PERIODS, _FOCAL, _CENTRE = np.radians(0.3), 0.02, 3.0, 0.003, 0.003
+_TURN, _MOVE_M, _CLOCK_PERIODS, _FOCAL, _CENTRE = np.radians(0.3), 0.02, 100.0, 0.003, 0.003
 _PRIOR_JOINTS = 10.0  # joints that weigh as much as the expectation
 _CLOCK_STEP = 0.25  # periods over which the velocity of joints is measured
 
@@ -218,8 +218,8 @@ def _adjust_round(
     sigma = np.array([_TURN] * 3 + [_MOVE_M] * 3 + [_CLOCK_PERIODS, _FOCAL, _CENTRE, _CENTRE])
     root = np.sqrt(weight)[..., None] * (focal / focal.mean())[:, None, None] / width
     deviation = state.subtract(expected, period) / sigma
-    # Geman-McClure's weights, of turn and move of each camera together.
-    trust = np.sqrt(_PRIOR_JOINTS) / (1 + (deviation[:, :6] ** 2).mean(axis=1, keepdims=True))
+    # Of turn and move of each camera together; a camera that is far from where it was expected is free.
+    trust = np.sqrt(_PRIOR_JOINTS) / (1 + (deviation[:, :6] ** 2).mean(axis=1, keepdims=True)) ** 2
 
     def unpack(values: F64) -> F64:
         step = np.zeros((cameras, freedom.per_camera))
@@ -235,7 +235,7 @@ def _adjust_round(
         off = trust * (deviation + step / sigma)
         return np.concatenate([(root * error).ravel(), off[free]])
 
-    start, units = np.zeros(int(free.sum())), np.broadcast_to(sigma, free.shape)[free]
+    start, units = np.zeros(int(free.sum())), np.broadcast_to(np.minimum(sigma, 1.0), free.shape)[free]
     found = least_squares(residuals, start, x_scale=units, diff_step=1e-4, max_nfev=_MAX_EVALUATIONS)
     return state.move(unpack(found.x), period)
 
