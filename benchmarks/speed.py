@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from benchmarks import plain_search, replays, streams
+from benchmarks import plain_search, replays, stages, streams
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.initialisation import sample_bodies
@@ -40,6 +40,7 @@ LOOK_UPS = 200_000  # queries of closest points
 GROWTH = {"points": (2500, 5000, 10000), "particles": (10, 20, 40), "iterations": (5, 10, 20)}
 BASE = {"points": 5000, "particles": 20, "iterations": 10}
 PLAIN_SIZE = (10, 3)  # particles and iterations of the search that the plain version also runs
+STAGE_FITS = 3  # the first of them compiles
 TRACKED_POINTS, TRACKED_FRAMES, WALK_M = 5000, 6, 0.03  # points, frames, metres per frame
 
 
@@ -138,6 +139,28 @@ class Bench:
             row = {"sides": sides, "points": len(points), "searched": tracker.counters["searched"]}
             rows.append(row | {"milliseconds_a_frame": 1000 * float(np.median(seconds[1:]))})
         return rows
+
+    def measure_stages(self) -> list[Row]:
+        """Measure milliseconds of each stage of a tracked cloud without normals and of a whole fit to 10,000 points."""
+        rows = []
+        for sides in ("all", "one"):
+            tracker, runs = BodyTracker(self._fitter, BodyTrackerSettings(max_points=TRACKED_POINTS)), []
+            for frame in range(TRACKED_FRAMES):
+                state = replace(self._body, center=self._body.center + np.array([WALK_M * frame, 0.0, 0.0]))
+                points, _, eye = self._sample_sensed_cloud(state, sides, frame)
+                person = PersonCloud(points, None, frame * 50_000_000, eye)
+                with stages.measure_stages(stages.REFINEMENT) as spent:
+                    tracker.track_or_refit(person)
+                runs.append(spent)
+            # The first cloud is searched, the second may compile.
+            rows += stages.make_rows(f"tracked, {sides} side{'s' if sides == 'all' else ''}", runs[2:])
+        cloud, runs = self._sample_cloud(10000), []
+        fitter = BodyFitter(self._model, FitterSettings(threads=1))
+        for _ in range(STAGE_FITS):
+            with stages.measure_stages(stages.SEARCH) as spent:
+                fitter.fit(*cloud)
+            runs.append(spent)
+        return rows + stages.make_rows("whole fit", runs[1:])
 
     def measure_fits(self) -> list[Row]:
         """Measure seconds of whole fits to 10,000 points: the defaults, and the thesis's particles and iterations."""

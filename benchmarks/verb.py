@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure speed as ratios in one run: look-ups, steps, search, growth, tracking, whole fits, images, replay, memory.
+"""Measure speed as ratios in one run: look-ups, steps, search, growth, tracking, stages, fits, images, replay, memory.
 
 `bench peers` compares with common alternatives; the part `live` runs the nodes over DDS.
 """
@@ -22,6 +22,7 @@ PARTS = {
     "search": Bench.measure_search,
     "growth": Bench.measure_growth,
     "tracking": Bench.measure_tracking,
+    "stages": Bench.measure_stages,
     "fits": Bench.measure_fits,
     "images": Bench.measure_images,
     "replay": Bench.measure_replay,

@@ -29,6 +29,8 @@ from flowing_puppet_ros.cli.scans.fit_people import FitOptions
 from flowing_puppet_ros.cli.scans.fit_sequence import fit_sequence
 from flowing_puppet_ros.cli.scans.given_joints import read_joints
 from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.exchange.files import FORMATS, write_people
+from flowing_puppet_ros.exchange.motion import read_fit
 from flowing_puppet_ros.settings import Settings, make_out_folder, nested
 
 
@@ -112,6 +114,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="measure each person in a standard pose: stature, girths, lengths (m) and volume (m3)",
     )
+    parser.add_argument(
+        "--export", choices=FORMATS, help="also write each body for other programs, as the verb export does"
+    )
     parser.add_argument("--rerun", type=Path, metavar="RRD", help="write the fits as a recording for the Rerun viewer")
     runner.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object per input on stdout")
@@ -150,6 +155,8 @@ def run(arguments: argparse.Namespace) -> int:
 
     def tell(summary: dict[str, Any]) -> None:
         _tell(summary, arguments.json)
+        if arguments.export and "error" not in summary:
+            _export(summary, arguments.export)
         finished.extend([] if "error" in summary else [summary])
 
     verb = runner.Verb("fit", fit_file, list_files, tell)
@@ -174,6 +181,12 @@ def _resolve_info(arguments: argparse.Namespace) -> str | None:
     if given is None or given.count(",") == 3:
         return given
     return str(runner.resolve_path(Path(given), arguments))
+
+
+def _export(summary: dict[str, Any], form: str) -> None:
+    for fit in summary.get("people", [summary]):
+        output = Path(fit["output"])
+        write_people([read_fit(output)], form, output.parent)
 
 
 def _parse_viewpoint(text: str) -> tuple[float, float, float]:

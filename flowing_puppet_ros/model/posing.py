@@ -63,7 +63,8 @@ class BodyPoints:
         return PosedPoints(*_pose(arrays, layout))
 
 
-@njit(cache=True, nogil=True)
+# Sums may be taken in any order: those over the coefficients are most of the time.
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract"})
 def _pose(body, layout):  # type: ignore[no-untyped-def]
     center, rotation, pose, shape = body
     mean, basis, poses, starts, rows, share = layout

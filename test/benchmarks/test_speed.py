@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import peer_runs, speed, streams
+from benchmarks import peer_runs, speed, stages, streams
 from benchmarks.verb import PARTS
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 
 
 @pytest.fixture(autouse=True)
@@ -66,6 +67,39 @@ def test_tracking_is_measured_without_the_first_search(monkeypatch: pytest.Monke
     assert [row["searched"] for row in rows] == [1, 1]
     assert searched == [True, False]
     assert all(row["milliseconds_a_frame"] > 0 for row in rows)
+
+
+@pytest.mark.slow
+def test_the_stages_of_a_tracked_cloud_and_of_a_fit_make_up_their_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(speed, "TRACKED_FRAMES", 3)
+    monkeypatch.setattr(speed, "STAGE_FITS", 2)
+    query = NearestPoints.query
+    rows = speed.Bench().measure_stages()
+    assert NearestPoints.query is query, "what was measured is as it was"
+    for path in ("tracked, all sides", "tracked, one side", "whole fit"):
+        own = [row for row in rows if row["path"] == path]
+        assert sum(row["percent"] for row in own) == pytest.approx(100)
+        assert {"normal equations", "hands"} & {row["stage"] for row in own}
+        assert all(row["milliseconds"] > -0.1 for row in own)
+
+
+def test_a_stage_does_not_count_the_stages_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [0.0]
+    monkeypatch.setattr(stages.time, "process_time", lambda: now[0])
+
+    class Work:
+        def outer(self) -> int:
+            now[0] += 2
+            return self.inner()
+
+        def inner(self) -> int:
+            now[0] += 5
+            return 7
+
+    with stages.measure_stages({"outer": [(Work, "outer")], "inner": [(Work, "inner")]}) as spent:
+        assert Work().outer() == 7
+        now[0] += 3
+    assert spent == {"outer": 2, "inner": 5, stages.REST: 3}
 
 
 def test_images_are_measured_by_size_and_people_who_are_all_tracked(capsys: pytest.CaptureFixture[str]) -> None:

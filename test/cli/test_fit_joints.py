@@ -30,17 +30,24 @@ def test_a_fit_begins_at_given_joints(
     np.save(tmp_path / "man.npy", scale * POINTS @ turn.T)
     given = write_joints(tmp_path / "joints.json", turn, scale)
     status, (fit,), _ = fitted(
-        capsys, tmp_path / "man.npy", "--out", tmp_path / "o", "--joints", given, "--measure", *FAST
+        capsys, tmp_path / "man.npy", "--out", tmp_path / "o", "--joints", given, "--measure", "--export", "obj", *FAST
     )
     assert (status, fit["up"], fit["metres_per_unit"]) == (0, up, 1 / scale)
     with np.load(fit["output"]) as arrays:
         places = dict(zip(arrays["joint_names"], arrays["joints"] / scale, strict=True))
+        height = np.ptp(arrays["vertices"] @ up) / scale
         measured = dict(zip(arrays["measurement_names"], arrays["measurements"], strict=True))
+    written = np.array(
+        [line.split()[1:] for line in (tmp_path / "o" / "man.obj").read_text().splitlines() if line.startswith("v ")],
+        float,
+    )
+    assert np.ptp(written[:, 1]) == pytest.approx(height, abs=1e-4), "metres, y up, whatever the scan has"
     errors = [np.linalg.norm(places[name] - turn @ JOINTS[name]) for name in LIMBS]
     assert np.mean(errors) < 0.05, dict(zip(LIMBS, errors, strict=True))
     assert measured == pytest.approx(fit["measurements"])
-    stature = np.ptp(cloud_of(joints_of())[0][:, 2])
-    assert fit["measurements"]["stature"] == pytest.approx(stature, abs=0.08)  # he is made of capsules
+    # The capsules of his head and feet are larger than a head and feet: his stature is that between their joints.
+    stature = JOINTS["head_top"][2] - JOINTS["left_toe"][2]
+    assert fit["measurements"]["stature"] == pytest.approx(stature, abs=0.05)
     assert fit["measurements"]["arm_length"] == pytest.approx(0.28 + 0.25, abs=0.05)
 
 

@@ -65,6 +65,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "doctor",
         "draw",
         "evidence.image",
+        "exchange",
         "image.detector",
         "image.formats",
         "image.networks",

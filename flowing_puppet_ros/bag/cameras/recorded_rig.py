@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from flowing_puppet_ros.bag.graph import MIN_CAMERAS, find_cameras, find_info_to
 from flowing_puppet_ros.bag.reader import Bag, open_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
-from flowing_puppet_ros.image.video.clip import Clip, DetectedFrame, Progress, track_clip
+from flowing_puppet_ros.image.video.clip import Clip, Progress, track_clip
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.multiview.association.view import PersonInView
 from flowing_puppet_ros.multiview.camera import Camera
@@ -111,8 +110,7 @@ def read_people(
         for name in missing:
             if not recorded.topics[name]:
                 raise InputError(f"{path} has neither images nor puppets of {name}: give the bag with the images")
-            shown = partial(progress, title=name)
-            frames[name] = _track(path, recorded.topics[name], model, networks, warn, shown)
+            frames[name] = _track(path, recorded.topics[name], name, model, networks, warn, progress)
     first = min(group[0][0] for group in frames.values() if group) if any(frames.values()) else 0.0
     return names, {name: [(time - first, people) for time, people in frames[name]] for name in recorded.topics}
 
@@ -136,16 +134,19 @@ def _read_puppets(path: Path, cameras: Sequence[str]) -> tuple[tuple[str, ...], 
 def _track(
     path: Path,
     topic: str,
+    title: str,
     model: DeformableStructures,
     networks: KeypointSource | None,
     warn: Callable[[str], None],
-    progress: Callable[[Iterable[DetectedFrame]], Iterable[DetectedFrame]],
+    progress: Progress,
 ) -> list[tuple[float, list[PersonInView]]]:
     """Track one camera with its whole recording in view."""
     bag = open_bag_frames(path, topic, warn=warn)
     found = []
     clip = Clip(bag, bool(bag.detections))
-    for frame in track_clip(clip, model, networks=networks, warn=warn, progress=lambda frames, _: progress(frames)):
+    for frame in track_clip(
+        clip, model, networks=networks, warn=warn, progress=lambda frames, _: progress(frames, title)
+    ):
         people = [
             PersonInView(puppet.id, np.where(puppet.confidence[:, None] > 0, puppet.joints, np.nan), puppet.confidence)
             for puppet in frame.puppets

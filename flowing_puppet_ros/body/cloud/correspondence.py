@@ -199,7 +199,13 @@ def measure_distances(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarr
     surface = np.concatenate([vertices, corners.mean(axis=1)])
     face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     seen = cloud.sees(surface, np.concatenate([normals, face_normals]))
-    to_cloud, nearest = cloud.nearest.query(surface[seen])
+    count = int(np.count_nonzero(seen[: len(vertices)]))
+    first, rows = cloud.nearest.query(surface[seen][:count])
+    # A face's centre is near what its first corner is near.
+    at_vertex = np.zeros(len(vertices), dtype=np.int64)
+    at_vertex[seen[: len(vertices)]] = rows
+    rest, others = cloud.nearest.query(surface[seen][count:], guess=at_vertex[faces[seen[len(vertices) :], 0]])
+    to_cloud, nearest = np.concatenate([first, rest]), np.concatenate([rows, others])
     to_body, place = NearestPoints(surface).query(cloud.points)
     to_vertex, at_face = to_body.copy(), np.flatnonzero(place >= len(vertices))
     gaps = corners[place[at_face] - len(vertices)] - cloud.points[at_face][:, None]

@@ -30,6 +30,7 @@ from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
 _ASSOCIATION = AssociationSettings(max_epipolar_distance=0.35, max_joint_distance=0.6, max_view_error=0.35)
 _TRIANGULATION = TriangulationSettings(max_ray_distance=0.3)
 _MIN_OBSERVATIONS = 60  # joints of a camera at all instants
+_NEAR_PERIODS = 1.5  # between clocks that lead to the same result
 _PASSES = 2  # the second associates people by the cameras of the first
 
 
@@ -76,27 +77,56 @@ def refine_rig(
 
     PuppetError when no person is seen by two cameras long enough, or a camera sees nobody whom others see.
     """
-    coarse = find_coarse_offsets(names, cameras, frames, max_offset) if freedom.clocks else dict.fromkeys(cameras, 0.0)
-    current = Adjusted(dict(cameras), coarse)
-    first: PeopleTracks | None = None
-    for _ in range(_PASSES):
-        tracks = associate_tracks(names, current.cameras, frames, current.offsets, _ASSOCIATION, _TRIANGULATION)
-        _check_tracks(tracks, list(cameras))
-        first = first or tracks
-        current = adjust(current.cameras, current.offsets, cameras, tracks, freedom)
-        factor = match_baselines(current.cameras, cameras)
-        current = replace(current, cameras=place_as_before(scale_to(current.cameras, factor), cameras))
-    assert first is not None
-    factor, heights = _find_scale(tracks, current, scale)
     zero = dict.fromkeys(cameras, 0.0)
+    starts = [zero]
+    if freedom.clocks:
+        coarse = find_coarse_offsets(names, cameras, frames, max_offset)
+        # A turned camera may look as if it were late: both are tried, and what agrees better is taken.
+        starts += [coarse] if any(coarse.values()) else []
+    found: list[tuple[float, Adjusted, PeopleTracks]] = []
+    reason: PuppetError | None = None
+    for start in starts:
+        if found and _is_near(start, found[0][1].offsets, found[0][2].period):
+            continue
+        try:
+            found.append(_refine_from(start, names, cameras, frames, freedom))
+        except PuppetError as error:
+            reason = reason or error
+    if not found:
+        assert reason is not None
+        raise reason
+    _, refined, tracks = min(found, key=lambda each: each[0])
+    factor, heights = _find_scale(tracks, refined, scale)
     return RefinedRig(
-        scale_to(current.cameras, factor),
-        current.offsets,
+        scale_to(refined.cameras, factor),
+        refined.offsets,
         measure_agreement(cameras, zero, tracks),
-        measure_agreement(current.cameras, current.offsets, tracks),
+        measure_agreement(refined.cameras, refined.offsets, tracks),
         {person: height * factor for person, height in heights.items()},
         tracks.period,
     )
+
+
+def _is_near(one: Mapping[str, float], other: Mapping[str, float], period: float) -> bool:
+    return all(abs(one[name] - other[name]) <= _NEAR_PERIODS * period for name in one)
+
+
+def _refine_from(
+    offsets: Mapping[str, float],
+    names: Sequence[str],
+    cameras: Mapping[str, Camera],
+    frames: CameraFrames,
+    freedom: Freedom,
+) -> tuple[float, Adjusted, PeopleTracks]:
+    """Refine from the given `offsets`; return the mean distance px that remains, the cameras, and people's tracks."""
+    current = Adjusted(dict(cameras), dict(offsets))
+    for _ in range(_PASSES):
+        tracks = associate_tracks(names, current.cameras, frames, current.offsets, _ASSOCIATION, _TRIANGULATION)
+        _check_tracks(tracks, list(cameras))
+        current = adjust(current.cameras, current.offsets, cameras, tracks, freedom)
+        factor = match_baselines(current.cameras, cameras)
+        current = replace(current, cameras=place_as_before(scale_to(current.cameras, factor), cameras))
+    return measure_agreement(current.cameras, current.offsets, tracks).all_mean, current, tracks
 
 
 def _check_tracks(tracks: PeopleTracks, names: list[str]) -> None:

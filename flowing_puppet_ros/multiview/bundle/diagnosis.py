@@ -39,18 +39,20 @@ class AgreementOfViews:
         share: of the pairs of views that could show one person, those that do.
         by_camera: share of a camera's views that agree with any other.
         joints: (T, J, 3) m of the people.
+        quality: the share, less how badly those views fit.
     """
 
     share: float
     by_camera: dict[str, float]
     joints: F64
+    quality: float
 
 
 def measure_agreement_of_views(cameras: Mapping[str, Camera], instants: Sequence[People]) -> AgreementOfViews:
     """Return how many views of people, at several instants, belong to somebody whom several cameras see."""
     agreeing, total = dict.fromkeys(cameras, 0), dict.fromkeys(cameras, 0)
     pairs, possible = 0, 0
-    joints = []
+    joints, mismatches = [], [0.0]
     for people in instants:
         views = calibrate_views(cameras, people, _TRIANGULATION.min_confidence)
         free = {(name, k) for name, group in views.items() for k in range(len(group))}
@@ -59,11 +61,14 @@ def measure_agreement_of_views(cameras: Mapping[str, Camera], instants: Sequence
         possible += sum(min(len(views[one]), len(views[other])) for one, other in combinations(views, 2))
         for cluster in find_clusters(views, free, _ASSOCIATION, _TRIANGULATION):
             joints.append(cluster.joints)
+            mismatches.append(cluster.mismatch)
             pairs += len(cluster.views) * (len(cluster.views) - 1) // 2
             for name in cluster.views:
                 agreeing[name] += 1
     by_camera = {name: agreeing[name] / total[name] for name in cameras if total[name]}
-    return AgreementOfViews(pairs / max(1, possible), by_camera, np.stack(joints) if joints else np.zeros((0, 0, 3)))
+    share = pairs / max(1, possible)
+    placed = np.stack(joints) if joints else np.zeros((0, 0, 3))
+    return AgreementOfViews(share, by_camera, placed, share * (1 - float(np.mean(mismatches))))
 
 
 def find_size(
@@ -100,11 +105,11 @@ def explain_disagreement(
 
     `share` of them agree as it is.
     """
-    best, reason = share + _MIN_GAIN, ""
+    best, reason = 0.0, ""
     for sentence, changed, people in _list_mistakes(cameras, instants[:: max(1, len(instants) // _INSTANTS)]):
-        found = find_size(changed, names, people)[1].share
-        if found > best:
-            best, reason = found, sentence
+        found = find_size(changed, names, people)[1]
+        if found.share > share + _MIN_GAIN and found.quality > best:
+            best, reason = found.quality, sentence
     return reason
 
 

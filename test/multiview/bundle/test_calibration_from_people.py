@@ -54,7 +54,7 @@ def angle(one: Camera, other: Camera) -> float:
 def refined() -> RefinedRig:
     """A rig with one camera turned by two degrees and another one late by 3.4 images."""
     start = dict(CAMERAS) | {"cam2": turn(CAMERAS["cam2"], 2.0, (0.6, 0.8, 0.0))}
-    return refine_rig(NAMES, start, record({"cam3": 3.4}), Freedom(), Scale())
+    return refine_rig(NAMES, start, record({"cam3": 3.4}, 60), Freedom(), Scale())
 
 
 @pytest.mark.slow
@@ -72,16 +72,19 @@ def test_a_late_clock_is_found_to_a_tenth_of_an_image(refined: RefinedRig) -> No
 
 @pytest.mark.slow
 def test_the_report_is_that_of_the_noise(refined: RefinedRig) -> None:
-    """The mean length of a two-dimensional error of 2 px is 2 sqrt(pi / 2), less what three unknowns of eight take."""
+    """The mean length of a two-dimensional error of 2 px is 2 sqrt(pi / 2), less what three unknowns of eight take.
+
+    Between two images, errors are averaged: a straight line has two thirds of the variance on the average.
+    """
     assert refined.before.mean["cam2"] > 15
     expected = 2 * np.sqrt(np.pi / 2) * np.sqrt(5 / 8)
-    assert refined.after.all_mean == pytest.approx(expected, rel=0.1)
+    assert np.sqrt(2 / 3) * expected < refined.after.all_mean < expected
     assert sorted(refined.heights.values()) == pytest.approx([1.65, 1.85], rel=0.06)
 
 
 @pytest.mark.slow
 def test_scale_by_a_distance_or_a_height() -> None:
-    frames, freedom = record(count=30), Freedom(clocks=False)
+    frames, freedom = record(count=8), Freedom(clocks=False)
     known = float(np.linalg.norm(CAMERAS["cam1"].centre - CAMERAS["cam3"].centre))
     doubled = refine_rig(NAMES, CAMERAS, frames, freedom, Scale(("cam1", "cam3"), 2 * known))
     gap = np.linalg.norm(doubled.cameras["cam1"].centre - doubled.cameras["cam3"].centre)
