@@ -11,7 +11,7 @@ no     | no    | the id is held for a while
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -63,10 +63,19 @@ class FusedTracker:
     """Tracks the people in view of one camera."""
 
     def __init__(
-        self, people: PeopleFitter, settings: BodyTrackerSettings, hold: float, report: Report | None = None
+        self,
+        people: PeopleFitter,
+        settings: BodyTrackerSettings,
+        hold: float,
+        report: Report | None = None,
+        publish_id: Callable[[str], str] = str,
     ) -> None:
-        """Fit with `people`; ids are held for `hold` seconds without a sign of the person."""
+        """Fit with `people`; ids are held for `hold` seconds without a sign of the person.
+
+        `publish_id` turns the names of puppets without ids (p1, p2, ...) into ids.
+        """
         self._people = people
+        self._publish_id = publish_id
         self._settings = settings
         self._hold_ns = round(1e9 * hold)
         self._report = report or Report()
@@ -195,7 +204,7 @@ class FusedTracker:
         for number, puppet in enumerate(nameless):
             if number not in names:
                 self._named += 1
-                names[number] = f"p{self._named}"
+                names[number] = self._publish_id(f"p{self._named}")
             named.append(replace(puppet, id=names[number]))
         return named
 

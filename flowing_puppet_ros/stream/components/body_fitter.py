@@ -112,7 +112,11 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._fitter = BodyFitter(self._model, settings.fitter)
         self._scene = SceneTracker(self._fitter, settings, self.report)
         self._fused = FusedTracker(
-            PeopleFitter(self._fitter, settings.fusion), settings.tracker, settings.tracker.hold, self.report
+            PeopleFitter(self._fitter, settings.fusion),
+            settings.tracker,
+            settings.tracker.hold,
+            self.report,
+            self.publish_id,
         )
         self._puppets = PuppetPairs(self._model, settings.fusion)
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
