@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 # make venv   set everything up in .venv          make check  linter, type checker and the fast tests
 # make demo   sample bag -> replay -> report      make test   linter, type checker and all tests
+# make demo-rgbd  the same with colour and depth of drawn people, compared with the truth
 # make bench  speed as ratios, and live nodes     make lint   linter and type checker alone
 # make docs   the documentation site, into out/site
-# make coverage, make release-check, make figures, make config, make lock: see CONTRIBUTING.md
+# make coverage, release-check, figures, config, changelog, lock, test-noble: see CONTRIBUTING.md
 
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
 SAMPLE := bags/cache/sample
+RGBD := bags/cache/rgbd
 # The two variables that the ROS wheels leave in their children would keep another environment's Python from starting.
 CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE
 # Tests in this many processes. They keep the order of the files, so that costly fixtures are seldom made twice, and
@@ -15,7 +17,10 @@ CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE
 WORKERS := 2
 PYTEST = $(CLEAN_ENV) -u PYTHONDONTWRITEBYTECODE $(PYTHON) -m pytest --numprocesses $(WORKERS) --dist worksteal
 
-.PHONY: venv demo sample-bag check test coverage lint bench docs figures config lock release-check clean
+# What runs with the versions of Ubuntu 24.04, which a ROS 2 Jazzy there has: nodes and all that they are made of.
+NOBLE_TESTS := test/model test/inference test/flow test/evidence test/image test/body test/stream test/multiview test/bag test/node
+
+.PHONY: venv venv-noble test-noble demo demo-rgbd sample-bag check test coverage lint bench docs figures config changelog lock release-check clean
 
 venv:
 	@python=$$(sh scripts/find_python.sh) && $(CLEAN_ENV) "$$python" -I scripts/make_venv.py
@@ -26,6 +31,12 @@ sample-bag: venv
 demo: sample-bag
 	@$(CLEAN_ENV) .venv/bin/flowing-puppet replay $(SAMPLE) --out out/demo.mcap --report out/report.html
 	@echo "The puppets and bodies are in out/demo.mcap (RViz, Foxglove); the report is out/report.html (any browser)."
+
+demo-rgbd: venv
+	@$(CLEAN_ENV) $(PYTHON) bags/make_rgbd_sample.py --out $(RGBD)
+	@$(CLEAN_ENV) .venv/bin/flowing-puppet replay $(RGBD) --out out/rgbd.mcap --report out/rgbd.html
+	@$(CLEAN_ENV) .venv/bin/flowing-puppet evaluate bag out/rgbd.mcap --input $(RGBD) --truth $(RGBD)/truth.json
+	@echo "The bodies are in out/rgbd.mcap (RViz, Foxglove); the report is out/rgbd.html (any browser)."
 
 lint: venv
 	@.venv/bin/ruff check .
@@ -38,6 +49,13 @@ check: lint
 test: lint
 	@$(PYTHON) scripts/ensure_browser.py
 	@$(PYTEST)
+
+venv-noble:
+	@python=$$(sh scripts/find_python.sh) && $(CLEAN_ENV) "$$python" -I scripts/make_venv.py --noble
+
+test-noble: venv-noble
+	@$(CLEAN_ENV) -u PYTHONDONTWRITEBYTECODE .venv-noble/bin/python -m pytest --numprocesses $(WORKERS) --dist worksteal \
+		-m "not slow" --ignore test/evidence/image/test_hands.py $(NOBLE_TESTS)
 
 # Coverage sees no line of a compiled kernel run: those are covered where their tests are, not in the table.
 coverage: venv
@@ -59,6 +77,9 @@ bench: venv
 
 config: venv
 	@$(PYTHON) scripts/write_config.py
+
+changelog:
+	@$(PYTHON) scripts/write_changelog.py
 
 lock: venv
 	@$(PYTHON) scripts/lock.py

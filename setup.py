@@ -8,6 +8,7 @@ from setuptools import find_packages, setup
 
 NAME = "flowing_puppet_ros"
 HERE = Path(__file__).resolve().parent
+EXTRAS = ("annotate", "cluster", "learn", "neural", "report", "rerun", "scans", "video")
 NODES = ("optical_flow", "puppet_tracker", "visual_hull", "body_fitter")
 
 
@@ -28,6 +29,8 @@ setup(
     description="People's pose and body shape from images, clouds and bags, with puppets.",
     long_description="See README.md.",
     license="Apache-2.0",
+    license_files=["LICENSE"],
+    url=re.findall(r'<url type="repository">(.+)</url>', (HERE / "package.xml").read_text())[0],
     maintainer="flowing_puppet_ros maintainers",
     maintainer_email="maintainers@users.noreply.github.com",
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
@@ -44,20 +47,14 @@ setup(
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
-        (f"share/{NAME}", ["package.xml"]),
+        (f"share/{NAME}", ["package.xml", "LICENSE", "README.md", "CHANGELOG.rst"]),
         (f"share/{NAME}/launch", files("launch/*.launch.py")),
         (f"share/{NAME}/config", files("config/*.*")),
     ],
     python_requires=">=3.12",
     install_requires=requirements("runtime"),
-    extras_require={
-        "learn": requirements("learn") + requirements("learn-assets"),
-        "annotate": requirements("annotate"),
-        "cluster": requirements("cluster"),
-        "neural": requirements("neural"),
-        "rerun": requirements("rerun"),
-        "video": requirements("video"),
-    },
+    extras_require={name: requirements(name) for name in EXTRAS}
+    | {"learn": requirements("learn") + requirements("learn-assets")},
     entry_points={
         "console_scripts": [
             "flowing-puppet = flowing_puppet_ros.cli:main",

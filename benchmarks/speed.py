@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from benchmarks import plain_search, stages, streams
+from benchmarks import plain_search, replays, stages, streams
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.initialisation import sample_bodies
@@ -182,8 +182,12 @@ class Bench:
         return streams.measure_tracking(self._seed)
 
     def measure_replay(self) -> list[Row]:
-        """Measure the replay of the repository's small recording of four cameras, including all output."""
-        return streams.measure_replay(self._seed)
+        """Measure replays of the repository's small recording of four cameras on one thread and on all cores."""
+        return replays.measure_replay(self._seed)
+
+    def measure_memory(self) -> list[Row]:
+        """Measure the peak memory of replays of recordings of different lengths."""
+        return replays.measure_memory(self._seed)
 
     @cached_property
     def _fitter(self) -> BodyFitter:

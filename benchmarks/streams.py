@@ -1,20 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Speed of the 2D tracker by image size and number of people, on puppets drawn over noise, and of a replay.
+"""Speed of the 2D tracker by image size and number of people, on puppets drawn over noise.
 
 Processor time of the whole process, after a first run that compiles.
 """
 
 from __future__ import annotations
 
-import tempfile
 import time
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
-from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.tables import Row
 from flowing_puppet_ros.flow.estimate import FlowSettings
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
@@ -27,7 +23,6 @@ SIZES = ((320, 240), (640, 480), (1280, 960))  # width and height, px
 PEOPLE = (1, 2, 4, 8)
 MIDDLE, ALONE = (640, 480), 1  # size at which people vary, and people at which the size varies
 FRAMES, STEP_PX = 6, 3.0  # images, and a person's motion between them
-GOLDEN = Path(__file__).resolve().parent.parent / "bags" / "golden"
 
 type PlacedPeople = list[tuple[np.ndarray, float]]  # joints (J, 2) px, scale px/m
 
@@ -77,16 +72,3 @@ def _draw_people(model: DeformableStructures, ground: np.ndarray, people: Placed
         labels = render_labels(contours, depth_order(model), (ground.shape[0], ground.shape[1]))
         image[labels > 0] = colours[labels[labels > 0] - 1]
     return image
-
-
-def measure_replay(seed: int) -> list[Row]:
-    """Measure the replay of the repository's small recording of four cameras, including all output."""
-    if not GOLDEN.is_dir():
-        raise InputError(f"the replay is measured on {GOLDEN}, which only the source tree has")
-    with tempfile.TemporaryDirectory() as folder:
-        for attempt in range(2):
-            started = time.process_time(), time.perf_counter()
-            summary = replay(GOLDEN, Path(folder) / f"{attempt}.mcap", ReplayOptions(seed=seed))
-            spent = time.process_time() - started[0], time.perf_counter() - started[1]
-    row = {"images": summary["frames"], "bodies": summary["bodies"], "processor_seconds": spent[0], "seconds": spent[1]}
-    return [row | {"images_a_second": summary["frames"] / spent[1]}]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure speed as ratios in one run: look-ups, steps, search, growth, tracking, stages, whole fits, images, replay.
+"""Measure speed as ratios in one run: look-ups, steps, search, growth, tracking, stages, fits, images, replay, memory.
 
 `bench peers` compares with common alternatives; the part `live` runs the nodes over DDS.
 """
@@ -26,6 +26,7 @@ PARTS = {
     "fits": Bench.measure_fits,
     "images": Bench.measure_images,
     "replay": Bench.measure_replay,
+    "memory": Bench.measure_memory,
 }
 LIVE = "live"
 MIN_SECONDS = 5.0  # of feeding a node

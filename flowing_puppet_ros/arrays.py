@@ -12,6 +12,7 @@ type Array = np.ndarray[Any, Any]
 """Numbers of any type."""
 type F32 = NDArray[np.float32]
 type F64 = NDArray[np.float64]
+type I8 = NDArray[np.int8]
 type I32 = NDArray[np.int32]
 type I64 = NDArray[np.int64]
 type U8 = NDArray[np.uint8]

@@ -16,6 +16,8 @@ from threading import Lock
 import threadpoolctl
 from numba import config
 
+MAX_THREADS = 1024  # more than any machine has cores
+
 
 def usable_threads(threads: int) -> int:
     """Return at most `threads`, the cores that this process may use, and NUMBA_NUM_THREADS, which limits workers."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make or update the virtual environment `.venv`; `make venv` runs this with a Python 3.12.
+"""Make or update the virtual environment `.venv`, or `.venv-noble` with `--noble`; make runs this with a Python 3.12.
 
 Each step leaves a stamp with the hash of its inputs in `.venv/.setup`: a step with unchanged inputs is skipped, and a
 failed run resumes where it stopped. Only the standard library is used.
@@ -21,7 +21,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-VENV = ROOT / ".venv"
+# Ubuntu 24.04's own versions, and neither Open3D nor pages, plots and documentation (`make venv-noble`).
+NOBLE = "--noble" in sys.argv[1:]
+VENV = ROOT / (".venv-noble" if NOBLE else ".venv")
+LOCK = "lock-noble" if NOBLE else "lock"
+NAMES = ("runtime", "annotate", "learn", "neural", "report", "scans", "video", "dev", "docs", "build")
+NOBLE_NAMES = ("runtime", "neural", "dev", "build")
 STATE = VENV / ".setup"
 PYTHON = VENV / "bin" / "python"
 SITE_PACKAGES = VENV / "lib" / "python3.12" / "site-packages"
@@ -160,8 +165,9 @@ def install_requirements(names: Iterable[str], environment: dict[str, str]) -> N
     files = [part for name in names for part in ("-r", f"requirements/{name}.txt")]
     command = [str(PYTHON), "-m", "pip", "install", "--disable-pip-version-check"]
     failure = "Installing the Python packages failed"
-    run([*command, "-c", "requirements/lock.txt", *files], environment, "packages", failure)
-    run([*command, "--no-deps", "-r", "requirements/learn-assets.txt"], environment, "packages", failure)
+    run([*command, "-c", f"requirements/{LOCK}.txt", *files], environment, "packages", failure)
+    if not NOBLE:
+        run([*command, "--no-deps", "-r", "requirements/learn-assets.txt"], environment, "packages", failure)
 
 
 def fix_include_paths(environment: dict[str, str]) -> None:
@@ -209,7 +215,7 @@ def install_package(environment: dict[str, str]) -> None:
 
 def check_imports(environment: dict[str, str]) -> None:
     """Import the package's dependencies, to detect a broken installation now."""
-    code = "import cv2, numba, open3d, rclpy, rosbags, scipy, flowing_puppet_msgs.msg, hri_msgs.msg, tf2_msgs.msg"
+    code = "import cv2, numba, rclpy, rosbags, scipy, flowing_puppet_msgs.msg, hri_msgs.msg, tf2_msgs.msg"
     run([PYTHON, "-c", code + ", flowing_puppet_ros"], environment, "check", "An installed package does not import")
 
 
@@ -228,8 +234,8 @@ def install_networks(environment: dict[str, str]) -> None:
 
 def make_steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]:
     """Return the steps in order."""
-    names = ("runtime", "annotate", "neural", "video", "learn", "dev", "docs", "build", *(() if ros else ("ros",)))
-    lists = [ROOT / "requirements" / f"{name}.txt" for name in (*names, "learn-assets", "lock")]
+    names = (*(NOBLE_NAMES if NOBLE else NAMES), *(() if ros else ("ros",)))
+    lists = [ROOT / "requirements" / f"{name}.txt" for name in (*names, "learn-assets", LOCK)]
     package = [ROOT / name for name in ("setup.py", "setup.cfg", "pyproject.toml", "package.xml", "launch", "config")]
     libraries = ROOT / "scripts" / "interface_libraries.py"
     every = [
@@ -243,7 +249,7 @@ def make_steps(ros: tuple[Path, ...], environment: dict[str, str]) -> list[Step]
         Step("headers", "include paths", ["headers 1"], lambda: fix_include_paths(environment)),
         Step("interfaces", "messages", [*INTERFACES, libraries], lambda: build_interfaces(ros, environment)),
         Step("package", "flowing_puppet_ros", package, lambda: install_package(environment)),
-        Step("check", "imports", ["check 1"], lambda: check_imports(environment)),
+        Step("check", "imports", ["check 2"], lambda: check_imports(environment)),
         Step("networks", "keypoint networks", [NETWORK_FILES], lambda: install_networks(environment)),
     ]
     return [step for step in every if not (ros and step.name == "headers")]

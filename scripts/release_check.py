@@ -18,6 +18,9 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from scripts.write_changelog import PACKAGES, make_changelog
+
 ROOT = Path(__file__).resolve().parent.parent
 NAME = "flowing_puppet_ros"
 MANIFESTS = ("package.xml", "msg_defs/package.xml")
@@ -58,12 +61,24 @@ def check_changelog(root: Path, released: bool) -> Iterator[str]:
         yield f"CHANGELOG.md still calls {version} unreleased"
 
 
+def check_manifests(root: Path) -> Iterator[str]:
+    """Check that the manifests name a real address, and that CHANGELOG.rst, which bloom reads, is CHANGELOG.md."""
+    for package, folder in PACKAGES.items():
+        place = root / folder.relative_to(ROOT)
+        manifest = f"{(place / 'package.xml').relative_to(root)}"
+        for placeholder in ("example.org", "noreply"):
+            if placeholder in (place / "package.xml").read_text():
+                yield f"{manifest} has a placeholder, {placeholder}, for an address"
+        if (place / "CHANGELOG.rst").read_text() != make_changelog(package, (root / "CHANGELOG.md").read_text()):
+            yield f"{(place / 'CHANGELOG.rst').relative_to(root)} is not what `make changelog` writes"
+
+
 def check_licences(root: Path) -> Iterator[str]:
     """Check that sources have the licence line, and that LICENSE and the manifests agree with it."""
     if "Apache License" not in (root / "LICENSE").read_text():
         yield "LICENSE is not the Apache License"
     for manifest in MANIFESTS:
-        if f"<license>{LICENSE}</license>" not in (root / manifest).read_text():
+        if not re.search(rf"<license[^>]*>{LICENSE}</license>", (root / manifest).read_text()):
             yield f"{manifest} does not say {LICENSE}"
     for path in list_tracked(root):
         if path.name.endswith(SOURCES) and SPDX not in "\n".join(path.read_text().splitlines()[:3]):
@@ -117,7 +132,7 @@ def main(given: list[str]) -> int:
     quick = parser.parse_args(given).quick
     findings = [*check_versions(ROOT), *check_changelog(ROOT, released=not quick), *check_licences(ROOT)]
     if not quick:
-        findings += [*check_tree(ROOT), *check_packages(ROOT)]
+        findings += [*check_manifests(ROOT), *check_tree(ROOT), *check_packages(ROOT)]
     for finding in findings:
         print(f"release check: {finding}", file=sys.stderr)
     if not findings:

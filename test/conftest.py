@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING
 
 import hypothesis
 import pytest
-from playwright.sync_api import Browser, sync_playwright
 
 from scripts.ensure_browser import NAMES
 
 if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
     from flowing_puppet_ros.model.sp import StitchedPuppet
 
 
@@ -73,17 +74,19 @@ def model() -> "StitchedPuppet":
 
 
 @pytest.fixture(scope="session")
-def chromium() -> Iterator[Callable[[Sequence[str]], Browser]]:
+def chromium() -> Iterator[Callable[[Sequence[str]], "Browser"]]:
     """Return what starts a headless Chromium with some flags."""
     program = next(filter(None, map(shutil.which, NAMES)), None)
     if program is None:
         pytest.skip("no Chromium on this machine")
+    from playwright.sync_api import sync_playwright
+
     with sync_playwright() as playwright:
         yield lambda flags: playwright.chromium.launch(executable_path=program, args=list(flags))
 
 
 @pytest.fixture(scope="session")
-def browser(chromium: Callable[[Sequence[str]], Browser]) -> Iterator[Browser]:
+def browser(chromium: Callable[[Sequence[str]], "Browser"]) -> Iterator["Browser"]:
     """Return a headless Chromium."""
     started = chromium(BROWSER_FLAGS)
     yield started
@@ -91,7 +94,7 @@ def browser(chromium: Callable[[Sequence[str]], Browser]) -> Iterator[Browser]:
 
 
 @pytest.fixture(scope="session")
-def drawing_browser(chromium: Callable[[Sequence[str]], Browser]) -> Iterator[Browser]:
+def drawing_browser(chromium: Callable[[Sequence[str]], "Browser"]) -> Iterator["Browser"]:
     """Return a headless Chromium that has WebGL."""
     started = chromium(DRAWING_FLAGS)
     yield started

@@ -60,7 +60,7 @@ def test_a_block_stops_at_its_first_failure(tmp_path: Path) -> None:
         "body_fitter --ros-args -r ponits:=/cloud",
         "body_fitter --ros-args -p wings:=2",
         "make coffee",
-        "ros2 launch flowing_puppet_ros bodies.launch.py camera:=one",
+        "ros2 launch flowing_puppet_ros cameras.launch.py camera:=one",
         "frobnicate",
     ],
 )

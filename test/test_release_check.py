@@ -8,9 +8,20 @@ from pathlib import Path
 import pytest
 
 from scripts import release_check
-from scripts.release_check import check_changelog, check_licences, check_packages, check_tree, check_versions
+from scripts.release_check import (
+    check_changelog,
+    check_licences,
+    check_manifests,
+    check_packages,
+    check_tree,
+    check_versions,
+)
+from scripts.write_changelog import make_changelog
 
-FILES = ("LICENSE", "CHANGELOG.md", "package.xml", "msg_defs/package.xml", "flowing_puppet_ros/__init__.py")
+FILES = (
+    "LICENSE", "CHANGELOG.md", "CHANGELOG.rst", "package.xml", "msg_defs/package.xml", "msg_defs/CHANGELOG.rst",
+    "flowing_puppet_ros/__init__.py",
+)  # fmt: skip
 
 
 @pytest.fixture
@@ -54,6 +65,20 @@ def test_a_changelog_needs_the_version_and_for_a_release_its_end(tree: Path) -> 
     assert "no change" in next(check_changelog(tree, released=True))
     log.write_text("# Changelog\n\n## 0.0.1\n\n- A change.\n")
     assert f"## {version}" in next(check_changelog(tree, released=True))
+
+
+def test_placeholders_and_an_old_changelog_are_named(tree: Path) -> None:
+    for folder in (tree, tree / "msg_defs"):
+        text = (folder / "package.xml").read_text()
+        (folder / "package.xml").write_text(text.replace("example.org", "a.org").replace("noreply.github", "a"))
+    for package, place in (("flowing_puppet_ros", tree), ("flowing_puppet_msgs", tree / "msg_defs")):
+        (place / "CHANGELOG.rst").write_text(make_changelog(package, (tree / "CHANGELOG.md").read_text()))
+    assert not list(check_manifests(tree))
+    changed(tree / "package.xml", "https://a.org", "https://example.org")
+    (tree / "msg_defs" / "CHANGELOG.rst").write_text("Old.\n")
+    placeholder, old = check_manifests(tree)
+    assert placeholder == "package.xml has a placeholder, example.org, for an address"
+    assert old == "msg_defs/CHANGELOG.rst is not what `make changelog` writes"
 
 
 def test_a_source_without_its_licence_line_is_named(tree: Path) -> None:

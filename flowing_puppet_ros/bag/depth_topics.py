@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from flowing_puppet_ros.bag.reader import Bag
+from flowing_puppet_ros.bag.reader import RecordingLike
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.component import base_topic, is_compressed_depth_topic
 from flowing_puppet_ros.stream.messages.compressed_depth import decode_compressed_depth, source_encoding
@@ -41,7 +41,7 @@ class DepthTopic:
     info: str
 
 
-def read_samples(bag: Bag) -> dict[str, ImageSample]:
+def read_samples(bag: RecordingLike) -> dict[str, ImageSample]:
     """Return topic -> its first readable image, for raw images and for compressed ones that hold depth."""
     found: dict[str, ImageSample] = {}
     for name, topic in bag.details.items():
@@ -139,7 +139,7 @@ def find_info(topic: str, frame: str, size: tuple[int, int], infos: Mapping[str,
         for name, info in infos.items()
         if _info_size(info) == size and info.header.frame_id.lstrip("/") == frame.lstrip("/") != ""
     ]
-    return max(fitting, key=lambda name: (_count_common(name, topic), name), default=beside if beside in infos else "")
+    return max(fitting, key=lambda name: (count_common(name, topic), name), default=beside if beside in infos else "")
 
 
 def _choose_info(topic: str, sample: ImageSample, infos: Mapping[str, Any]) -> tuple[str, str]:
@@ -156,7 +156,7 @@ def _choose_info(topic: str, sample: ImageSample, infos: Mapping[str, Any]) -> t
     listed = ", ".join(
         f"{name} ({info.width}x{info.height}, frame {info.header.frame_id!r})" for name, info in sorted(infos.items())
     )
-    first = min(infos, key=lambda name: (-_count_common(name, topic), name))
+    first = min(infos, key=lambda name: (-count_common(name, topic), name))
     return (
         "",
         f"{note}, and no camera_info of that size and frame but {listed}; --topic-map {first}:={beside} takes one",
@@ -167,7 +167,7 @@ def _info_size(info: Any) -> tuple[int, int]:
     return int(info.width), int(info.height)
 
 
-def _count_common(first: str, second: str) -> int:
+def count_common(first: str, second: str) -> int:
     """Return how many words two topics have in common from the start."""
     count = 0
     for left, right in zip(first.split("/"), second.split("/"), strict=False):

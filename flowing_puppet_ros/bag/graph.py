@@ -7,11 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from flowing_puppet_ros.bag.colour_topics import ColourTopics, choose_colour, find_colour_topics
 from flowing_puppet_ros.bag.depth_topics import DepthTopic, ImageSample, holds_depth, select_depth_topics
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.settings import Settings
-from flowing_puppet_ros.stream.component import Component, Port, base_topic
+from flowing_puppet_ros.stream.component import COMPRESSED_DEPTH, Component, Port, base_topic
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent, VisualHullSettings
@@ -110,19 +111,21 @@ def build_graph(
     infos: Mapping[str, Any],
     settings: Mapping[str, Mapping[str, Any]],
     factory: MessageFactory,
+    cloud_frames: Mapping[str, str] | None = None,
 ) -> Graph:
     """Make the components that the topics (name -> type) of a recording can feed.
 
     - One tracker per camera.
     - One visual hull of two or more cameras that `frames` connects (`infos`: topic -> its first CameraInfo), and one
       body fitter for its silhouettes.
-    - One body fitter for every topic of clouds or depth images (`samples`: image topic -> its first image).
+    - One body fitter for every topic of clouds or depth images (`samples`: image topic -> its first image;
+      `cloud_frames`: cloud topic -> its frame), joined with the puppets of a colour camera that looks there too.
 
     `settings` is component name -> setting -> value. Outputs of these components in the recording are not used but
     made again. InputError lists the topics if nothing can be used.
     """
     of_depth = {name for name, sample in samples.items() if holds_depth(name, sample.encoding)}
-    cameras = _find_cameras({name: kind for name, kind in topics.items() if name not in of_depth})
+    cameras = find_cameras({name: kind for name, kind in topics.items() if name not in of_depth})
     clouds = [topic for topic, kind in topics.items() if kind == POINT_CLOUD and not topic.endswith("/body_vertices")]
     depths, depth_notes = select_depth_topics(samples, infos, clouds)
     if not cameras and not clouds and not depths:
@@ -136,11 +139,20 @@ def build_graph(
             graph.instances += _make_hull_and_fitter(calibrated, settings, factory)
     made = graph.find_outputs()
     sources: list[str | DepthTopic] = [*(cloud for cloud in clouds if cloud not in made), *depths]
+    trackers = {tracker.resolve("image"): tracker for tracker in graph.instances if "image" in tracker.remapped}
+    colours = find_colour_topics(list(trackers), samples, infos)
     for source in sources:
+        topic = source.image if isinstance(source, DepthTopic) else source
+        colour, note = choose_colour(topic, _find_frame(topic, samples, cloud_frames or {}), colours, frames)
+        graph.notes += [note] if note else []
         fitter = _make_scene_fitter(source, topics, settings, factory)
+        if colour is not None:
+            _join_colour(fitter, trackers[colour.image], colour, settings, factory)
         if fitter.resolve("bodies") in graph.find_outputs():  # by another cloud in the same namespace
             fitter.namespace = f"/{fitter.name.removesuffix('/body_fitter')}"
         graph.instances.append(fitter)
+    for instance in graph.instances:  # people have the ids that a node of this name and namespace would give them
+        instance.component.node = f"{instance.namespace}/{instance.name.rpartition('/')[2]}"
     return graph
 
 
@@ -184,7 +196,8 @@ def _find_skeletons(listing: str, topics: Mapping[str, str]) -> list[str]:
     return sorted(name for name, kind in topics.items() if kind == SKELETON_2D and find_body_id(listing, name))
 
 
-def _find_cameras(topics: Mapping[str, str]) -> list[CameraTopics]:
+def find_cameras(topics: Mapping[str, str]) -> list[CameraTopics]:
+    """Return the cameras whose images are among the topics (name -> type), by namespace."""
     found: dict[str, str] = {}
     for base in IMAGE_NAMES:
         for topic, kind in topics.items():
@@ -256,7 +269,7 @@ def _make_hull_and_fitter(
     hull = VisualHullComponent(chosen, factory)
     remapped = {f"{camera.name}/image": camera.image for camera in cameras}
     fitter = BodyFitterComponent(_make_settings(BodyFitterSettings, "body_fitter", settings), factory)
-    remapped_inputs = {"silhouettes": "/silhouettes", "points": "", "depth": "", "camera_info": "", "initial": ""}
+    remapped_inputs = {port.name: "" for port in fitter.inputs} | {"silhouettes": "/silhouettes"}
     return [Instance("visual_hull", hull, "", remapped), Instance("body_fitter", fitter, "", remapped_inputs)]
 
 
@@ -267,7 +280,7 @@ def _make_scene_fitter(
     factory: MessageFactory,
 ) -> Instance:
     """Return a body fitter for a topic of clouds, or for depth images with their camera_info."""
-    remapped = {"points": "", "depth": "", "camera_info": "", "silhouettes": ""}
+    remapped = dict.fromkeys(("points", "depth", "camera_info", "silhouettes", "puppets", "puppets/camera_info"), "")
     if isinstance(source, DepthTopic):
         topic = base_topic(source.image)
         remapped |= {"depth": source.image, "camera_info": source.info}
@@ -278,6 +291,27 @@ def _make_scene_fitter(
     instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, topic.rpartition("/")[0], remapped)
     fitter.set_expected("initial", topics.get(instance.resolve("initial")) == BODIES)
     return instance
+
+
+def _find_frame(topic: str, samples: Mapping[str, ImageSample], cloud_frames: Mapping[str, str]) -> str:
+    """Return the frame of the depth images or clouds on a topic, "" where it is not known."""
+    sample = next((samples[name] for name in (topic, f"{topic}/{COMPRESSED_DEPTH}") if name in samples), None)
+    return sample.frame if sample else cloud_frames.get(topic, "").lstrip("/")
+
+
+def _join_colour(
+    fitter: Instance,
+    tracker: Instance,
+    colour: ColourTopics,
+    settings: Mapping[str, Mapping[str, Any]],
+    factory: MessageFactory,
+) -> None:
+    """Let a body fitter take the puppets of a tracker, with the calibration of its camera."""
+    if colour.rectified:
+        chosen = {"fusion.rectified": True, **settings.get("body_fitter", {})}
+        fitter.component = BodyFitterComponent(_make_settings(BodyFitterSettings, "", {"": chosen}), factory)
+    fitter.remapped |= {"puppets": tracker.resolve("puppets"), "puppets/camera_info": colour.info}
+    fitter.component.set_expected("puppets", True)
 
 
 def find_info_topics(topics: Mapping[str, str]) -> list[str]:

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 from mcap.reader import make_reader
 
@@ -54,6 +54,34 @@ class Topic:
     type: str
     count: int
     qos: tuple[dict[str, Any], ...]
+
+
+class RecordingLike(Protocol):
+    """Messages by topic: those of a bag, or those that were heard live."""
+
+    @property
+    def path(self) -> Path:
+        """Where it comes from."""
+        ...
+
+    @property
+    def topics(self) -> Mapping[str, str]:
+        """The types of the topics by name."""
+        ...
+
+    @property
+    def details(self) -> Mapping[str, Topic]:
+        """The topics by name."""
+        ...
+
+    @property
+    def notes(self) -> list[str]:
+        """What is to be said about how it was read."""
+        ...
+
+    def messages(self, topics: Collection[str] | None = None) -> Iterator[Record]:
+        """Yield the messages of `topics` (all by default) in the order of their log times."""
+        ...
 
 
 class Bag:

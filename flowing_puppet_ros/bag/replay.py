@@ -7,7 +7,6 @@ import json
 import math
 import sys
 import time
-from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -19,30 +18,35 @@ from tqdm import tqdm
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.bag.depth_topics import read_samples
 from flowing_puppet_ros.bag.foreign.static_frames import find_static_transforms
-from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Instance, build_graph, find_info_topics
-from flowing_puppet_ros.bag.reader import Bag, Record, open_bag
-from flowing_puppet_ros.bag.stuck_stamps import StuckStamps
+from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Graph, Instance, build_graph, find_info_topics
+from flowing_puppet_ros.bag.graph_run import Call, GraphRun, Step
+from flowing_puppet_ros.bag.reader import Record, RecordingLike, open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.unused import count_used, explain_unused
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.component import Output, Port
+from flowing_puppet_ros.stream.component import COMPRESSED
 from flowing_puppet_ros.stream.components.registry import COMPONENTS
 from flowing_puppet_ros.stream.messages.detections import find_body_id, name_body, skeleton_topic
 from flowing_puppet_ros.stream.messages.geometry import FrameTree
-from flowing_puppet_ros.stream.messages.images import compress_image
+from flowing_puppet_ros.stream.messages.images import SharedImages
 from flowing_puppet_ros.stream.messages.message_types import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
     IDS_LIST,
+    POINT_CLOUD,
     PUPPETS,
     TRANSFORMS,
 )
-from flowing_puppet_ros.threads import one_opencv_thread
+from flowing_puppet_ros.stream.pipeline import Pipeline
+from flowing_puppet_ros.stream.stuck_stamps import StuckStamps
+from flowing_puppet_ros.threads import MAX_THREADS, one_blas_thread, one_opencv_thread, usable_threads
 
 STATIC_TRANSFORMS = "/tf_static"
 METADATA_NAME = "flowing_puppet_ros"
 """Name of the output bag's metadata whose "replay" is JSON of the version, settings and counters of the replay."""
+MAX_STEPS_PER_TOPIC = 4
+"""Messages of the recording that are worked on or wait for it at a time, per topic: the bound of a replay's memory."""
 _COPIED_TYPES = (CAMERA_INFO, PUPPETS, TRANSFORMS)
 """Types of input topics that are copied to the output bag, so that a viewer needs no other bag."""
 
@@ -60,6 +64,7 @@ class ReplayOptions:
         playback_duration: seconds to replay after `start_offset`.
         salvage: read what is whole of a truncated or damaged bag.
         progress: show a progress bar on stderr.
+        jobs: threads, None for one per core; the results do not depend on it.
     """
 
     rate: float = 0.0
@@ -70,6 +75,11 @@ class ReplayOptions:
     playback_duration: float = math.inf
     salvage: bool = False
     progress: bool = True
+    jobs: int | None = field(default=None, repr=False)
+
+    def count_threads(self) -> int:
+        """Return the number of threads that work."""
+        return usable_threads(MAX_THREADS) if self.jobs is None else self.jobs
 
 
 def replay(source: Path, target: Path, options: ReplayOptions | None = None) -> dict[str, Any]:
@@ -83,7 +93,7 @@ def replay(source: Path, target: Path, options: ReplayOptions | None = None) -> 
     if source.exists() and source.resolve() in (target.resolve(), target.parent.resolve()):
         raise InputError(f"{target} is the input itself or in its folder: name another output")
     begin = time.perf_counter()
-    with one_opencv_thread(), open_bag(source, options.salvage) as bag:
+    with one_blas_thread(), one_opencv_thread(), open_bag(source, options.salvage) as bag:
         run = _Replay(bag, options)
         with BagWriter(target) as writer:
             run.write_to(writer)
@@ -92,16 +102,31 @@ def replay(source: Path, target: Path, options: ReplayOptions | None = None) -> 
     return run.summarise(source, target, time.perf_counter() - begin, counts)
 
 
+@dataclass(frozen=True, slots=True)
+class ReplayPlan:
+    """What a replay of a recording would run, and what it would warn of before the first message."""
+
+    graph: Graph
+    warnings: tuple[str, ...]
+
+
+def plan_replay(recording: RecordingLike) -> ReplayPlan:
+    """Return what `replay` would run; InputError as of `replay`."""
+    run = _Replay(recording, ReplayOptions())
+    return ReplayPlan(run._graph, tuple(run.warnings))
+
+
 class _Replay:
     """One pass over a bag."""
 
-    def __init__(self, bag: Bag, options: ReplayOptions) -> None:
+    def __init__(self, bag: RecordingLike, options: ReplayOptions) -> None:
         self._bag = bag
         self._options = options
         self._new_name = _rename_topics(bag.topics, options.topic_map)
         self._factory = BagMessageFactory()
         self.warnings: list[str] = list(bag.notes)
         self._stuck = StuckStamps()
+        self._writing_seconds = 0.0
         topics = {self._new_name[name]: kind for name, kind in bag.topics.items()}
         unknown = sorted(set(options.topic_map) - set(bag.topics))
         if unknown:
@@ -114,7 +139,13 @@ class _Replay:
         self._static += self._find_fixed_frames(topics, infos)
         samples = {self._new_name[name]: sample for name, sample in read_samples(bag).items()}
         self._graph = build_graph(
-            topics, samples, self._build_frame_tree(), infos, self._collect_settings(), self._factory
+            topics,
+            samples,
+            self._build_frame_tree(),
+            infos,
+            self._collect_settings(),
+            self._factory,
+            self._read_cloud_frames(topics),
         )
         self.warnings += self._graph.notes
         self._recorded = {self._new_name[name]: detail for name, detail in bag.details.items()}
@@ -122,6 +153,8 @@ class _Replay:
             {name: detail.type for name, detail in self._recorded.items() if detail.count}
         )
         self._outputs = self._graph.find_outputs()
+        cameras = [name for name in self._recorded if len(self._find_pictures(name)) > 1]
+        self._shared = SharedImages(MAX_STEPS_PER_TOPIC * len(cameras))
         copied = {self._new_name[name] for name, kind in bag.topics.items() if kind in _COPIED_TYPES}
         self._copied = (copied | {self._new_name[record.topic] for record in self._static}) - set(self._outputs)
         for instance in self._graph.instances:
@@ -200,6 +233,16 @@ class _Replay:
                 break
         return {self._new_name[old]: info for old, info in found.items()}
 
+    def _read_cloud_frames(self, topics: Mapping[str, str]) -> dict[str, str]:
+        """Return cloud topic -> the frame of its first readable cloud."""
+        found: dict[str, str] = {}
+        for name in self._find_recorded_topics(topics, lambda name: topics[name] == POINT_CLOUD):
+            for record in self._bag.messages([name]):
+                with suppress(InputError):
+                    found[self._new_name[name]] = record.message.header.frame_id
+                break
+        return found
+
     def write_to(self, writer: BagWriter) -> None:
         """Pass every message through the graph and write the results."""
         self._add_topics(writer)
@@ -207,15 +250,17 @@ class _Replay:
         total = sum(self._bag.details[name].count for name in used)
         bar = tqdm(total=total, desc="replay", unit="msg", file=sys.stderr, disable=not self._options.progress)
         log_time = self._static[0].log_time if self._static else 0
-        for record in self._static:
-            self._replay_record(writer, record, log_time)
-        with bar:
+        with bar, Pipeline(self._options.count_threads(), MAX_STEPS_PER_TOPIC * max(1, len(used))) as pipeline:
+            run = GraphRun(self._graph, self._routes, pipeline, writer, self._factory)
+            for record in self._static:
+                run.add(self._make_step(record, log_time))
             for record in pace(self._select_time_span(self._bag.messages(used)), self._options.rate):
                 log_time = record.log_time
-                self._replay_record(writer, record, log_time)
+                run.add(self._make_step(record, log_time))
                 bar.update()
-            for instance in self._graph.instances:
-                self._emit(writer, log_time, instance, self._run_timed(instance, instance.component.flush))
+            run.flush(log_time)
+        self.warnings += run.warnings
+        self._writing_seconds = run.writing_seconds
 
     def _select_time_span(self, records: Iterator[Record]) -> Iterator[Record]:
         """Yield the records of the selected time span; InputError if there are none."""
@@ -257,60 +302,40 @@ class _Replay:
             else:
                 writer.add_topic(topic, port.type, port.qos)
 
-    def _replay_record(self, writer: BagWriter, record: Record, log_time: int) -> None:
+    def _make_step(self, record: Record, log_time: int) -> Step:
+        """Return what is to be done with a record."""
         topic = self._new_name[record.topic]
+        step = Step(log_time)
         if topic in self._copied:
-            writer.write_raw(topic, log_time, record.raw)
+            step.copied = topic, record.raw
         routes = self._routes.get(topic, [])
         if not routes:
-            return
+            return step
         try:
             message = record.message
         except InputError as error:
-            if str(error) not in self.warnings:
-                self.warnings.append(str(error))
-            return
+            step.warnings.append(str(error))
+            return step
         if any(self._needs_time(instance, port) for instance, port in routes):
-            self.warnings += self._stuck.advance(topic, record.log_time, message)
+            step.warnings += self._stuck.advance(topic, record.log_time, message)
+        pictures = self._find_pictures(topic)
+        shared = self._shared.share(message, len(pictures)) if len(pictures) > 1 else message
         for instance, port in routes:
-            named = name_body(instance.resolve(port), topic, message)
-            self._emit(writer, log_time, instance, self._handle(instance, port, named))
+            given = shared if (instance, port) in pictures else name_body(instance.resolve(port), topic, message)
+            step.calls.append(Call(instance, port, given))
+        return step
+
+    def _find_pictures(self, topic: str) -> list[tuple[Instance, str]]:
+        """Return the inputs that a topic feeds with pictures, and not depth."""
+        return [
+            (instance, name)
+            for instance, name in self._routes.get(topic, [])
+            if any(port.name == name and port.transport == COMPRESSED for port in instance.component.inputs)
+        ]
 
     def _needs_time(self, instance: Instance, port: str) -> bool:
         """Return whether messages of an input must follow one another in time; not if partners have their stamps."""
         return port in ("points", "depth") and instance.resolve("initial") not in self._recorded
-
-    def _handle(self, instance: Instance, port: str, message: Any) -> Output:
-        return self._run_timed(instance, lambda: instance.component.handle(port, message))
-
-    def _run_timed(self, instance: Instance, work: Callable[[], Output]) -> Output:
-        begin = time.perf_counter()
-        outputs = work()
-        instance.seconds += time.perf_counter() - begin
-        self.warnings += [f"{instance.name}: {sentence}" for sentence in instance.component.report.drain_warnings()]
-        return outputs
-
-    def _emit(self, writer: BagWriter, log_time: int, instance: Instance, outputs: Output) -> None:
-        """Write messages and pass them on, in the order in which they were made."""
-        queue = deque((instance, port, message) for port, message in outputs)
-        while queue:
-            source, name, message = queue.popleft()
-            if message is None:  # the end of a person's topic, which a bag cannot express
-                continue
-            topic = source.resolve(name)
-            self._write(writer, topic, log_time, message, source.component.find_output(name))
-            for receiver, port in self._routes.get(topic, []):
-                queue.extend((receiver, made, item) for made, item in self._handle(receiver, port, message))
-
-    def _write(self, writer: BagWriter, topic: str, log_time: int, message: Any, port: Port) -> None:
-        if not port.recorded:
-            return
-        if port.per_person and not writer.has_topic(topic):
-            writer.add_topic(topic, port.type, port.qos)
-        if port.transport:
-            writer.write(f"{topic}/{port.transport}", log_time, compress_image(self._factory, message))
-        else:
-            writer.write(topic, log_time, message)
 
     def describe(self) -> dict[str, Any]:
         """Return what made the results and what was counted; the same input and options give the same."""
@@ -329,6 +354,7 @@ class _Replay:
     def summarise(self, source: Path, target: Path, seconds: float, counts: Mapping[str, int]) -> dict[str, Any]:
         """Return the summary of the replay, ready for JSON."""
         instances = self._graph.instances
+        spent_seconds = {instance.name: instance.seconds for instance in instances} | {"writing": self._writing_seconds}
         frames = sum(instance.component.counters["images"] for instance in instances)
         return {
             "input": str(source),
@@ -337,7 +363,7 @@ class _Replay:
             "bodies": sum(instance.component.counters["bodies"] for instance in instances),
             "seconds": round(seconds, 2),
             "frames_per_second": round(frames / seconds, 2),
-            "seconds_of": {instance.name: round(instance.seconds, 2) for instance in instances},
+            "seconds_of": {name: round(spent, 2) for name, spent in spent_seconds.items()},
             "messages": dict(counts),
             **({} if count_used(instances) else {"unused": explain_unused(self._graph, self._recorded, self.warnings)}),
             **self.describe(),

@@ -19,7 +19,7 @@ from rosbags.typesys.store import Typestore
 from flowing_puppet_ros.errors import InputError, PuppetError
 
 _INTERFACES = Path(__file__).resolve().parents[1] / "interfaces"
-_PACKAGES = ("flowing_puppet_msgs", "hri_msgs", "vision_msgs", "foxglove_msgs")
+_PACKAGES = ("flowing_puppet_msgs", "hri_msgs", "vision_msgs", "foxglove_msgs", "people_msgs")
 
 
 def definition_files(package: str) -> tuple[Path, ...]:

@@ -11,6 +11,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.errors import InputError, PuppetError
@@ -22,6 +23,10 @@ VERBS = {
     "track": "track people in a video, a frame folder or a bag with flowing puppets",
     "replay": "run the nodes' algorithms over a bag, losslessly and reproducibly",
     "report": "make the HTML report of a replayed bag",
+    "doctor": "say what can be computed from an input or on this machine, and what to run",
+    "import": "write the videos and the calibration of several cameras into a bag",
+    "calibrate": "refine the calibration and the clocks of several cameras by the people in a bag",
+    "export": "write fitted bodies as GLB, BVH, TRC, OBJ or JSON",
     "networks": "list, check and install the keypoint networks",
     "annotate": "pose puppets on images in the browser",
     "learn": "learn the body models, the likelihood and the detector",
@@ -31,15 +36,20 @@ VERBS = {
 }
 
 
-VERB_PACKAGES = ("evaluate", "sample")
-"""Verbs of several kinds: folders with a module per kind."""
+_INPUT_ARGUMENTS = ("inputs", "input", "images")
+"""Names of the arguments of verbs that are inputs."""
+VERB_PACKAGES = ("doctor", "evaluate", "export", "sample")
+"""Verbs in folders of their own."""
+_MODULES = {"import": "cameras.import_folder", "calibrate": "cameras.calibrate_bag"}
+"""Verbs whose module is elsewhere."""
 
 
 def import_verb(verb: str) -> ModuleType:
     """Import the module of a verb; InputError if it is not installed."""
     if verb == "bench":
         return _import_benchmarks()
-    return import_module(f"{__name__}.{verb}.verb" if verb in VERB_PACKAGES else f"{__name__}.{verb}")
+    module = f"{verb}.verb" if verb in VERB_PACKAGES else _MODULES.get(verb, verb)
+    return import_module(f"{__name__}.{module}")
 
 
 def _import_benchmarks() -> ModuleType:
@@ -69,6 +79,15 @@ def make_verb_parser(verb: str, arguments: list[str]) -> tuple[ModuleType, argpa
     return module, parser, arguments
 
 
+def _suggest(verb: str, parsed: argparse.Namespace, error: str) -> str:
+    """Return the end of the sentence in which a verb refused its input: the command that helps, empty if none does."""
+    from flowing_puppet_ros.doctor.recognise import suggest
+
+    given: Any = next((value for name, value in vars(parsed).items() if name in _INPUT_ARGUMENTS and value), [])
+    paths = given if isinstance(given, list) else [given]
+    return suggest(verb, Path(paths[0]), error) if len(paths) == 1 else ""
+
+
 def main(argv: list[str] | None = None) -> int:
     """Run one verb and return the exit status: 0 done, 1 the work failed, 2 unusable arguments or input."""
     parser = argparse.ArgumentParser(
@@ -81,11 +100,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("verb", choices=VERBS, metavar="VERB", help="what to do; VERB --help says more")
     parser.add_argument("arguments", nargs=argparse.REMAINDER, help=argparse.SUPPRESS)
     chosen = parser.parse_args(argv)
+    parsed = argparse.Namespace()
     try:
         module, verb_parser, arguments = make_verb_parser(chosen.verb, chosen.arguments)
-        return module.run(verb_parser.parse_args(arguments))
+        verb_parser.parse_args(arguments, parsed)
+        return module.run(parsed)
     except PuppetError as error:
-        print(f"flowing-puppet {chosen.verb}: {error}", file=sys.stderr)
+        print(f"flowing-puppet {chosen.verb}: {error}{_suggest(chosen.verb, parsed, str(error))}", file=sys.stderr)
         return error.exit_status
     except KeyboardInterrupt:
         print(f"flowing-puppet {chosen.verb}: interrupted", file=sys.stderr)

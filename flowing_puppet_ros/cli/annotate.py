@@ -14,6 +14,7 @@ from pathlib import Path
 from flowing_puppet_ros.annotate.folder import ImageFolder
 from flowing_puppet_ros.annotate.store import AnnotationStore
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.extras import needing_extra
 from flowing_puppet_ros.image.networks.choice import IMAGE_SIDE_PX, SOURCE_HELP, SOURCES, load_networks
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 
@@ -33,12 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve the page until interrupted; InputError where the extra `annotate` is not installed."""
-    try:
+    with needing_extra("annotate", "annotate"):
         import waitress
 
         from flowing_puppet_ros.annotate.server import MAX_REQUEST_BYTES, make_app
-    except ModuleNotFoundError as error:
-        raise InputError(f"annotate needs {error.name}; pip install 'flowing_puppet_ros[annotate]'") from error
     if arguments.host in WILDCARDS:
         raise InputError(f"--host {arguments.host} does not name a machine; give the address that the browser will use")
     folder = ImageFolder(arguments.folder)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import FitterSettings
+from flowing_puppet_ros.body.measurements.measure import DEFINITIONS
 from flowing_puppet_ros.body.scans.scan import SCAN_SUFFIXES, SUFFIXES, read_scan
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES
 from flowing_puppet_ros.body.scans.unit import UNITS
@@ -25,6 +26,8 @@ from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.cli.scans.fit_file import fit_file, list_files
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions
+from flowing_puppet_ros.cli.scans.fit_sequence import fit_sequence
+from flowing_puppet_ros.cli.scans.given_joints import read_joints
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.settings import Settings, make_out_folder, nested
 
@@ -79,6 +82,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="find the people among floor, walls and furniture first (in metres if --unit is auto); results are"
         " <stem>-1 and so on, the likeliest person first",
     )
+    parser.add_argument(
+        "--sequence",
+        action="store_true",
+        help="the inputs are scans of one person over time, in this order: one shape for all; --joints start the first",
+    )
+    parser.add_argument(
+        "--camera-info",
+        metavar="FILE|FX,FY,CX,CY",
+        help="the input is a depth image (16-bit .png or .tif in --unit, mm if auto; or .npy) of this camera: a file"
+        " with the fields of a CameraInfo, or four numbers in pixels; all people in it are fitted, in metres",
+    )
+    parser.add_argument(
+        "--color",
+        type=Path,
+        metavar="IMAGE",
+        help="colour image of the same pixels as the depth image or organised cloud: keypoint networks find the people"
+        " in it; an organised .pcd with colours has its own",
+    )
+    parser.add_argument(
+        "--joints",
+        type=Path,
+        metavar="JSON",
+        help="start from 3D joints of the one person in the scan's frame and unit: "
+        '{"joints": {"left_wrist": [x, y, z, confidence], ...}}',
+    )
+    parser.add_argument(
+        "--measure",
+        action="store_true",
+        help="measure each person in a standard pose: stature, girths, lengths (m) and volume (m3)",
+    )
     parser.add_argument("--rerun", type=Path, metavar="RRD", help="write the fits as a recording for the Rerun viewer")
     runner.add_arguments(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object per input on stdout")
@@ -96,12 +129,20 @@ def run(arguments: argparse.Namespace) -> int:
         view=arguments.view,
         viewpoint=arguments.viewpoint,
         scene=arguments.scene,
+        camera_info=_resolve_info(arguments),
+        color=None if arguments.color is None else runner.resolve_path(arguments.color, arguments),
         settings=settings.fitter,
         segmentation=settings.segmentation,
+        measure=arguments.measure,
+        joints=() if arguments.joints is None else tuple(read_joints(arguments.joints).items()),
     )
     sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in _find_scans(given)]
     several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
     finished: list[dict[str, Any]] = []
+    if arguments.sequence and (arguments.scene or arguments.scheduler is not None):
+        raise InputError("--sequence fits one person in scans one after another; leave --scene and --scheduler")
+    if arguments.joints is not None and (arguments.scene or (several and not arguments.sequence)):
+        raise InputError("--joints are those of the person in one scan; give one INPUT, and leave --scene")
     if arguments.rerun is not None:
         from flowing_puppet_ros.report.rerun_file import import_rerun
 
@@ -112,7 +153,11 @@ def run(arguments: argparse.Namespace) -> int:
         finished.extend([] if "error" in summary else [summary])
 
     verb = runner.Verb("fit", fit_file, list_files, tell)
-    if several:
+    if arguments.sequence:
+        make_out_folder(options.out)
+        fit_sequence(sources, options, tell)
+        status = 0
+    elif several:
         status = runner.run_batch(verb, sources, options, arguments.out, arguments)
     else:
         status = _one(verb, sources[0], options)
@@ -121,6 +166,14 @@ def run(arguments: argparse.Namespace) -> int:
 
         write_fits(_fits(finished), arguments.rerun)
     return status
+
+
+def _resolve_info(arguments: argparse.Namespace) -> str | None:
+    """Return the numbers of --camera-info, or its file as other processes find it."""
+    given: str | None = arguments.camera_info
+    if given is None or given.count(",") == 3:
+        return given
+    return str(runner.resolve_path(Path(given), arguments))
 
 
 def _parse_viewpoint(text: str) -> tuple[float, float, float]:
@@ -161,6 +214,12 @@ def _find_scans(given: Path) -> list[Path]:
     return found
 
 
+def _list_measurements(measured: dict[str, float]) -> str:
+    return ", ".join(
+        f"{name.replace('_', ' ')} {value:.3f} {DEFINITIONS[name].unit}" for name, value in measured.items()
+    )
+
+
 def _tell(summary: dict[str, Any], as_json: bool) -> None:
     for fit in summary.get("people", [summary]):
         notes = list(fit.get("notes", []))
@@ -170,5 +229,7 @@ def _tell(summary: dict[str, Any], as_json: bool) -> None:
             notes[0] = f"{fit['output']}: {notes[0]}"
         if notes:
             print(f"flowing-puppet fit: {'; '.join(notes)}", file=sys.stderr)
+        if "measurements" in fit and not as_json:
+            print(f"{fit['output']}: {_list_measurements(fit['measurements'])}", flush=True)
     if as_json:
         print(json.dumps(summary), flush=True)

@@ -7,7 +7,7 @@ import argparse
 from importlib import import_module
 from types import ModuleType
 
-from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.extras import needing_extra
 
 MODULES = {
     "ds": "ds.command",
@@ -36,7 +36,5 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _import_kind(name: str) -> ModuleType:
-    try:
+    with needing_extra("learn", "learn"):
         return import_module(f"flowing_puppet_ros.learn.{MODULES[name]}")
-    except ModuleNotFoundError as error:
-        raise InputError(f"learning needs {error.name}; pip install 'flowing_puppet_ros[learn]'") from error

@@ -4,6 +4,7 @@
 Each camera (a topic named image, with its camera_info and, if there are any, detections) is tracked; two or more
 calibrated cameras give silhouettes and a visual hull; silhouettes, point clouds and depth images are fitted with
 bodies. All results go into one bag with the stamps of the input, and so do camera_info, detections and /tf_static.
+All cores work on a bag, or as many as --jobs says; the bytes are the same on any number.
 Several bags are replayed in parallel, on this machine or on a Dask cluster, with the same results as one by one; those
 that were finished by an earlier call with the same flags are skipped.
 """
@@ -93,11 +94,13 @@ def run(arguments: argparse.Namespace) -> int:
         start_offset=arguments.start_offset,
         playback_duration=arguments.playback_duration,
         salvage=arguments.salvage,
+        jobs=arguments.jobs,
     )
     if arguments.rerun is not None:
         from flowing_puppet_ros.report.rerun_file import import_rerun
 
         import_rerun()
+    runner.check_jobs(arguments)
     sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in find_bags(given)]
     if sources == arguments.inputs and len(sources) == 1 and arguments.scheduler is None:
         return _one(sources[0], arguments, options)
@@ -107,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
         out=runner.resolve_path(arguments.out, arguments),
         reports=arguments.report and runner.resolve_path(arguments.report, arguments),
         recordings=arguments.rerun and runner.resolve_path(arguments.rerun, arguments),
-        options=replace(options, progress=False),
+        options=replace(options, progress=False, jobs=None),
     )
     verb = runner.Verb("replay", replay_one, list_files, lambda summary: _tell(summary, arguments.json))
     return runner.run_batch(verb, sources, told, arguments.out, arguments)

@@ -42,7 +42,7 @@ def draw_flow_legend(size: int = 96, background: int = 255) -> np.ndarray:
     return legend
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _colour(flow, scale, wheel):  # type: ignore[no-untyped-def]
     height, width = flow.shape[:2]
     rgb = np.zeros((height, width, 3), np.uint8)

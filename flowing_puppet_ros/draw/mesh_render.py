@@ -190,7 +190,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill_triangles(pixels, depth, faces, corners, buffer, colour):  # type: ignore[no-untyped-def]
     height, width = buffer.shape
     for face in range(len(faces)):
@@ -219,7 +219,7 @@ def _fill_triangles(pixels, depth, faces, corners, buffer, colour):  # type: ign
                         colour[y, x, k] = u * corners[face, 0, k] + v * corners[face, 1, k] + w * corners[face, 2, k]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill_discs(pixels, depth, colours, radius, buffer, colour):  # type: ignore[no-untyped-def]
     height, width = buffer.shape
     for point in range(len(pixels)):

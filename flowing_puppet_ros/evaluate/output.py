@@ -9,13 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
+from flowing_puppet_ros.extras import needing_extra
 from flowing_puppet_ros.settings import make_out_folder
 
 Figures = dict[str, dict[str, float]]
@@ -78,12 +76,15 @@ class EvaluationReport:
 
     def emit(self, arguments: argparse.Namespace) -> None:
         """Write the files into `--out`, if given, and print the table or, with `--json`, the figures."""
+        print(format_json(self.figures) if arguments.json else format_table(self.make_rows()))
         if arguments.out is not None:
             self.write(arguments.out)
-        print(format_json(self.figures) if arguments.json else format_table(self.make_rows()))
 
     def write(self, folder: Path) -> None:
-        """Write `<verb>.json`, `.csv`, and `<verb>-<chart>.png` and `.svg`; the same figures give the same bytes."""
+        """Write `<verb>.json`, `.csv`, and `<verb>-<chart>.png` and `.svg`; the same figures give the same bytes.
+
+        InputError if the extra `report` is missing, when all but the plots is written.
+        """
         make_out_folder(folder)
         write_json(folder / f"{self.verb}.json", {"figures": self.figures, **self.details})
         write_csv(folder / f"{self.verb}.csv", self.make_rows())
@@ -114,6 +115,10 @@ def name_runs(paths: Sequence[Path]) -> list[str]:
 
 def draw_chart(chart: Chart, base: Path) -> None:
     """Draw a chart into `base`.png and `base`.svg."""
+    with needing_extra("report", "a plot"):
+        import matplotlib
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
     settings = {"svg.hashsalt": "flowing_puppet_ros", "svg.fonttype": "none", "font.size": 9, "axes.axisbelow": True}
     with matplotlib.rc_context(settings):
         figure = Figure((WIDTH_IN, HEIGHT_IN), dpi=DPI, layout="constrained")

@@ -34,7 +34,7 @@ def select_diverse(foundation: np.ndarray, count: int, kept: int, temperature: f
     return _lazy_greedy(np.ascontiguousarray(weights.T), count, kept)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _lazy_greedy(weights: np.ndarray, count: int, first: int) -> np.ndarray:
     """Maximise sum over rows of the maximum over the chosen columns; `weights` is (candidates, rows)."""
     candidates, rows = weights.shape

@@ -47,14 +47,35 @@ class Gaussian:
 
         Variables in neither list are marginalised out.
         """
+        gain, covariance = self._regress(kept, given)
+        values = np.asarray(values, dtype=np.float64)
+        mean = self.mean[np.asarray(kept, dtype=np.intp)] + gain @ (
+            values - self.mean[np.asarray(given, dtype=np.intp)]
+        )
+        return Gaussian(mean, covariance)
+
+    def make_conditional(self, kept: Sequence[int] | Array, given: Sequence[int] | Array) -> tuple[Array, Array, Array]:
+        """Return `condition` for any values: the mean (K,) at values of zero, its slope (K, G), and axes (K, K).
+
+        A sample is the mean plus the axes times standard normal numbers.
+        """
+        gain, covariance = self._regress(kept, given)
+        mean = self.mean[np.asarray(kept, dtype=np.intp)] - gain @ self.mean[np.asarray(given, dtype=np.intp)]
+        return mean, gain, _scaled_axes(covariance)
+
+    def _regress(self, kept: Sequence[int] | Array, given: Sequence[int] | Array) -> tuple[Array, Array]:
+        """Return the slope (K, G) of the variables `kept` on the variables `given`, and the covariance that is left."""
         a, b = np.asarray(kept, dtype=np.intp), np.asarray(given, dtype=np.intp)
         gain = np.linalg.solve(self.covariance[np.ix_(b, b)], self.covariance[np.ix_(b, a)]).T
-        mean = self.mean[a] + gain @ (np.asarray(values, dtype=np.float64) - self.mean[b])
         covariance = self.covariance[np.ix_(a, a)] - gain @ self.covariance[np.ix_(b, a)]
-        return Gaussian(mean, (covariance + covariance.T) / 2)
+        return gain, (covariance + covariance.T) / 2
 
     def sample(self, rng: np.random.Generator, n: int) -> Array:
         """Draw samples (n, D); a singular covariance is allowed."""
-        variances, axes = np.linalg.eigh(self.covariance)
-        scaled = axes * np.sqrt(np.maximum(variances, 0.0))
-        return np.asarray(self.mean + rng.standard_normal((n, len(self))) @ scaled.T)
+        return np.asarray(self.mean + rng.standard_normal((n, len(self))) @ _scaled_axes(self.covariance).T)
+
+
+def _scaled_axes(covariance: Array) -> Array:
+    """Return the axes (D, D), in columns, of a covariance, each as long as its standard deviation."""
+    variances, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(variances, 0.0)))

@@ -147,12 +147,30 @@ class StitchedPuppet:
         """Return P_i, the number of pose coefficients of a part."""
         return int(self.pose_basis[part].shape[2])
 
-    def rest_state(self) -> BodyState:
-        """Return the average body in the template pose: pose coefficients that undo the mean pose deformation."""
+    def rest_state(self, shape: Array | None = None) -> BodyState:
+        """Return a body in the template pose: pose coefficients that undo the mean pose deformation.
+
+        `shape` (16, S) are its shape coefficients, to which the parts are stitched; None: the average body.
+        """
         rest = _fit_rest_pose(self)
         parts = len(self.tree)
         upright = np.broadcast_to(np.eye(3), (parts, 3, 3)).copy()
-        return BodyState(self.rest_center.copy(), upright, rest.copy(), np.zeros((parts, self.shape_count)))
+        state = BodyState(self.rest_center.copy(), upright, rest.copy(), np.zeros((parts, self.shape_count)))
+        if shape is None:
+            return state
+        state.shape[:] = shape
+        change = [basis @ own for basis, own in zip(self.shape_basis, state.shape, strict=True)]
+        for (parent, child), interface in zip(self.tree.edges, self.interfaces, strict=True):
+            apart = change[parent][interface.parent_index] - change[child][interface.child_index]
+            moved = (
+                np.average(apart, axis=0, weights=interface.weight) + state.center[parent] - self.rest_center[parent]
+            )
+            state.center[child] += moved
+        return state
+
+    def measure_height(self, shape: Array) -> float:
+        """Return the height in metres of the person of a `shape` (16, S), standing in the template pose."""
+        return float(np.ptp(self.vertices(self.rest_state(shape))[:, 2]))
 
     def local_vertices(self, i: int, d: Array, s: Array) -> Array:
         """Return the vertices (..., N_i, 3) of part `i` in its own frame (Eqs. 45 and 46).
@@ -207,39 +225,54 @@ class StitchedPuppet:
         return rotation.procrustes(points, parent_points, interface.weight)
 
     def sample(self, rng: np.random.Generator, shape_scale: float = 1.0, pose_scale: float = 1.0) -> BodyState:
-        """Draw a stitched body that faces along x (thesis section "Generating Model Instances").
+        """Draw one of the bodies of `sample_many`."""
+        bodies = self.sample_many(rng, 1, shape_scale, pose_scale)
+        return BodyState(bodies.center[0], bodies.rotation[0], bodies.pose[0], bodies.shape[0])
 
-        All parts share one shape. From the torso outwards, a part's pose coefficients are drawn given its parent's,
-        and its rotation and centre stitch it to its parent within the joint limits. The scales multiply standard
-        deviations.
+    def sample_many(
+        self, rng: np.random.Generator, count: int, shape_scale: float = 1.0, pose_scale: float = 1.0
+    ) -> BodyState:
+        """Draw `count` stitched bodies that face along x (thesis section "Generating Model Instances").
+
+        All parts of a body share one shape. From the torso outwards, a part's pose coefficients are drawn given its
+        parent's, and its rotation and centre stitch it to its parent within the joint limits. The scales multiply
+        standard deviations. Bodies drawn one by one are the same but for rounding.
         """
+        counts = [self.pose_count(part) for part in range(len(self.tree))]
+        ends = np.cumsum([self.shape_count, *counts])
+        drawn = np.split(rng.standard_normal((count, ends[-1])), ends[:-1], axis=1)
         rest = self.rest_state()
-        rest.shape[:] = np.clip(shape_scale * rng.standard_normal(self.shape_count), -MAX_DEVIATIONS, MAX_DEVIATIONS)
-        torso = self.pose_count(0)
-        rest.pose[0, :torso] = np.clip(pose_scale * rng.standard_normal(torso), -MAX_DEVIATIONS, MAX_DEVIATIONS)
+        bodies = BodyState(*(np.tile(array, (count, *[1] * array.ndim)) for array in _arrays_of(rest)))
+        bodies.shape[:] = np.clip(shape_scale * drawn[0], -MAX_DEVIATIONS, MAX_DEVIATIONS)[:, None, :]
+        bodies.pose[:, 0, : counts[0]] = np.clip(pose_scale * drawn[1], -MAX_DEVIATIONS, MAX_DEVIATIONS)
         for parent, child in self.tree.edges:
-            given, own = self.pose_count(parent), self.pose_count(child)
-            d_child = self.pairwise[child - 1].condition(
-                np.arange(3 + given, 3 + given + own), np.arange(3, 3 + given), rest.pose[parent, :given]
+            given, own = counts[parent], counts[child]
+            mean, gain, axes = self.pairwise[child - 1].make_conditional(
+                np.arange(3 + given, 3 + given + own), np.arange(3, 3 + given)
             )
-            drawn = d_child.mean + pose_scale * (d_child.sample(rng, 1)[0] - d_child.mean)
-            rest.pose[child, :own] = np.clip(drawn, -MAX_DEVIATIONS, MAX_DEVIATIONS)
-            self._attach_to_parent(rest, parent, child)
-        return rest
+            expected = mean + bodies.pose[:, parent, :given] @ gain.T
+            poses = expected + pose_scale * (drawn[1 + child] @ axes.T)
+            bodies.pose[:, child, :own] = np.clip(poses, -MAX_DEVIATIONS, MAX_DEVIATIONS)
+            self._attach_to_parent(bodies, parent, child)
+        return bodies
 
-    def _attach_to_parent(self, state: BodyState, parent: int, child: int) -> None:
+    def _attach_to_parent(self, bodies: BodyState, parent: int, child: int) -> None:
         mesh = self.part_mesh(
-            parent, state.center[parent], state.rotation[parent], state.pose[parent], state.shape[parent]
+            parent,
+            bodies.center[:, parent],
+            bodies.rotation[:, parent],
+            bodies.pose[:, parent],
+            bodies.shape[:, parent],
         )
         interface = self.interfaces[child - 1]
-        target = mesh[interface.parent_index]
-        stitched, _ = self.stitch(child, parent, target, state.pose[child], state.shape[child])
-        relative = rotation.log(state.rotation[parent].T @ stitched)
+        target = mesh[:, interface.parent_index]
+        stitched, _ = self.stitch(child, parent, target, bodies.pose[:, child], bodies.shape[:, child])
+        relative = rotation.log(np.swapaxes(bodies.rotation[:, parent], -1, -2) @ stitched)
         limited = np.clip(relative, self.limit_low[child - 1], self.limit_high[child - 1])
-        state.rotation[child] = state.rotation[parent] @ rotation.exp(limited)
-        own = self.local_vertices(child, state.pose[child], state.shape[child])[interface.child_index]
-        offsets = target - own @ state.rotation[child].T
-        state.center[child] = np.average(offsets, axis=0, weights=interface.weight)
+        bodies.rotation[:, child] = bodies.rotation[:, parent] @ rotation.exp(limited)
+        own = self.local_vertices(child, bodies.pose[:, child], bodies.shape[:, child])[:, interface.child_index]
+        offsets = target - own @ np.swapaxes(bodies.rotation[:, child], -1, -2)
+        bodies.center[:, child] = np.average(offsets, axis=1, weights=interface.weight)
 
     def mirror(self, state: BodyState) -> BodyState:
         """Mirror a body in the plane y = 0: left and right are swapped."""
@@ -249,6 +282,10 @@ class StitchedPuppet:
             pose[..., i, : len(signs)] *= signs
         rotations = MIRROR_POINT[:, None] * state.rotation[..., other, :, :] * MIRROR_POINT
         return BodyState(state.center[..., other, :] * MIRROR_POINT, rotations, pose, state.shape[..., other, :])
+
+
+def _arrays_of(state: BodyState) -> tuple[Array, Array, Array, Array]:
+    return state.center, state.rotation, state.pose, state.shape
 
 
 @lru_cache(maxsize=4)

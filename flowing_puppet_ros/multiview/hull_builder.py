@@ -127,16 +127,22 @@ class HullBuilder:
             )
         return self._get_estimator(name).update_background(image, labels, scale, person)
 
-    def segment(self, views: Mapping[str, CameraObservation]) -> MultiViewPerson:
-        """Segment the silhouettes of one set and triangulate its joints.
+    def observe(self, name: str, image: U8, labels: U8, scale: float, person: U8) -> Observation:
+        """Return another person of a frame from which camera `name` has learned; see `SilhouetteEstimator.observe`."""
+        return self._get_estimator(name).observe(image, labels, scale, person)
 
-        `views` maps camera names to their observations at one instant. Raises InputError for a camera without
-        calibration.
+    def segment(self, views: Mapping[str, CameraObservation], identity: str = "") -> MultiViewPerson:
+        """Segment the silhouettes of one person in one set and triangulate its joints.
+
+        `views` maps camera names to their observations of the person called `identity` at one instant. Raises
+        InputError for a camera without calibration.
         """
         missing = sorted(set(views) - set(self.cameras))
         if missing:
             raise InputError(f"camera {missing[0]} has no calibration; check that its camera_info is published")
-        silhouettes = {name: self._get_estimator(name).segment(view.observation) for name, view in views.items()}
+        silhouettes = {
+            name: self._get_estimator(name).segment(view.observation, identity) for name, view in views.items()
+        }
         usable = sum(not silhouette.problem for silhouette in silhouettes.values())
         problem = ""
         if usable < MIN_VIEWS:

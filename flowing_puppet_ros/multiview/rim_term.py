@@ -164,7 +164,7 @@ def _match_outline(vertices: F64, normals: F64, edges: I64, outline: Outline, si
     )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _find_rim(vertices, normals, eye, edges):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return both ends of the edges (E, 2) that the rim crosses, seen from `eye` (3,), and where, 0 to 1."""
     facing = np.empty(len(vertices))
@@ -182,7 +182,7 @@ def _find_rim(vertices, normals, eye, edges):  # type: ignore[no-untyped-def]  #
     return first[:count], second[:count], share[:count]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _find_nearest(points, directions, rim, rim_directions, direction_cost, min_cosine):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return for every outline point the index of the nearest rim point; -1 where their directions disagree."""
     nearest = np.full(len(points), -1)

@@ -83,14 +83,15 @@ class Silhouette:
 class SilhouetteEstimator:
     """Silhouettes of the tracked people in one still camera's images.
 
-    `update_background` is cheap and needs every frame; `segment` takes the observations whose mask is wanted.
+    `update_background` is cheap and needs every frame, `observe` gives the other people of the same frame; `segment`
+    takes the observations whose mask is wanted.
     """
 
     def __init__(self, settings: SilhouetteSettings | None = None) -> None:
         """Start without a background."""
         self.settings = settings or SilhouetteSettings()
         self.background = Background(self.settings.background)
-        self._areas: deque[float] = deque(maxlen=_AREA_HISTORY)
+        self._areas: dict[str, deque[float]] = {}
 
     def reset(self) -> None:
         """Forget the background and the areas."""
@@ -106,7 +107,17 @@ class SilhouetteEstimator:
     ) -> Observation:
         """Learn the background from a frame and return the frame at working scale, for `segment`.
 
-        Frames without any puppet are not learned: an untracked person may still be there.
+        Frames without any puppet are not learned: an untracked person may still be there. Arguments as of `observe`.
+        """
+        observation = self.observe(image, labels, scale, person)
+        everyone = observation.puppet | observation.others
+        if everyone.any():
+            bare = distance_transform(everyone) > _BARE_DISTANCE_M * observation.scale
+            self.background.update(observation.image, bare)
+        return observation
+
+    def observe(self, image: U8, labels: U8, scale: float, person: U8 | None = None) -> Observation:
+        """Return a frame at working scale, without learning from it.
 
         Args:
             image: (H, W, 3) uint8 RGB.
@@ -126,13 +137,13 @@ class SilhouetteEstimator:
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor < 1 else image
         everyone = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST) > 0
         puppet = cv2.resize(person, size, interpolation=cv2.INTER_NEAREST) > 0
-        observation = Observation(small, puppet, everyone & ~puppet, scale * factor)
-        if everyone.any():
-            self.background.update(small, distance_transform(everyone) > _BARE_DISTANCE_M * observation.scale)
-        return observation
+        return Observation(small, puppet, everyone & ~puppet, scale * factor)
 
-    def segment(self, observation: Observation) -> Silhouette:
-        """Segment an observed frame; the result has a `problem` when it is empty or its area unlike recent ones."""
+    def segment(self, observation: Observation, identity: str = "") -> Silhouette:
+        """Segment an observed frame; the result has a `problem` when it is empty or its area unlike recent ones.
+
+        Areas are those of the person called `identity`.
+        """
         if not observation.puppet.any():
             return Silhouette(np.zeros(observation.puppet.shape, np.uint8), "no puppet in the image")
         self.background.resize((observation.puppet.shape[0], observation.puppet.shape[1]))
@@ -142,7 +153,7 @@ class SilhouetteEstimator:
         body = _grab_cut(np.ascontiguousarray(observation.image[window]), seed[window], self.settings.grabcut_rounds)
         mask = np.zeros(observation.puppet.shape, np.uint8)
         mask[window] = _clean(body, sure[window], _OPENING_RADIUS_M * observation.scale)
-        return Silhouette(mask, self._check_area(mask, observation.scale))
+        return Silhouette(mask, self._check_area(mask, observation.scale, identity))
 
     def _make_seed(self, observation: Observation) -> U8:
         """Return GrabCut's seed (h, w): the evidence of puppet and background for every pixel."""
@@ -171,10 +182,11 @@ class SilhouetteEstimator:
         seed[observation.others] = cv2.GC_BGD
         return seed
 
-    def _check_area(self, mask: U8, scale: float) -> str:
+    def _check_area(self, mask: U8, scale: float, identity: str) -> str:
         area = np.count_nonzero(mask) / scale**2
-        median = float(np.median(self._areas)) if len(self._areas) >= _MIN_AREA_HISTORY else area
-        self._areas.append(area)
+        areas = self._areas.setdefault(identity, deque(maxlen=_AREA_HISTORY))
+        median = float(np.median(areas)) if len(areas) >= _MIN_AREA_HISTORY else area
+        areas.append(area)
         if area == 0:
             return "the silhouette is empty"
         if not 1 / (1 + self.settings.max_area_change) <= area / median <= 1 + self.settings.max_area_change:

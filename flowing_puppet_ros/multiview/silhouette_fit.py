@@ -13,9 +13,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, U8
+from flowing_puppet_ros.arrays import F64, I8, U8
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, flip_heading, make_joint_targets
+from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
@@ -36,6 +37,8 @@ from flowing_puppet_ros.threads import one_blas_thread
 _MIN_OVERLAP_RATIO = 0.7
 # Distance outside a silhouette at which a vertex counts a quarter.
 _KERNEL_WIDTH_M = 0.04
+# Share inside the silhouettes from which on a vertex counts as seen: less than 2 cm outside on average, or 4 cm.
+_MIN_SEEN_SHARE, _MIN_NEAR_SHARE = 0.64, 0.25
 # Joints place limbs along the rays and in front of the body; outlines determine everything else better.
 _WEIGHTS = RefineWeights(pose=1e-7, pairwise=1e-7, shape=2e-6, sigma_start=0.08, sigma_end=0.05)
 
@@ -185,7 +188,14 @@ class SilhouetteFitter:
             best.overlap,
             best.overlap >= self.settings.min_iou,
             float(gap),
+            BodyVisibility.of_vertices(self.model, _judge_vertices(inside)),
         )
+
+
+def _judge_vertices(inside: F64) -> I8:
+    """Return the `Visibility` (V,) of vertices by how far they lie inside the silhouettes that show them."""
+    state = np.where(inside >= _MIN_NEAR_SHARE, Visibility.NEAR, Visibility.INFERRED)
+    return np.where(inside >= _MIN_SEEN_SHARE, Visibility.SEEN, state).astype(np.int8)
 
 
 def _mirror_name(name: str) -> str:

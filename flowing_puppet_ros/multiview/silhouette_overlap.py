@@ -27,7 +27,7 @@ def render_mask(camera: Camera, vertices: F64, faces: I32) -> Bools:
     return mask
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill(mask, pixels, faces):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set the pixels of `mask` inside or on any triangle; each row is one run between the triangle's edges."""
     height, width = mask.shape

@@ -56,16 +56,22 @@ def triangulate(
     Raises:
         InputError: with fewer than two cameras, or arrays of other shapes.
     """
-    settings = settings or TriangulationSettings()
     pixels, weights = _check_inputs(len(cameras), points, confidence)
     plane = np.stack([camera.undistort(xy) for camera, xy in zip(cameras, pixels, strict=True)])
+    return triangulate_plane(cameras, plane, weights, settings or TriangulationSettings())
+
+
+def triangulate_plane(
+    cameras: Sequence[Camera], plane: F64, weights: F64, settings: TriangulationSettings
+) -> tuple[F64, F64]:
+    """Triangulate as `triangulate` does, from points (C, J, 2) on the undistorted image planes; NaN where unseen."""
     known = np.isfinite(plane).all(axis=-1) & (weights >= settings.min_confidence) & (weights > 0)
     weights = np.where(known, weights, 0.0)
     plane = np.where(known[..., None], plane, 0.0)
 
     proposals = _propose_from_pairs(cameras, plane, known, settings)
     cost = np.stack([_robust_cost(cameras, plane, weights, p, settings.max_ray_distance) for p in proposals])
-    best = proposals[cost.argmin(axis=0), np.arange(pixels.shape[1])]
+    best = proposals[cost.argmin(axis=0), np.arange(plane.shape[1])]
     for _ in range(_GAUSS_NEWTON_STEPS):
         best = _gauss_newton_step(cameras, plane, weights, best, settings.max_ray_distance)
 

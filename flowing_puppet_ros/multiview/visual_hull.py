@@ -162,7 +162,7 @@ def _make_distance_field(views: list[_SignedSilhouette], corners: F64, settings:
     return field
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy")
 def _carve(volume, grid, distance, camera):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Raise a field (X, Y, Z) to one camera's signed distances in metres; count the cameras that see each voxel.
 

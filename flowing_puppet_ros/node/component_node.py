@@ -134,6 +134,7 @@ class ComponentNode[C: Component[Any]](LifecycleNode):
         """Make the component with the current settings and connect it to the topics."""
         kind: Any = COMPONENTS[self._component]
         component: C = kind(self._settings, RosMessageFactory())
+        component.node = self.get_fully_qualified_name()
         component.warm_up()
         settings = self._node_settings
         self.session = Session(self, component, settings.queue, self._diagnostics, settings.image_transport)

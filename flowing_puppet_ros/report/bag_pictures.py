@@ -34,6 +34,7 @@ STRIP_HEIGHT, FLOW_HEIGHT, VIEW_HEIGHT = 560, 400, 400  # px of track, flow and 
 BODY_SIZE = (360, 520)  # px, width and height of a body alone
 VIEW_ASPECT = 0.75  # width by height of a body over an image
 POINT_COLOUR = (20, 90, 200)
+PALE_SHARE = 0.6  # of white in the colour of a part that was not seen
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,11 +219,16 @@ def read_body_meshes(bodies: Sequence[Any], vertices: Any, triangles: np.ndarray
 
 
 def _vertex_colours(body: Any, count: int) -> np.ndarray:
-    """Return colours (V, 3) by part; grey for a model that is not installed here."""
+    """Return colours (V, 3) by part, pale where it was not seen; grey for a model that is not installed here."""
     with suppress(PuppetError):
         model = StitchedPuppet.load(body.model)
         if len(model.part_of_vertex) == count:
-            return part_colours(model.tree.names)[model.part_of_vertex].astype(float)
+            colours = part_colours(model.tree.names).astype(float)
+            # A recording of an older version says nothing of visibility.
+            unseen = [getattr(part, "visibility", 1) == 0 for part in body.parts]
+            if len(unseen) == len(colours):
+                colours[unseen] += PALE_SHARE * (255.0 - colours[unseen])
+            return colours[model.part_of_vertex]
     return np.full((count, 3), 205.0)
 
 

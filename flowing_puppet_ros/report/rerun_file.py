@@ -26,6 +26,7 @@ from flowing_puppet_ros.evaluate.bag.recording import (
     sensor_cloud_topics,
     to_cloud,
 )
+from flowing_puppet_ros.extras import import_extra
 from flowing_puppet_ros.report.bag_pictures import read_body_meshes
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
@@ -39,11 +40,7 @@ POINT_RADIUS_M = 0.004  # joints are four times as large
 
 def import_rerun() -> Any:
     """Return the package rerun-sdk; InputError says how to install it if it is missing."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise InputError("--rerun needs rerun-sdk: pip install 'flowing_puppet_ros[rerun]'") from error
-    return rerun
+    return import_extra("rerun", "rerun", "--rerun")
 
 
 def write_replay(input_bag: Path, output_bag: Path, path: Path) -> None:

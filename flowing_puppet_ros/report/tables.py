@@ -14,6 +14,12 @@ from flowing_puppet_ros.report.data import BodiesData, CameraData, ReportData
 from flowing_puppet_ros.report.page import details, table
 
 PUPPET_THRESHOLD_CM, BODY_THRESHOLD_CM = 10.0, 7.0  # of joint errors that count as correct
+SOURCES = {
+    "paired detections": "detections of the recording",
+    "searches for everybody": "keypoint networks",
+    "full frames with people": "the package's own detector",
+}
+"""What found the people, by the counter that tells it."""
 DETECTION_NOTE = "a detector's shoulders and hips differ slightly from the puppet's, so that 0 cannot be reached"
 
 
@@ -59,7 +65,17 @@ def _make_run_rows(data: ReportData) -> list[tuple[str, str, str]]:
         value = data.summary.get(key)
         if isinstance(value, (int, float)):
             rows.append((label, format_number(float(value), digits, unit), note))
+    found = _name_sources(data.summary)
+    if found:
+        rows.append(("People found by", found, "what the trackers start from and are corrected by"))
     return rows
+
+
+def _name_sources(summary: Mapping[str, Any]) -> str:
+    """Return what found the people in the images of a replay, by what its components counted."""
+    counted = [values for values in summary.get("counters", {}).values() if isinstance(values, Mapping)]
+    names = [name for counter, name in SOURCES.items() if any(values.get(counter) for values in counted)]
+    return ", ".join(names)
 
 
 def _make_camera_rows(camera: CameraData, cameras: int) -> list[tuple[str, str, str]]:

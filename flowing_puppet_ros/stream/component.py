@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.ids import make_public_id
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory
@@ -95,6 +96,8 @@ class Component[S: Settings]:
     """Settings that cannot change after the node was started."""
     hot_settings: ClassVar[frozenset[str]] = frozenset()
     """Settings that `reconfigure` changes while the component runs; a change of any other needs a new component."""
+    node: str = ""
+    """Fully qualified name of the node, from which the ids of its people follow; empty where there is no node."""
     background: Executor | None = None
     """Executor of slow work in a live node; None: all work is done at once, as in a replay."""
     inputs: tuple[Port, ...]
@@ -130,6 +133,10 @@ class Component[S: Settings]:
     def reconfigure(self, settings: S) -> None:
         """Continue with settings that differ from the present ones in `hot_settings` only."""
         self.settings = settings
+
+    def publish_id(self, own: str) -> str:
+        """Return the id under which a person is published that the component itself calls `own`."""
+        return make_public_id(self.node, own) if self.node else own
 
     def set_expected(self, port: str, expected: bool) -> None:
         """Set whether an optional input has publishers, so that the component knows what to wait for."""

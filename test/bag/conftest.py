@@ -29,7 +29,7 @@ class Golden:
 @pytest.fixture(scope="session")
 def golden(tmp_path_factory: pytest.TempPathFactory) -> Golden:
     path = tmp_path_factory.mktemp("golden") / "out.mcap"
-    options = ReplayOptions(settings=SETTINGS, progress=False)
+    options = ReplayOptions(settings=SETTINGS, progress=False, jobs=3)
     summary = replay(GOLDEN / "golden.mcap", path, options)
     truth, expected = (json.loads((GOLDEN / f"{name}.json").read_text()) for name in ("truth", "expected"))
     return Golden(GOLDEN / "golden.mcap", truth, expected, path, options, summary)

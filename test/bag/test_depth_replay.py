@@ -168,7 +168,7 @@ def test_depth_images_named_as_pictures_are_no_camera(tmp_path: Path) -> None:
         ("/depth/image_rect", IMAGE, image(0, NOTHING, "32FC1")),
         ("/depth/camera_info", CAMERA_INFO, info(0)),
     )
-    assert said == []
+    assert said == ["/depth/image_rect is used without colour: there is no camera_info for /rgb/image_raw"]
     assert (made["/rgb/puppets"], made["/depth/bodies"]) == (1, 1), "one of the two depth images, the rectified one"
     assert "/depth/puppets" not in made
 

@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The recipe of the sample bag: cached and checked downloads, and messages in the right pixels and frames."""
+"""The recipe of the sample bag: cached and checked downloads, and keypoints in the right pixels and frames."""
 
 import hashlib
 import importlib.util
+import json
 import subprocess
-import tomllib
+import zipfile
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import PuppetError
-from flowing_puppet_ros.stream.messages.geometry import FrameTree
-from flowing_puppet_ros.stream.messages.images import decode_image
+from flowing_puppet_ros.multiview.rig.files import read_rig
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
 
@@ -77,49 +74,28 @@ def test_a_failed_download_is_one_sentence(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_messages_are_in_the_pixels_and_frames_of_the_videos(recipe: ModuleType, tmp_path: Path) -> None:
-    """A world point projected with the bag's camera_info and /tf_static lands on its cropped keypoint."""
-    calibration = tomllib.loads((BAGS / "calibration.toml").read_text())
-    point, seen = np.array([0.3, -0.2, 1.1]), {}
-    with BagWriter(tmp_path / "bag.mcap") as writer:
-        maker = recipe.Recipe(writer, calibration)
-        maker.write_cameras()
-        for name, c in calibration.items():
-            lens = np.array(c["matrix"]), np.array(c["distortion"])
-            pixel, _ = cv2.projectPoints(point, np.array(c["rotation"]), np.array(c["translation"]), *lens)
-            person = np.zeros((25, 3))
-            person[3] = [*pixel.ravel(), 0.7]
-            maker.write_detections(name, 50, [person])
-            seen[name] = pixel.ravel() - [c["crop"], 0]
-            maker.write_image(name, 50, np.full((1920, c["video_size"][0], 3), 90, np.uint8))
-    with open_bag(tmp_path / "bag.mcap") as bag:
-        found: dict[str, Any] = {record.topic: record.message for record in bag.messages()}
-    frames = FrameTree()
-    frames.add(found["/tf_static"])
-    for name in calibration:
-        info = found[f"/{name}/camera_info"]
-        placed = frames.lookup_pose(info.header.frame_id, frames.find_root(info.header.frame_id))
-        assert placed is not None
-        position, rotation = placed
-        local = rotation.T @ (point - position)
-        pixel, _ = cv2.projectPoints(local, np.zeros(3), np.zeros(3), info.k.reshape(3, 3), info.d)
-        np.testing.assert_allclose(pixel.ravel(), seen[name], atol=1e-3)
-        joint = found[f"/{name}/detections"].puppets[0].joints[3]
-        np.testing.assert_allclose([joint.x, joint.y], seen[name], atol=1e-3)
-        assert joint.name == "LEar"
-        assert np.isnan(found[f"/{name}/detections"].puppets[0].joints[0].x)
-        assert decode_image(found[f"/{name}/image/compressed"]).shape == (info.height, info.width, 3)
-        assert local[2] > 0
+def test_keypoints_are_in_the_pixels_and_frames_of_the_videos(recipe: ModuleType, tmp_path: Path) -> None:
+    """A keypoint of file 4 is one of frame 5, without the columns that its video lost; what was not found is null."""
+    row = [100.0, 200.0, 0.7, 0.0, 0.0, 0.0] + [1.0, 2.0, 0.1] * 23
+    with zipfile.ZipFile(tmp_path / "wheel.whl", "w") as archive:
+        for camera in recipe.CROPS:
+            for index in range(recipe.FRAMES):
+                people = [{"pose_keypoints_2d": row}] if index == 4 else []
+                name = f"Pose2Sim/Demo/pose/cam{camera[-1]}_json/{camera}.{index:04d}.json"
+                archive.writestr(name, json.dumps({"people": people}))
+    recipe.write_keypoints(tmp_path / "wheel.whl", tmp_path)
+    for camera, left in (("cam01", 8), ("cam02", 4), ("cam03", 0)):
+        frames = json.loads((tmp_path / f"{camera}.json").read_text())["frames"]
+        assert sorted(map(int, frames)) == list(range(1, 100))
+        assert frames["4"] == [] and frames["5"][0][:2] == [[100.0 - left, 200.0, 0.7], [None, None, 0.0]]
 
 
-def test_keypoints_lag_the_video_by_one_frame(recipe: ModuleType) -> None:
-    asked: list[str] = []
-
-    class Archive:
-        def read(self, name: str) -> str:
-            asked.append(name)
-            return '{"people": []}'
-
-    assert recipe.people(Archive(), "cam02", 0) is None
-    assert recipe.people(Archive(), "cam02", 1) == []
-    assert asked == ["Pose2Sim/Demo/pose/cam2_json/cam02.0000.json"]
+def test_the_calibration_is_that_of_the_videos(recipe: ModuleType) -> None:
+    """The rotations and the size of the cropped videos are in the file, and the cameras look at the treadmill."""
+    rig = read_rig(BAGS / "calibration.toml")
+    assert list(rig.cameras) == list(recipe.CROPS)
+    for name, crop in recipe.CROPS.items():
+        camera = rig.cameras[name].camera
+        assert camera.size == (1080 if crop else 1088, 1920)
+        pixel, depth = camera.project(np.array([0.0, 0.0, 1.0]))
+        assert depth > 2 and 0 < pixel[0] < camera.size[0] and 0 < pixel[1] < camera.size[1]

@@ -19,7 +19,7 @@ from flowing_puppet_ros.stream.components.registry import COMPONENTS, node_setti
 ROOT = Path(__file__).resolve().parents[2]
 FENCE = re.compile(r"^```(bash(?: test)?|python(?: test)?)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 ROS2 = {"launch", "topic", "node", "security", "action", "bag", "lifecycle", "param", "service", "run"}
-USUAL = {"source", "export", "colcon", "ls", "cd", "rviz2"}
+USUAL = {"source", "export", "colcon", "ls", "cd", "rviz2", "git", "ln", "rosdep", "docker"}
 
 
 class WrongCommand(AssertionError):
@@ -123,7 +123,8 @@ def _check_ros2(given: list[str]) -> None:
     if given[:2] == ["launch", "flowing_puppet_ros"]:
         path = ROOT / "launch" / given[2]
         _check_files([f"launch/{given[2]}"])
+        declared = path.read_text() + (ROOT / "flowing_puppet_ros/node/launching/actions.py").read_text()
         for argument in given[3:]:
             name = argument.partition(":=")[0]
-            if f'"{name}"' not in path.read_text():
+            if f'"{name}": (' not in declared:
                 raise WrongCommand(f"{path.name} has no argument {name!r}")

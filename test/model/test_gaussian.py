@@ -28,6 +28,15 @@ def test_conditional_is_joint_over_marginal(joint: Gaussian) -> None:
         np.testing.assert_allclose(log_density(conditional, point), expected)
 
 
+def test_conditional_for_any_values_is_that_for_each(joint: Gaussian) -> None:
+    kept, given = [3, 0], [4, 1]
+    mean, slope, axes = joint.make_conditional(kept, given)
+    for values in np.random.default_rng(4).normal(size=(3, 2)):
+        conditional = joint.condition(kept, given, values)
+        np.testing.assert_allclose(mean + slope @ values, conditional.mean)
+        np.testing.assert_allclose(axes @ axes.T, conditional.covariance)
+
+
 def test_marginal_is_the_integral_of_the_joint() -> None:
     pair = Gaussian(np.array([0.3, -0.2]), np.array([[1.0, 0.6], [0.6, 0.8]]))
     y = np.linspace(-8, 8, 4001)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.model import rotation
-from flowing_puppet_ros.model.sp import POSE_WIDTH, BodyState, StitchedPuppet
+from flowing_puppet_ros.model.sp import MAX_DEVIATIONS, POSE_WIDTH, BodyState, StitchedPuppet
 
 MIRROR = np.array([1.0, -1.0, 1.0])
 
@@ -189,6 +189,32 @@ def test_samples_depend_on_the_seed_alone(neutral: StitchedPuppet) -> None:
     np.testing.assert_array_equal(first.center, second.center)
     np.testing.assert_array_equal(first.pose, second.pose)
     assert np.abs(first.pose - third.pose).max() > 0.1
+
+
+def test_many_samples_are_those_drawn_one_by_one(neutral: StitchedPuppet) -> None:
+    rng = np.random.default_rng(4)
+    single = [neutral.sample(rng, 0.7, 0.9) for _ in range(5)]
+    many = neutral.sample_many(np.random.default_rng(4), 5, 0.7, 0.9)
+    for name in ("center", "rotation", "pose", "shape"):
+        np.testing.assert_allclose(getattr(many, name), [getattr(each, name) for each in single], atol=1e-9)
+    assert (neutral.sample_many(rng, 3, 0.0).shape == 0).all()
+
+
+def test_poses_of_neighbours_are_drawn_with_their_covariance(neutral: StitchedPuppet) -> None:
+    """The torso's coefficients are standard normal, and the upper leg's follow from them by the pairwise Gaussian."""
+    child = neutral.tree.names.index("left_upper_leg")
+    parent, pair = neutral.tree.parents[child], neutral.pairwise[child - 1]
+    given, own = neutral.pose_count(parent), neutral.pose_count(child)
+    drawn = neutral.sample_many(np.random.default_rng(6), 4000, 0.0)
+    inside = (np.abs(drawn.pose[:, parent]) < MAX_DEVIATIONS).all(axis=1)
+    poses = np.concatenate([drawn.pose[inside, parent, :given], drawn.pose[inside, child, :own]], axis=1)
+    residual = [
+        pose[given:] - pair.condition(np.arange(3 + given, 3 + given + own), np.arange(3, 3 + given), pose[:given]).mean
+        for pose in poses
+    ]
+    expected = pair.condition(np.arange(3 + given, 3 + given + own), np.arange(3, 3 + given), np.zeros(given))
+    np.testing.assert_allclose(np.mean(residual, axis=0), 0, atol=0.06)
+    np.testing.assert_allclose(np.cov(residual, rowvar=False), expected.covariance, atol=0.08)
 
 
 def test_people_differ_in_stature_and_bulk(model: StitchedPuppet) -> None:

@@ -93,6 +93,15 @@ class Point(IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
 
 
 @dataclass
+class Vector3(IdlStruct, typename="geometry_msgs::msg::dds_::Vector3_"):
+    """Vector."""
+
+    x: float64
+    y: float64
+    z: float64
+
+
+@dataclass
 class Quaternion(IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
     """Rotation."""
 
@@ -117,6 +126,7 @@ class BodyJoint(IdlStruct, typename=OWN + "BodyJoint_"):
     name: str
     position: Point
     confidence: float32
+    visibility: uint8
 
 
 @dataclass
@@ -128,6 +138,7 @@ class BodyPart(IdlStruct, typename=OWN + "BodyPart_"):
     shape_coefficients: sequence[float32]
     pose_coefficients: sequence[float32]
     confidence: float32
+    visibility: uint8
 
 
 @dataclass
@@ -135,9 +146,13 @@ class Body(IdlStruct, typename=OWN + "Body_"):
     """Person in space."""
 
     id: str
+    state: uint8
     model: str
     energy: float32
     confidence: float32
+    reliable: bool
+    height: float32
+    velocity: Vector3
     joints: sequence[BodyJoint]
     parts: sequence[BodyPart]
 

@@ -33,7 +33,7 @@ def flatten(part: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any
 
 @pytest.mark.parametrize("name", COMPONENTS)
 def test_values_survive_the_file(name: str) -> None:
-    read = YAML(typ="safe").load(parameter_yaml(name))[f"/**/{name}"]["ros__parameters"]
+    read = YAML(typ="safe").load(parameter_yaml(name))["/**"]["ros__parameters"]
     flat = dict(flatten(read))
     infos = [*COMPONENTS[name].settings_type.describe(), *node_settings(name).describe()]
     assert {key: (type(value), value) for key, value in flat.items()} == {

@@ -78,7 +78,14 @@ def test_the_whole_page_stands_alone(replay: Replay) -> None:
 
 @pytest.mark.slow
 def test_figures_are_those_of_the_bags(replay: Replay) -> None:
-    data = gather_data(*replay(), summary={"frames_per_second": 12.5, "settings": {"tracker": {"seed": 3}}})
+    data = gather_data(
+        *replay(),
+        summary={
+            "frames_per_second": 12.5,
+            "settings": {"tracker": {"seed": 3}},
+            "counters": {"left/tracker": {"searches for everybody": 2, "paired detections": 0}},
+        },
+    )
     assert data.shown_camera == "front"
     front = data.camera("front")
     assert front is not None and (front.tracked, front.images, front.switches) == (5, 5, 0)
@@ -91,6 +98,7 @@ def test_figures_are_those_of_the_bags(replay: Replay) -> None:
     assert data.bodies.errors.distance == pytest.approx(np.full((3, 12), 0.03), abs=2e-3)
     assert data.bodies.energy.tolist() == [2.5, 4.5, 6.5]
     text = Page(build_report_page(data)).text
+    assert "People found by keypoint networks" in " ".join(text.split())
     assert "12.5 images/s" in text and "tracker: settings" in text and "arms 0 of 5, legs 0 of 5" in text
 
 

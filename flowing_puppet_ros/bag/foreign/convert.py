@@ -7,7 +7,6 @@ from collections.abc import Callable
 from functools import cache, cached_property
 from typing import Any
 
-from rosbags.convert.converter import is_same_wireformat, migrate_message
 from rosbags.typesys.store import Typestore
 
 from flowing_puppet_ros.bag.foreign.foxglove import find_schema
@@ -70,6 +69,9 @@ class Converter:
             if topic.encoding == "cdr":
                 return None
             return lambda raw: bytes(self._store.ros1_to_cdr(raw, self.type))
+        # Loaded here, as below: it brings what writes all kinds of bags, and few recordings need it.
+        from rosbags.convert.converter import migrate_message
+
         cache: dict[str, object] = {}
         decode = make_decoder(topic, self._store)
         return lambda raw: self._serialise(
@@ -87,6 +89,8 @@ def _write_definition(store: Typestore, kind: str) -> str:
 
 def _is_same(source: Typestore, target: Typestore, own_type: str, kind: str) -> bool:
     """Return whether messages of two definitions have the same bytes, but for the header of ROS 1."""
+    from rosbags.convert.converter import is_same_wireformat
+
     try:
         return bool(is_same_wireformat(source, target, own_type, kind))
     except KeyError:  # the recorder left out a part of the definition

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import lz4.frame
-from backports import zstd
+import zstandard
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _DECOMPRESSORS: dict[str, Callable[[], Any]] = {
-    "zstd": zstd.ZstdDecompressor,
+    "zstd": lambda: zstandard.ZstdDecompressor().decompressobj(),
     "lz4": lz4.frame.LZ4FrameDecompressor,
     "gzip": lambda: zlib.decompressobj(wbits=31),
     "bz2": bz2.BZ2Decompressor,
@@ -29,7 +29,7 @@ _MAGIC = {
     b"\xfd7zXZ\x00": "xz",
 }
 _PIECE_BYTES = 1 << 20
-_ERRORS = (zstd.ZstdError, lzma.LZMAError, zlib.error, OSError, EOFError, ValueError, RuntimeError)
+_ERRORS = (zstandard.ZstdError, lzma.LZMAError, zlib.error, OSError, EOFError, ValueError, RuntimeError)
 """What the decompressors raise on damaged data."""
 
 
@@ -40,10 +40,14 @@ def find_compression(start: bytes) -> str:
 
 def decompress_message(data: bytes) -> bytes:
     """Return a message that rosbag2 compressed by itself; InputError is the caller's business, ValueError is raised."""
+    decompressor = _DECOMPRESSORS["zstd"]()
     try:
-        return bytes(zstd.decompress(data))
+        found = bytes(decompressor.decompress(data))
     except _ERRORS as error:
         raise ValueError(str(error)) from error
+    if not decompressor.eof:
+        raise ValueError("its zstd data ends too early")
+    return found
 
 
 def decompress_prefix(name: str, data: bytes) -> bytes:

@@ -11,6 +11,7 @@ from numba.extending import register_jitable
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
+from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 
 # Weight of a pair's squared length beside its squared distance along the cloud's normal.
 TANGENTIAL_WEIGHT = 0.05
@@ -30,23 +31,26 @@ class Cloud:
         normals: (N, 3) unit normals, outward.
         nearest: index of `points`.
         viewpoint: (3,) position of the sensor in metres, None when the body was seen from all sides.
+        field: what the sensor at the viewpoint can know, None where it sees everything.
     """
 
     points: np.ndarray
     normals: np.ndarray
     nearest: NearestPoints
     viewpoint: np.ndarray | None
+    field: SensorField | None
 
     @classmethod
     def of(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray | None = None) -> Cloud:
         """Index a cloud."""
-        return cls(points, normals, NearestPoints(points), viewpoint)
+        return cls(points, normals, NearestPoints(points), viewpoint, None)
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return which vertices (V,) face the viewpoint; all of them when there is none."""
+        """Return which vertices (V,) face the viewpoint and are in its field; all when there is no viewpoint."""
         if self.viewpoint is None:
             return np.ones(len(vertices), dtype=bool)
-        return ((self.viewpoint - vertices) * normals).sum(axis=1) > 0
+        facing = ((self.viewpoint - vertices) * normals).sum(axis=1) > 0
+        return facing if self.field is None else facing & ~self.field.find_unknown(vertices)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

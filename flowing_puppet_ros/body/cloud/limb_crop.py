@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 # Tapered capsules between joints: two joints and the radius at each in metres; the limbs stand once for both sides.
@@ -24,7 +26,7 @@ TRUNK_CAPSULES: tuple[tuple[str, str, float, float], ...] = (
 )
 
 
-def crop_to_limbs(points: np.ndarray, joints: dict[str, np.ndarray], factor: float) -> np.ndarray:
+def crop_to_limbs(points: np.ndarray, joints: Mapping[str, np.ndarray], factor: float) -> np.ndarray:
     """Return which points (N,) lie within `factor` limb radii of the limbs' axes.
 
     Args:
@@ -32,14 +34,24 @@ def crop_to_limbs(points: np.ndarray, joints: dict[str, np.ndarray], factor: flo
         joints: positions (3,) of a body's joints in metres; capsules with an unknown joint are left out.
         factor: multiple of the radii, about 1.5 to 2.5 for hulls.
     """
-    sides = [(f"{side}_{a}", f"{side}_{b}", ra, rb) for side in ("left", "right") for a, b, ra, rb in LIMB_CAPSULES]
     near = np.zeros(len(points), dtype=bool)
-    for first, second, first_radius, second_radius in (*sides, *TRUNK_CAPSULES):
-        if first in joints and second in joints:
-            near |= _inside_capsule(
-                points, joints[first], joints[second], factor * first_radius, factor * second_radius
-            )
+    for capsule in list_capsules(joints):
+        near |= _inside_capsule(points, capsule[:3], capsule[3:6], factor * capsule[6], factor * capsule[7])
     return near
+
+
+def list_capsules(joints: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the capsules (C, 8) of a body: two ends and the radius at each, metres.
+
+    `joints` are positions (3,) m by name; capsules with an unknown joint are left out.
+    """
+    sides = [(f"{side}_{a}", f"{side}_{b}", ra, rb) for side in ("left", "right") for a, b, ra, rb in LIMB_CAPSULES]
+    rows = [
+        [*joints[first], *joints[second], first_radius, second_radius]
+        for first, second, first_radius, second_radius in (*sides, *TRUNK_CAPSULES)
+        if first in joints and second in joints
+    ]
+    return np.array(rows, dtype=np.float64).reshape(-1, 8)
 
 
 def _inside_capsule(points: np.ndarray, a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> np.ndarray:

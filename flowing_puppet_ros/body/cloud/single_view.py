@@ -12,6 +12,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours
 from flowing_puppet_ros.evidence.cloud.one_sided import OneSidedView
+from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 
 MAX_VIEW_POINTS = 4000
 """More points of one side add time and no accuracy."""
@@ -38,7 +39,12 @@ class SingleViewCloud(Cloud):
 
     @classmethod
     def seen_from(
-        cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray, unknown: np.ndarray | None = None
+        cls,
+        points: np.ndarray,
+        normals: np.ndarray,
+        viewpoint: np.ndarray,
+        unknown: np.ndarray | None = None,
+        field: SensorField | None = None,
     ) -> SingleViewCloud:
         """Index a cloud; the arguments are those of `Cloud`, `unknown` that of `OneSidedView.build`.
 
@@ -55,18 +61,19 @@ class SingleViewCloud(Cloud):
         near, own = find_neighbours(points, NOISE_NEIGHBOURS, every), np.arange(0, len(points), every)
         apart = np.abs(((points[near] - points[own, None]) * normals[own, None]).sum(axis=2))
         noise = float(np.median(apart[near != own[:, None]]))
-        view = OneSidedView.build(points, viewpoint, unknown)
+        view = OneSidedView.build(points, viewpoint, unknown, field)
         return cls(
             points,
             normals,
             NearestPoints(points),
             viewpoint,
+            field,
             view,
             max(MIN_DEPTH_TOLERANCE_M, TOLERANCE_PER_NOISE * noise),
         )
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Return which vertices (V,) face the sensor and are not hidden by what it saw."""
+        """Return which vertices (V,) face the sensor, are in its field and not hidden by what it saw."""
         facing = ((self.view.viewpoint - vertices) * normals).sum(axis=1) > 0
         return np.asarray(facing & ~self.view.find_hidden(vertices))
 

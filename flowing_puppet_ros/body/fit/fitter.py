@@ -16,12 +16,14 @@ from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleVie
 from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings, Progress, sub_progress
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.quality import assess_fit
+from flowing_puppet_ros.body.fit.visibility import BodyVisibility, judge_visibility
 from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton
 from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
 from flowing_puppet_ros.body.refine.nonrigid import NonRigidRefinement, NonRigidWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, ExactCloud
+from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import one_blas_thread
 
@@ -49,6 +51,7 @@ class BodyFit:
         confidence: 0 to 1, from the parts on the cloud and the cloud on the body.
         reliable: whether the body can be trusted, see `FitQuality.reliable`.
         two_way_distance: mean distance between body and cloud over both directions, metres.
+        visibility: which vertices, joints and parts the sensor saw.
     """
 
     state: BodyState
@@ -59,6 +62,7 @@ class BodyFit:
     confidence: float
     reliable: bool
     two_way_distance: float
+    visibility: BodyVisibility
 
 
 class BodyFitter:
@@ -86,6 +90,7 @@ class BodyFitter:
         *,
         initial: Mapping[str, tuple[float, float, float, float]] | None = None,
         viewpoint: np.ndarray | None = None,
+        field: SensorField | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
         nonrigid: bool = True,
@@ -95,6 +100,7 @@ class BodyFitter:
 
         Cases:
             initial joints: the body that they describe, a search near it, Gauss-Newton.
+            initial joints, `field`: the same without the search, which would draw what is out of sight to the cloud.
             single view, or sparse: the best of the hypotheses (cases in `BodyHypotheses.search`), with Gauss-Newton.
             dense whole cloud: the same, then the hand poses.
             dense whole cloud, `nonrigid`: the same, then every vertex by itself.
@@ -105,6 +111,8 @@ class BodyFitter:
             initial: joints by name as (x, y, z in metres, confidence 0 to 1), NaN where unknown; without them the
                 person is upright with unknown yaw.
             viewpoint: (3,) position of the sensor in metres, for a cloud that shows one side only.
+            field: what the sensor at the viewpoint can know of the person; without it, all that is not in the cloud
+                counts as free.
             seed: overrides the settings' seed.
             progress: called with the fraction done, 0 to 1.
             nonrigid: refine the vertices beyond the model where a whole cloud is dense.
@@ -118,8 +126,8 @@ class BodyFitter:
         with one_blas_thread():
             points, normals = check_cloud(points, normals)
             if initial is not None:
-                return self._fit_from_joints(points, normals, initial, viewpoint, rng, progress)
-            cloud = self.prepare_cloud(points, normals, viewpoint)
+                return self._fit_from_joints(points, normals, initial, (viewpoint, field), rng, progress)
+            cloud = self.prepare_cloud(points, normals, viewpoint, field)
             state = self.hypotheses.search(cloud, rng, progress, quick)
             progress(1.0)
             if not self._is_dense(cloud):
@@ -128,12 +136,20 @@ class BodyFitter:
             fit = self.assess(state, cloud)
             return self._refine_nonrigid(fit, cloud) if nonrigid else fit
 
-    def prepare_cloud(self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None) -> Cloud:
+    def prepare_cloud(
+        self,
+        points: np.ndarray,
+        normals: np.ndarray | None,
+        viewpoint: np.ndarray | None,
+        field: SensorField | None = None,
+    ) -> Cloud:
         """Downsample and index a cloud; InputError when it cannot be the surface of a person."""
         points, normals = self.prepare_points(points, normals, viewpoint)
         if normals is None:
             normals = estimate_normals(points, viewpoint)
-        return Cloud.of(points, normals) if viewpoint is None else SingleViewCloud.seen_from(points, normals, viewpoint)
+        if viewpoint is None:
+            return Cloud.of(points, normals)
+        return SingleViewCloud.seen_from(points, normals, viewpoint, field=field)
 
     def prepare_points(
         self, points: np.ndarray, normals: np.ndarray | None, viewpoint: np.ndarray | None
@@ -185,11 +201,14 @@ class BodyFitter:
         points: np.ndarray,
         normals: np.ndarray | None,
         initial: Mapping[str, tuple[float, float, float, float]],
-        viewpoint: np.ndarray | None,
+        sensor: tuple[np.ndarray | None, SensorField | None],
         rng: np.random.Generator,
         progress: Progress,
     ) -> BodyFit:
-        """Fit from the body that the joints describe, to the part of the cloud around its limbs."""
+        """Fit from the body that the joints describe, to the part of the cloud around its limbs.
+
+        `sensor` are the viewpoint and the field of `fit`.
+        """
         targets = make_joint_targets(self.model, initial)
         body = body_from_joints(self.model, self.gauss_newton, targets)
         if self.settings.clip_factor > 0:
@@ -203,9 +222,13 @@ class BodyFitter:
                     " cloud and joints are in the same frame, in metres"
                 )
             points, normals = points[near], None if normals is None else normals[near]
-        cloud = self.prepare_cloud(points, normals, viewpoint)
-        grid = CloudGrid.build(cloud.points, cloud.normals)
+        cloud = self.prepare_cloud(points, normals, *sensor)
         targets = targets.scale(self.settings.joint_weight)
+        if isinstance(cloud, SingleViewCloud) and cloud.field is not None:
+            body = self.hypotheses.refine_partial(body, cloud, targets)
+            progress(1.0)
+            return self.assess(body, cloud)
+        grid = CloudGrid.build(cloud.points, cloud.normals)
         found = self.hypotheses.search_near(body, grid, targets, rng, sub_progress(progress, 0.1, 0.8))
         body = self.hypotheses.refine(found, cloud, targets, self.settings.gauss_newton_steps)
         progress(1.0)
@@ -222,6 +245,11 @@ class BodyFitter:
         distance = two_way_distance(vertices, self.model.faces, cloud)
         return replace(fit, vertices=vertices, two_way_distance=distance)
 
+    def assess_surface(self, state: BodyState, cloud: Cloud) -> BodyFit:
+        """Return the fit of a body to a cloud, with refined vertices where the cloud is dense and whole."""
+        fit = self.assess(state, cloud)
+        return self._refine_nonrigid(fit, cloud) if self._is_dense(cloud) else fit
+
     def assess(self, state: BodyState, cloud: Cloud) -> BodyFit:
         """Return the fit of a body to a cloud, with its energy and confidences."""
         vertices = self.model.vertices(state)
@@ -235,6 +263,7 @@ class BodyFitter:
             quality.confidence,
             quality.reliable,
             quality.distance,
+            judge_visibility(self.model, vertices, cloud),
         )
 
 

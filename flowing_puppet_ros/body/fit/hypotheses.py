@@ -16,6 +16,7 @@ import numpy as np
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.initialisation import flip_heading, sample_bodies
+from flowing_puppet_ros.body.fit.partial_view import measure_unknown_share, strengthen_priors
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
 from flowing_puppet_ros.body.fit.quality import MAX_UNCOVERED, FitQuality, assess_fit
 from flowing_puppet_ros.body.fit.single_view_search import ROUGH, SingleViewSearch
@@ -45,6 +46,8 @@ MAX_REPAIRABLE_COST_M = 0.06
 # Cost of the best limb hypothesis, in costs of the body that it came from, for another repair round; the second where
 # so much of the cloud is uncovered that the whole body is probably wrong.
 MAX_COST_RATIO, MAX_COST_RATIO_IF_WRONG, MIN_WRONG_UNCOVERED = 0.98, 0.9, 0.25
+# Gauss-Newton from initial joints where the sensor sees a part of the person only.
+PARTIAL = RefineWeights(sigma_start=0.2, sigma_end=0.03, iterations=20)
 # Bodies that are refined to compare frames.
 ROUGH_STARTS = 4
 # Share of the particles and rounds in a search for the warm-up.
@@ -196,6 +199,11 @@ class BodyHypotheses:
         """Return the body after `steps` Gauss-Newton steps over all parts; `alternate` is that of `RefineWeights`."""
         terms = [cloud.free_space_term] if isinstance(cloud, SingleViewCloud) else []
         return self.gauss_newton.run(body, cloud, targets, RefineWeights(iterations=steps, alternate=alternate), terms)
+
+    def refine_partial(self, body: BodyState, cloud: SingleViewCloud, targets: JointTargets) -> BodyState:
+        """Return a body that lies roughly on the seen part of a person after Gauss-Newton steps over all parts."""
+        weights = strengthen_priors(PARTIAL, measure_unknown_share(self._model, body, cloud))
+        return self.gauss_newton.run(body, cloud, targets, weights, [cloud.free_space_term])
 
     def evaluate(self, body: BodyState, cloud: Cloud) -> BodyCandidate:
         """Refine a hypothesis briefly and assess it."""

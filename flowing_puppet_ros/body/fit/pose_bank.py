@@ -33,6 +33,9 @@ JOINT_PRIOR_M = 1e-4
 """Mean distance that a squared Mahalanobis distance of 1 of a joint's rotation is worth."""
 JOINT_RIDGE_RAD = 0.05
 """Standard deviation added to a joint's rotation."""
+END_TARGETS, BEYOND_END_M, MIN_UNKNOWN_END = 10, 0.15, 0.5
+"""A cloud is cut off at its top or bottom if this share of places so far beyond so many of its outermost points is
+unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,6 +172,7 @@ class PoseBank:
         seen = np.ones((*points.shape[:2], 1), dtype=bool)
         if isinstance(coarse.cloud, SingleViewCloud):
             seen = (normals @ (middle - coarse.cloud.view.viewpoint) < 0)[:, :, None]
+            seen &= _find_same_height(points[:, :, 2], coarse)[:, :, None]
         return np.asarray(middle - (points * seen).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
 
     def _pose_surface(self, bodies: list[Particles], parts: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -182,7 +186,16 @@ class PoseBank:
 def make_bank(model: StitchedPuppet) -> list[Particles]:
     """Sample the bank: the particles of each part in every yaw and pose; made once for a model."""
     rng = np.random.default_rng(0)
-    bank = states_to_particles(model, [model.sample(rng, shape_scale=0.0) for _ in range(POSES)])
+    bodies = model.sample_many(rng, POSES, shape_scale=0.0)
+    bank = [
+        Particles(
+            bodies.center[:, part],
+            bodies.rotation[:, part],
+            bodies.pose[:, part, : model.pose_count(part)],
+            bodies.shape[:, part],
+        )
+        for part in range(len(model.tree))
+    ]
     yaws = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
     return [Particles.join([_rotate(group, yaw) for yaw in yaws]) for group in bank]
 
@@ -192,6 +205,28 @@ def _measure_misfit(points: np.ndarray, normals: np.ndarray, coarse: CoarseCloud
     if isinstance(coarse.cloud, SingleViewCloud):
         return coarse.cloud.view.misfit(points, normals)
     return mean_distance(points, coarse.targets), np.ones(points.shape[:2], dtype=np.bool_)
+
+
+def _find_same_height(height: np.ndarray, coarse: CoarseCloud) -> np.ndarray:
+    """Return which surface points (P, K) of bodies, at `height` (P, K) m, may be as high as the cloud is on the person.
+
+    Where the sensor could not see above or below the cloud, the person goes on there: only as much of a body counts as
+    the cloud is high, from its other end.
+    """
+    every = np.ones(height.shape, dtype=bool)
+    field, targets = coarse.cloud.field, coarse.targets
+    if field is None:
+        return every
+    order = np.argsort(targets[:, 2])
+    step = np.array([0.0, 0.0, BEYOND_END_M])
+    below = field.find_unknown(targets[order[:END_TARGETS]] - step).mean() > MIN_UNKNOWN_END
+    above = field.find_unknown(targets[order[-END_TARGETS:]] + step).mean() > MIN_UNKNOWN_END
+    extent = float(np.ptp(targets[:, 2]))
+    if below and not above:
+        return np.asarray(height > height.max(axis=1, keepdims=True) - extent)
+    if above and not below:
+        return np.asarray(height < height.min(axis=1, keepdims=True) + extent)
+    return every
 
 
 def _take_first(points: PointSet, count: int) -> PointSet:

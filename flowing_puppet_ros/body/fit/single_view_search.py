@@ -14,6 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
+from flowing_puppet_ros.body.fit.partial_view import measure_unknown_share, strengthen_priors
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
@@ -123,6 +124,8 @@ class SingleViewSearch:
 
     def _refine(self, body: BodyState, cloud: SingleViewCloud, weights: RefineWeights) -> BodyState:
         none = JointTargets.none(self._model)
+        if cloud.field is not None:
+            weights = strengthen_priors(weights, measure_unknown_share(self._model, body, cloud))
         return self._refiner.run(body, cloud, none, weights, terms=[cloud.free_space_term])
 
 

@@ -18,8 +18,9 @@ from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dposv
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic, geman_mcclure
+from flowing_puppet_ros.body.refine.joint_rows import JointRows
 from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, System
-from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.search.energy import RAY_SHARE, JointTargets
 from flowing_puppet_ros.model.posing import PosedPoints
 from flowing_puppet_ros.model.rotation import exp_one
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -76,9 +77,7 @@ class GaussNewton:
     def __init__(self, model: StitchedPuppet) -> None:
         self._model = model
         self._equations = NormalEquations(model)
-        self._regressor = np.zeros((len(model.joint_names), len(model.part_of_vertex)))
-        for row, (index, weight) in enumerate(zip(model.joint_index, model.joint_weight, strict=True)):
-            np.add.at(self._regressor[row], index, weight)
+        self._joints = JointRows(model, self._equations)
 
     def run(
         self,
@@ -136,13 +135,13 @@ class GaussNewton:
         chosen = np.flatnonzero(targets.weight > 0)
         if not len(chosen):
             return
-        gap = self._regressor[chosen] @ posed.vertices - targets.points[chosen]
+        gap = self._joints.find_joints(chosen, posed.vertices) - targets.points[chosen]
+        rows = self._joints.derive(chosen, posed, rotation)
+        if targets.rays is not None:
+            ray = targets.rays[chosen]
+            squeeze = np.eye(3) - (1 - RAY_SHARE) * ray[:, :, None] * ray[:, None, :]
+            gap, rows = np.squeeze(squeeze @ gap[:, :, None], axis=2), squeeze @ rows
         trust = geman_mcclure((gap**2).sum(axis=1), width**2)
-        rows = np.zeros((len(chosen), 3, len(gradient)))
-        for part, jacobian in enumerate(self._equations.compute_jacobians(posed)):
-            vertex = self._model.part_vertices[part]
-            share = self._regressor[np.ix_(chosen, vertex)] * self._equations.share[vertex]
-            rows[:, :, self._equations.unknowns(part)] += rotation[part] @ np.tensordot(share, jacobian, 1)
         flat = rows.reshape(-1, len(gradient))
         weight = np.repeat(trust * targets.weight[chosen], 3)
         hessian += (flat * weight[:, None]).T @ flat

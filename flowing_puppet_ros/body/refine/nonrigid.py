@@ -10,9 +10,10 @@ differences between every offset and the mean of its neighbours' (the umbrella o
 from __future__ import annotations
 
 from dataclasses import dataclass
+from inspect import signature
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix, diags_array, eye_array
+from scipy.sparse import coo_matrix, csr_matrix, diags, identity
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence
@@ -23,6 +24,7 @@ ANCHOR_WEIGHT = 0.01
 TYPICAL_WEIGHT = 0.45
 SOLVER_TOLERANCE = 1e-3  # relative residual of conjugate gradients
 MAX_SOLVER_STEPS = 60  # of conjugate gradients
+_RELATIVE_TOLERANCE = "rtol" if "rtol" in signature(cg).parameters else "tol"  # its name before SciPy 1.12
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ def umbrella_laplacian(faces: np.ndarray, count: int) -> csr_matrix:
     edges = np.unique(np.concatenate([edges, edges[:, ::-1]]), axis=0)
     degree = np.bincount(edges[:, 0], minlength=count)
     linked = coo_matrix((1 / degree[edges[:, 0]], edges.T), shape=(count, count))
-    return (diags_array((degree > 0).astype(float)) - linked).tocsr()
+    return (diags((degree > 0).astype(float)) - linked).tocsr()
 
 
 class NonRigidRefinement:
@@ -58,10 +60,10 @@ class NonRigidRefinement:
         self._faces = faces
         self._weights = weights
         operator = umbrella_laplacian(faces, count)
-        self._stiff = (weights.stiffness * (operator.T @ operator) + ANCHOR_WEIGHT * eye_array(count)).tocsr()
+        self._stiff = (weights.stiffness * (operator.T @ operator) + ANCHOR_WEIGHT * identity(count)).tocsr()
         # Correspondences couple the coordinates of a vertex and change every time; without that coupling the system is
         # the same for all bodies, and its factors are a good preconditioner for conjugate gradients.
-        typical = (self._stiff + TYPICAL_WEIGHT * eye_array(count)).tocsc()
+        typical = (self._stiff + TYPICAL_WEIGHT * identity(count)).tocsc()
         self._factors = splu(
             typical, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
@@ -92,8 +94,9 @@ class NonRigidRefinement:
         solution, _ = cg(
             LinearOperator((size, size), matvec=multiply, dtype=np.float64),
             -gradient.ravel(),
-            rtol=SOLVER_TOLERANCE,
+            atol=0.0,
             maxiter=MAX_SOLVER_STEPS,
             M=LinearOperator((size, size), matvec=precondition, dtype=np.float64),
+            **{_RELATIVE_TOLERANCE: SOLVER_TOLERANCE},
         )
         return np.asarray(solution.reshape(shape))

@@ -8,8 +8,6 @@ filled.
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 from numba import njit
 
@@ -73,15 +71,6 @@ class NormalEquations:
         own = np.arange(self.first[part], self.first[part + 1])
         return np.concatenate([own, np.arange(self.first[-1], self.size)])
 
-    def compute_jacobians(self, posed: PosedPoints) -> list[np.ndarray]:
-        """Return for each part the derivatives (N_i, 3, unknowns) of its points in its own frame."""
-        shapes, made = self.size - int(self.first[-1]), []
-        for part, (start, end) in enumerate(pairwise(self._points.starts)):
-            jacobian = np.empty((end - start, 3, 6 + self._points.poses[part] + shapes))
-            _fill_jacobians(jacobian, posed.local[start:end], self._points.basis[start:end])
-            made.append(jacobian)
-        return made
-
     def pose_points(self, state: BodyState) -> PosedPoints:
         """Return the points of a body."""
         return self._points.pose(state)
@@ -113,12 +102,6 @@ def _fill_jacobian(jacobian, local, basis, k, columns):  # type: ignore[no-untyp
         jacobian[i, 3 + i] = 1.0
         for column in range(columns):
             jacobian[i, 6 + column] = basis[k, i, column]
-
-
-@njit(cache=True, nogil=True)
-def _fill_jacobians(jacobians, local, basis):  # type: ignore[no-untyped-def]
-    for k in range(len(local)):
-        _fill_jacobian(jacobians[k], local, basis, k, jacobians.shape[2] - 6)
 
 
 @njit(cache=True, nogil=True)

@@ -14,6 +14,7 @@ from flowing_puppet_ros.body.scans.pcd import read_viewpoint
 from flowing_puppet_ros.body.scans.ply import read_ply
 from flowing_puppet_ros.body.scans.tables import TEXT_SUFFIXES, read_lidar_scan, read_numpy, read_text_table
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.extras import import_extra
 
 SCAN_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".pcd", ".xyz", ".npy", ".npz", ".asc", ".pts")
 SUFFIXES = (*SCAN_SUFFIXES, ".txt", ".csv", ".bin")
@@ -135,7 +136,7 @@ def _orient_outward(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 
 def _read_open3d(path: Path) -> Scan:
-    import open3d as o3d
+    o3d = import_extra("open3d", "scans", f"{path.suffix} of {path.name}")
 
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     if path.suffix.lower() != ".pcd":

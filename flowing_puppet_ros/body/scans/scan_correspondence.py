@@ -98,7 +98,7 @@ def correspond(
     return found, np.linalg.norm(found - bridge, axis=1)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _find_closest(
     points: np.ndarray,
     normals: np.ndarray,
@@ -127,7 +127,7 @@ def _find_closest(
     return face, barycentric
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _closest_on_triangle(point: np.ndarray, triangle: np.ndarray) -> np.ndarray:
     """Return the barycentric coordinates (3,) of the closest point: inside the face, or on the nearest of its edges."""
     ab, ac, ap = triangle[1] - triangle[0], triangle[2] - triangle[0], point - triangle[0]

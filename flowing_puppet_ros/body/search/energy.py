@@ -16,6 +16,7 @@ from flowing_puppet_ros.body.search.particles import Particles
 from flowing_puppet_ros.evidence.cloud.data_term import DataCost
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
+RAY_SHARE = 0.1
 MIN_CENTRE_DISTANCE_M = 0.05  # between the centres of neighbouring parts, Eq. 51
 
 
@@ -26,10 +27,13 @@ class JointTargets:
     Attributes:
         points: (J, 3) metres in the model's joint order; arbitrary where the weight is 0.
         weight: (J,) at least 0, confidence times strength (per squared metre of distance).
+        rays: (J, 3) unit vectors from a camera to the joints, along which a gap counts `RAY_SHARE` of its length in
+            the refinement, since an image knows little of the depth; None: gaps count alike in all directions.
     """
 
     points: np.ndarray
     weight: np.ndarray
+    rays: np.ndarray | None = None
 
     @classmethod
     def none(cls, model: StitchedPuppet) -> JointTargets:
@@ -39,7 +43,7 @@ class JointTargets:
 
     def scale(self, strength: float) -> JointTargets:
         """Return the same positions with `strength` times the weight."""
-        return JointTargets(self.points, strength * self.weight)
+        return JointTargets(self.points, strength * self.weight, self.rays)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Single linkage of points whose spacing grows with the distance from the sensor, as between the rings of a LiDAR."""
+"""Single linkage of points, also of those whose spacing grows with the distance from the sensor (rings of a LiDAR)."""
 
 from __future__ import annotations
 
@@ -35,16 +35,29 @@ def link_points(points: np.ndarray, distance: np.ndarray) -> np.ndarray:
     if not len(points):
         return np.empty(0, dtype=np.int64)
     gap = np.clip(GAP_M + GAP_PER_M * distance, *GAP_LIMITS_M)
-    scaled = np.ascontiguousarray(points * np.array([1.0, 1.0, HEIGHT_SCALE]))
-    low = scaled[:, :2].min(axis=0)
-    cell = ((scaled[:, :2] - low) / GAP_LIMITS_M[1]).astype(np.int64)
+    scaled = points * np.array([1.0, 1.0, HEIGHT_SCALE])
+    return np.unique(_link_in_cells(scaled, gap, GAP_LIMITS_M[1]), return_inverse=True)[1]
+
+
+def link_within(points: np.ndarray, gap: float) -> np.ndarray:
+    """Return the cluster (N,) of each point (N, 3), by its first point; points closer than `gap` belong together."""
+    if not len(points):
+        return np.empty(0, dtype=np.int64)
+    label = _link_in_cells(points, np.full(len(points), gap), gap)
+    _, first, cluster = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[cluster]
+
+
+def _link_in_cells(points: np.ndarray, gap: np.ndarray, width: float) -> np.ndarray:
+    """Return a number (N,) that the points (N, 3) of a cluster share; columns are as wide as the largest `gap` (N,)."""
+    low = points[:, :2].min(axis=0)
+    cell = ((points[:, :2] - low) / width).astype(np.int64)
     deep = int(cell[:, 1].max()) + 2
     key = cell[:, 0] * deep + cell[:, 1]
     order = np.argsort(key, kind="stable")
-    root = _link(scaled[order], gap[order], key[order], deep)
     label = np.empty(len(points), dtype=np.int64)
-    label[order] = root
-    return np.unique(label, return_inverse=True)[1]
+    label[order] = _link(np.ascontiguousarray(points[order], dtype=np.float64), gap[order], key[order], deep)
+    return label
 
 
 @njit(cache=True, nogil=True)

@@ -10,15 +10,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
-from flowing_puppet_ros.body.segmentation.planes import Plane, PlaneCache, find_floor, find_wall
+from flowing_puppet_ros.body.segmentation.linkage import link_within
+from flowing_puppet_ros.body.segmentation.planes import Plane, PlaneCache, find_planes, is_clear_of_planes
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
 
 VOXELS_PER_GAP = 2.5  # voxel edges in `max_gap`
 MAX_GAP_RANGE_M = 4.0
 """Distance from the sensor up to which `max_gap` holds; beyond, points lie farther apart in proportion."""
-MAX_WALLS = 8  # the search for walls ends there
-MAX_PLANE_POINTS = 8000  # points in which planes are looked for
 EXTENT_LIMITS_M = ((0.5, 0.9, 2.0, 2.6), (0.15, 0.3, 1.1, 1.9), (0.02, 0.07, 0.8, 1.3))
 """A person's three extents, longest first: minimum, the range that scores 1, maximum."""
 FLAT_SHARE_LIMITS = (0.6, 0.8)
@@ -103,7 +102,7 @@ def segment_people(
     centres = _average_voxels(local, voxel)
     free, floor = _remove_planes(centres, settings.plane_clearance, origin, plane_cache)
     label = np.full(len(centres), -1)
-    label[free] = _cluster(_average_voxels(compensated, voxel)[free], settings.max_gap)
+    label[free] = link_within(_average_voxels(compensated, voxel)[free], settings.max_gap)
     new_clusters = label.max() + 1
     # Scores by the first point of a cluster: what a claim leaves as it was is not scored again.
     scored: dict[int, tuple[np.ndarray, float]] = {}
@@ -213,47 +212,10 @@ def _remove_planes(
     `centres` (M, 3) are relative to `origin` (3,), which may differ from cloud to cloud.
     """
     cached = plane_cache.get(centres, clearance, origin) if plane_cache else None
-    floor, walls = cached or _find_planes(centres, clearance)
+    floor, walls = cached or find_planes(centres, clearance)
     if plane_cache and cached is None:
         plane_cache.put(centres, clearance, floor, walls, origin)
-    return np.flatnonzero(_is_clear_of_planes(centres, clearance, floor, walls)), floor
-
-
-def _is_clear_of_planes(
-    centres: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]
-) -> np.ndarray:
-    clear = np.ones(len(centres), dtype=bool) if floor is None else floor.height(centres) > clearance
-    for wall in walls:
-        clear &= np.abs(wall.height(centres)) > clearance
-    return clear
-
-
-def _find_planes(centres: np.ndarray, clearance: float) -> tuple[Plane | None, list[Plane]]:
-    rng = np.random.default_rng(0)
-    floor = find_floor(_subsample(centres), clearance, rng)
-    walls: list[Plane] = []
-    while len(walls) < MAX_WALLS:
-        free = centres[_is_clear_of_planes(centres, clearance, floor, walls)]
-        wall = find_wall(_subsample(free), clearance, rng) if len(free) >= 3 else None
-        if wall is None:
-            break
-        walls.append(wall)
-    return floor, walls
-
-
-def _subsample(points: np.ndarray) -> np.ndarray:
-    """Return evenly chosen points, as many as are enough to find planes."""
-    return np.ascontiguousarray(points[:: 1 + len(points) // MAX_PLANE_POINTS])
-
-
-def _cluster(points: np.ndarray, gap: float) -> np.ndarray:
-    """Return the cluster (M,) of each point: points closer than `gap` belong together (DBSCAN, Ester et al. 1996)."""
-    import open3d as o3d
-
-    if not len(points):
-        return np.empty(0, dtype=np.int64)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-    return np.asarray(cloud.cluster_dbscan(eps=gap, min_points=1)).astype(np.int64)
+    return np.flatnonzero(is_clear_of_planes(centres, clearance, floor, walls)), floor
 
 
 def _group_by_label(label: np.ndarray) -> list[tuple[int, np.ndarray]]:

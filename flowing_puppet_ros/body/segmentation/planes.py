@@ -30,6 +30,8 @@ CELL_M, MIN_COVERED_SHARE = 0.25, 0.6
 """Share of the product of its sides that a plane's points must cover, in cells of this size; slices through people and
 furniture cover less."""
 
+MAX_WALLS = 8  # the search for walls ends there
+MAX_PLANE_POINTS = 8000  # points in which planes are looked for
 MAX_CACHED_CLOUDS, MIN_KEPT_SHARE = 10, 0.7
 """Clouds after which planes are searched again, and the share of a plane's points that must still lie on it."""
 
@@ -91,6 +93,36 @@ class PlaneCache:
         shares = [float((np.abs(plane.height(points)) < clearance).mean()) for plane in planes]
         self._planes = [(plane.shift(origin), share) for plane, share in zip(planes, shares, strict=True)]
         self._has_floor, self._clouds_left = floor is not None, MAX_CACHED_CLOUDS
+
+
+def find_planes(points: np.ndarray, clearance: float) -> tuple[Plane | None, list[Plane]]:
+    """Return the floor, None without one, and the walls in points (N, 3) m with z up, evenly downsampled.
+
+    `clearance` is the half thickness of a plane, metres.
+    """
+    rng = np.random.default_rng(0)
+    floor = find_floor(_subsample(points), clearance, rng)
+    walls: list[Plane] = []
+    while len(walls) < MAX_WALLS:
+        free = points[is_clear_of_planes(points, clearance, floor, walls)]
+        wall = find_wall(_subsample(free), clearance, rng) if len(free) >= 3 else None
+        if wall is None:
+            break
+        walls.append(wall)
+    return floor, walls
+
+
+def is_clear_of_planes(points: np.ndarray, clearance: float, floor: Plane | None, walls: Sequence[Plane]) -> np.ndarray:
+    """Return which points (N,) are neither in or below the floor nor in walls."""
+    clear = np.ones(len(points), dtype=bool) if floor is None else floor.height(points) > clearance
+    for wall in walls:
+        clear &= np.abs(wall.height(points)) > clearance
+    return clear
+
+
+def _subsample(points: np.ndarray) -> np.ndarray:
+    """Return evenly chosen points, as many as are enough to find planes."""
+    return np.ascontiguousarray(points[:: 1 + len(points) // MAX_PLANE_POINTS])
 
 
 def find_floor(points: np.ndarray, clearance: float, rng: np.random.Generator) -> Plane | None:

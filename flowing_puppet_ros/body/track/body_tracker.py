@@ -21,6 +21,7 @@ from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, check_cloud
+from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.upright.upright_fit import FEW_POINTS, MIN_MANY_POINTS, UprightFitter, floor_term
@@ -100,7 +101,7 @@ class _TrackState:
 class _Prepared(NamedTuple):
     """A cloud that is ready to be tracked to; `oriented`: its normals were turned outwards by the predicted body.
 
-    `floor`: z of the floor in metres where few points leave the body to it, else None.
+    `floor`: z of the floor in metres where few points leave the body to it, else None. `targets` pull at the joints.
     """
 
     cloud: Cloud
@@ -108,6 +109,7 @@ class _Prepared(NamedTuple):
     occluded: bool
     oriented: bool
     floor: float | None
+    targets: JointTargets
 
 
 class BodyTracker:
@@ -154,6 +156,13 @@ class BodyTracker:
         """Whether much less of the person was seen in the last cloud than normally."""
         return self._state.hidden
 
+    def predict(self, stamp: int) -> BodyState | None:
+        """Return the body where it should be at a time in ns, None when the last one is too old or not known."""
+        last = self._state.last
+        if last is None or not 0 < stamp - last.stamp <= 1e9 * self._settings.max_time_gap:
+            return None
+        return self._predict(last, last.middle, stamp)
+
     def accept(self) -> None:
         """Take the last body for the best there is: a full fit has found none that is closer."""
         if self._state.last is not None:
@@ -178,24 +187,24 @@ class BodyTracker:
                 fit, lost = self._refit(fit, prepared, seed, progress), False
         return self._record(fit, lost, prepared)
 
-    def track(self, person: PersonCloud) -> BodyFit | None:
+    def track(self, person: PersonCloud, targets: JointTargets | None = None) -> BodyFit | None:
         """Fit the next cloud like `track_or_refit`, but never by a full fit: None when there is no body to start from.
 
-        `lost` tells whether the body is not where the person is.
+        `targets` are where somebody else sees the joints. `lost` tells whether the body is not where the person is.
         """
         if self._state.last is None:
             # Normals take long, and nothing would use them.
             self._fitter.prepare_points(*check_cloud(person.points, person.normals), person.viewpoint)
             return None
         with one_blas_thread():
-            prepared = self._prepare(person)
+            prepared = self._prepare(person, targets)
             fit, lost = self._track(prepared)
         if fit is None:
             self._state = replace(self._state, lost=lost)
             return None
         return self._record(fit, lost, prepared)
 
-    def _prepare(self, person: PersonCloud) -> _Prepared:
+    def _prepare(self, person: PersonCloud, targets: JointTargets | None = None) -> _Prepared:
         stamp, viewpoint = person.stamp, person.viewpoint
         on_floor = person.floor is not None and viewpoint is not None and len(person.points) < MIN_MANY_POINTS
         points, normals = (person.points, person.normals) if on_floor else check_cloud(person.points, person.normals)
@@ -212,10 +221,11 @@ class BodyTracker:
             vertices = self._fitter.model.vertices(self._predict(last, points.mean(axis=0), stamp))
             normals = estimate_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
         if on_floor and viewpoint is not None:
-            cloud: Cloud = self._upright.make_cloud(points, viewpoint, np.empty((0, 3)))
+            cloud: Cloud = self._upright.make_cloud(points, viewpoint, None, person.field)
         else:
-            cloud = self._fitter.prepare_cloud(points, normals, viewpoint)
-        return _Prepared(cloud, stamp, occluded, oriented, person.floor if on_floor else None)
+            cloud = self._fitter.prepare_cloud(points, normals, viewpoint, person.field)
+        pull = self._no_joints if targets is None else targets
+        return _Prepared(cloud, stamp, occluded, oriented, person.floor if on_floor else None, pull)
 
     def _track(self, prepared: _Prepared) -> tuple[BodyFit | None, bool]:
         """Return the last body after a few steps on the new cloud, and whether it is lost.
@@ -228,7 +238,7 @@ class BodyTracker:
             return self._fitter.assess(self._translate(last, prepared.stamp), cloud), False
         if last is None:
             return None, True
-        fit = self._step(self._predict(last, cloud.points.mean(axis=0), prepared.stamp), cloud, prepared.floor)
+        fit = self._step(self._predict(last, cloud.points.mean(axis=0), prepared.stamp), prepared)
         return fit, self._is_lost(fit)
 
     def _record(self, fit: BodyFit, lost: bool, prepared: _Prepared) -> BodyFit:
@@ -239,14 +249,14 @@ class BodyTracker:
         self._state = replace(state, before=state.last, last=seen, best=best, frames=frames, lost=lost)
         return fit
 
-    def _step(self, start: BodyState, cloud: Cloud, floor: float | None) -> BodyFit:
+    def _step(self, start: BodyState, prepared: _Prepared) -> BodyFit:
         """Take a few steps from where the person should be; if they fail, more steps with a wider kernel."""
-        fit = self._refine(start, cloud, NARROW_WIDTHS_M, self._settings.gauss_newton_steps, floor)
+        fit = self._refine(start, prepared, NARROW_WIDTHS_M, self._settings.gauss_newton_steps)
         if not self._is_lost(fit):
             self.counters["tracked"] += 1
             return fit
         self.counters["widened"] += 1
-        wide = self._refine(start, cloud, WIDE_WIDTHS_M, WIDE_STEPS, floor)
+        wide = self._refine(start, prepared, WIDE_WIDTHS_M, WIDE_STEPS)
         return min(fit, wide, key=lambda found: found.two_way_distance)
 
     def _refit(
@@ -265,6 +275,7 @@ class BodyTracker:
             cloud.points,
             normals,
             viewpoint=cloud.viewpoint,
+            field=cloud.field,
             seed=seed,
             progress=progress,
             nonrigid=False,
@@ -316,9 +327,8 @@ class BodyTracker:
         self._state = replace(state, visible=visible, hidden=hidden)
         return hidden
 
-    def _refine(
-        self, start: BodyState, cloud: Cloud, widths: tuple[float, float], steps: int, floor: float | None
-    ) -> BodyFit:
+    def _refine(self, start: BodyState, prepared: _Prepared, widths: tuple[float, float], steps: int) -> BodyFit:
+        cloud, floor = prepared.cloud, prepared.floor
         weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps, alternate=ALTERNATE)
         terms: list[SurfaceTerm] = []
         if floor is not None:
@@ -327,8 +337,11 @@ class BodyTracker:
         learned = SHAPE_WEIGHT_PER_FRAME * min(self._state.frames, MAX_SHAPE_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
         # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
-        facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint)
-        body = self._fitter.gauss_newton.run(start, facing, self._no_joints, weights, terms)
+        facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint, cloud.field)
+        body = self._fitter.gauss_newton.run(start, facing, prepared.targets, weights, terms)
+        # A limb that left the view stays in its last pose: its motion would go on for ever.
+        last = start if self._state.last is None else self._state.last.fit.state
+        body = hang_unseen_parts(self._fitter.model, (last, body), cloud, prepared.targets)
         return self._fitter.assess(body, cloud)
 
     def _is_lost(self, fit: BodyFit) -> bool:

@@ -20,6 +20,7 @@ from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCloud
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
+from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.reporting import Report
@@ -47,8 +48,8 @@ class MultiBodyTrackerSettings(BodyTrackerSettings):
 class _BodyTrack:
     """One person.
 
-    The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, the number of full fits
-    and the stamp of the last, and whether it is `proven` to be a person.
+    The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, its `motion`, the number
+    of full fits and the stamp of the last, and whether it is `proven` to be a person.
     """
 
     id: str
@@ -57,6 +58,7 @@ class _BodyTrack:
     stamp: int
     tracker: BodyTracker
     velocity: F64 = field(default_factory=lambda: np.zeros(3))
+    motion: TorsoMotion = field(default_factory=TorsoMotion)
     fits: int = 0
     fitted: int = 0
     proven: bool = True
@@ -69,6 +71,10 @@ class _BodyTrack:
         """Return whether it is known to be a person, as a reliable body shows from then on."""
         self.proven = self.proven or fit.reliable
         return self.proven
+
+    def show(self, fit: BodyFit) -> TrackedBody:
+        """Return its body at the time of the last cloud, with what is known of its motion."""
+        return self.motion.add(self.id, self.stamp, fit, self.tracker.hidden)
 
     def update(self, middle: F64, stamp: int) -> None:
         """Take where the person is now."""
@@ -131,7 +137,7 @@ class MultiBodyTracker:
         seed: int,
         executor: Executor | None = None,
         first: Mapping[int, BodyFit] = MappingProxyType({}),
-    ) -> list[tuple[str, BodyFit]]:
+    ) -> list[TrackedBody]:
         """Track everybody to the people of the next cloud.
 
         Args:
@@ -142,7 +148,7 @@ class MultiBodyTracker:
             first: bodies of new people that are known already, by their index in `people`.
 
         Returns:
-            (id, fit) of everybody who is seen and has a body.
+            The bodies of everybody who is seen and has one, in the order of their ids.
         """
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
@@ -155,26 +161,26 @@ class MultiBodyTracker:
                 track.tracker.start(person, known)
                 track.fitted = stamp
         fitted = parallel_map(_track, [(track.tracker, person) for track, person in matched], self._threads)
-        fits: list[tuple[str, BodyFit]] = []
+        bodies: list[TrackedBody] = []
         waiting: list[tuple[_BodyTrack, SeededCloud]] = []
         for (track, person), fit in zip(matched, fitted, strict=True):
             if isinstance(fit, InputError):
                 self._report.count_unusable(fit)
                 continue
             if fit is not None and track.prove(fit):
-                fits.append((track.id, fit))
+                bodies.append(track.show(fit))
             # A full fit to the little that is seen of a hidden person would bend the body.
             unreliable = fit is not None and not fit.reliable and not track.tracker.hidden
             unreliable = unreliable and stamp - track.fitted >= REFIT_INTERVAL_NS
             cloud = SeededCloud(person, _person_seed(seed, track.number))
             if not self._background_fit.add(track.number, cloud) and (track.tracker.lost or unreliable):
                 waiting.append((track, cloud))
-        self._report.counters["tracked people"] += len(fits)
+        self._report.counters["tracked people"] += len(bodies)
         self._drop_lost(stamp)
-        fits += self._start_fit(waiting, executor)
-        return sorted(fits, key=lambda pair: (len(pair[0]), pair[0]))
+        bodies += self._start_fit(waiting, executor)
+        return sorted(bodies, key=lambda body: (len(body.id), body.id))
 
-    def step_one(self, person: PersonCloud, seed: int, executor: Executor | None = None) -> list[tuple[str, BodyFit]]:
+    def step_one(self, person: PersonCloud, seed: int, executor: Executor | None = None) -> list[TrackedBody]:
         """Track like `step` in clouds that all show one and the same person, wherever they are."""
         for track in self._tracks:
             track.middle, track.velocity = person.middle, np.zeros(3)
@@ -189,9 +195,7 @@ class MultiBodyTracker:
         self._drop_lost(stamp)
         return named
 
-    def _start_fit(
-        self, waiting: list[tuple[_BodyTrack, SeededCloud]], executor: Executor | None
-    ) -> list[tuple[str, BodyFit]]:
+    def _start_fit(self, waiting: list[tuple[_BodyTrack, SeededCloud]], executor: Executor | None) -> list[TrackedBody]:
         """Start a full fit of the person who needs it most; in line it is finished when this returns."""
         if not waiting or self._background_fit.busy:
             return []
@@ -205,7 +209,7 @@ class MultiBodyTracker:
         self._background_fit.start(track.number, track.tracker.fork(quick), cloud, executor)
         self._adopt_finished_fit()
         fit = track.tracker.last
-        return [(track.id, fit)] if known is None and fit is not None and track.prove(fit) else []
+        return [track.show(fit)] if known is None and fit is not None and track.prove(fit) else []
 
     def _adopt_finished_fit(self) -> None:
         """Take over the tracker that a full fit has led to, unless the track's own is closer by now."""

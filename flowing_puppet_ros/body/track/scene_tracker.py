@@ -18,9 +18,11 @@ from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_c
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.person_finder import FoundBody, PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings, nested, setting
 
@@ -84,18 +86,43 @@ def crop_to_region(points: F64, region: RegionSettings) -> Bools:
 class SceneCloud:
     """A cloud with z up: `points` (N, 3) m, `normals` (N, 3) or None, `stamp` ns.
 
-    `single_view` says that it is known to be seen from one side, from the origin of its frame.
+    `single_view` says that it is known to be seen from one side, from the origin of its frame; `image` is its range
+    image where it is organised, whose pixels are those of the points.
     """
 
     points: F64
     normals: F64 | None
     stamp: int
     single_view: bool = False
+    image: RangeImage | None = None
 
     @property
     def whole(self) -> PersonCloud:
         """All of the cloud as one person."""
         return PersonCloud(self.points, self.normals, self.stamp)
+
+    def take(self, rows: Bools) -> SceneCloud:
+        """Return the part of the cloud whose points are `rows` (N,)."""
+        normals = None if self.normals is None else self.normals[rows]
+        return replace(self, points=self.points[rows], normals=normals, image=self.image and self.image.take(rows))
+
+    def with_fields(self, people: Sequence[PersonCloud]) -> list[PersonCloud]:
+        """Return people seen from the origin with what the sensor can know of each.
+
+        A scan without order is drawn into an image for that, unless the person is all of it: its own extent says
+        nothing about the sensor's.
+        """
+        image = self.image
+        if image is None and any(person.rows is not None for person in people):
+            image = RangeImage.of_scan(self.points, np.zeros(3))
+        if image is None:
+            return list(people)
+        return [
+            replace(person, field=image.make_field(slice(None) if person.rows is None else person.rows))
+            if self.image is not None or person.rows is not None
+            else person
+            for person in people
+        ]
 
 
 class SceneTracker:
@@ -126,8 +153,8 @@ class SceneTracker:
 
     def step(
         self, cloud: SceneCloud, seed: int, executor: Executor | None = None
-    ) -> tuple[list[tuple[str, BodyFit]], list[str]]:
-        """Return (id, fit) of everybody in the next cloud, and the ids of those who are out of sight for now.
+    ) -> tuple[list[TrackedBody], list[str]]:
+        """Return the bodies of everybody in the next cloud, and the ids of those who are out of sight for now.
 
         Full fits run on the `executor`, or in line. InputError when the cloud cannot be one of people.
 
@@ -140,11 +167,11 @@ class SceneTracker:
         In single views a new person has an upright body at once, which is refined by a full fit where it is doubtful.
         """
         settings = self._settings
-        self._check(cloud)
+        self.check(cloud)
         if not settings.scene:
             (person,) = self._with_viewpoint(cloud, [cloud.whole])
             if not settings.track:
-                return [(ONLY_ID, self._fit(person, seed))], []
+                return [TrackedBody(ONLY_ID, self._fit(person, seed))], []
             return self._tracker.step_one(person, seed, executor), []
         known = self._tracker.predict_bodies(cloud.stamp) if settings.track else ()
         if self._is_one_sided(cloud, remember=True):
@@ -152,7 +179,7 @@ class SceneTracker:
             if not settings.track:
                 fits = {id(body.person): body.fit for body in found}
                 named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
-                return [(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
+                return [TrackedBody(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
             first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
             seen = [body.person for body in found]
             return self._tracker.step(seen, cloud.stamp, seed, executor, first), self._tracker.occluded_ids
@@ -160,10 +187,10 @@ class SceneTracker:
         if settings.track:
             return self._tracker.step(people, cloud.stamp, seed, executor), self._tracker.occluded_ids
         named = self._tracker.associate_only(people, cloud.stamp)
-        return [(identity, self._fit(person, seed)) for identity, person in named], []
+        return [TrackedBody(identity, self._fit(person, seed)) for identity, person in named], []
 
-    def fit_once(self, cloud: SceneCloud, seed: int, progress: Progress | None = None) -> list[tuple[str, BodyFit]]:
-        """Return (id, fit) of everybody in a cloud that belongs to no stream; ids count from b1.
+    def fit_once(self, cloud: SceneCloud, seed: int, progress: Progress | None = None) -> list[TrackedBody]:
+        """Return the bodies of everybody in a cloud that belongs to no stream; ids count from b1.
 
         Where nobody can be told from surroundings, a cloud of a person's size is the person.
         """
@@ -172,14 +199,17 @@ class SceneTracker:
             proven = self.fit_found(self.find_once(cloud), seed, progress)
             if not proven:
                 raise InputError(_NOBODY.format(len(cloud.points)))
-            return [(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
+            return [TrackedBody(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
         people = self._segment(cloud) if self._settings.scene else []
         if not people and (not self._settings.scene or extent <= MAX_HEIGHT_M):
             people = [cloud.whole]
         if not people:
             raise InputError(_NOBODY.format(len(cloud.points)))
         people = self._with_viewpoint(cloud, people, remember=False)
-        return [(f"b{number}", self._fit(person, seed, progress)) for number, person in enumerate(people, start=1)]
+        return [
+            TrackedBody(f"b{number}", self._fit(person, seed, progress))
+            for number, person in enumerate(people, start=1)
+        ]
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
         """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
@@ -223,7 +253,8 @@ class SceneTracker:
         rows, points = self._in_range(cloud)
         normals = None if cloud.normals is None else cloud.normals[rows]
         found = self._finder.find(points, normals, np.zeros(3), cloud.stamp, known, max_fits, remember)
-        moved = [FoundBody(replace(body.person, rows=rows[body.person.rows]), body.fit) for body in found]
+        people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
+        moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
 
     def _improve(
@@ -244,7 +275,8 @@ class SceneTracker:
         )
         return [replace(person, stamp=cloud.stamp) for person in people]
 
-    def _check(self, cloud: SceneCloud) -> None:
+    def check(self, cloud: SceneCloud) -> None:
+        """Raise an InputError when a cloud has no point, or none in range."""
         if not len(cloud.points):
             raise InputError("the cloud has no finite point in the region of interest")
         distance, limit = np.linalg.norm(cloud.points, axis=1).min(), self._settings.segmentation.max_range
@@ -255,7 +287,14 @@ class SceneTracker:
             )
 
     def _fit(self, person: PersonCloud, seed: int, progress: Progress | None = None) -> BodyFit:
-        return self._fitter.fit(person.points, person.normals, viewpoint=person.viewpoint, seed=seed, progress=progress)
+        return self._fitter.fit(
+            person.points,
+            person.normals,
+            viewpoint=person.viewpoint,
+            field=person.field,
+            seed=seed,
+            progress=progress,
+        )
 
     def _sensor(self, cloud: SceneCloud) -> F64 | None:
         """Return where the sensor is for the segmentation: at the origin, unless people are seen from all sides."""
@@ -277,4 +316,4 @@ class SceneTracker:
             single = is_single_view(people[0].points)
             if remember:
                 self._single_view = single
-        return [replace(person, viewpoint=np.zeros(3)) for person in people] if single else people
+        return cloud.with_fields([replace(person, viewpoint=np.zeros(3)) for person in people]) if single else people

@@ -7,6 +7,7 @@ height, comes from the floor and from the bank, not from the points.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -17,6 +18,7 @@ from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.evidence.cloud.one_sided import distances
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+from flowing_puppet_ros.threads import one_blas_thread
 
 POSES, YAWS, SHAPE_SCALE = 120, 16, 0.7
 MIN_STRAIGHT_KNEE_RAD, MIN_OTHER_KNEE_RAD = np.radians(150.0), np.radians(95.0)
@@ -90,30 +92,17 @@ def stature_cost(stature: np.ndarray) -> np.ndarray:
     return STATURE_COST_M * ((stature - MEAN_STATURE_M) / STATURE_DEVIATION_M) ** 2
 
 
-def measure_stature(model: StitchedPuppet, state: BodyState) -> float:
-    """Return the height of the person when standing, in metres: the rest pose, stitched in the person's shape."""
-    rest = model.rest_state()
-    rest.shape[:] = state.shape
-    for number, (parent, child) in enumerate(model.tree.edges):
-        interface = model.interfaces[number]
-        target, own = (
-            model.local_vertices(part, rest.pose[part], rest.shape[part])[index]
-            for part, index in ((parent, interface.parent_index), (child, interface.child_index))
-        )
-        rest.center[child] = rest.center[parent] + np.average(target - own, axis=0, weights=interface.weight)
-    return float(np.ptp(model.vertices(rest)[:, 2]))
-
-
 @lru_cache(maxsize=3)
+@one_blas_thread()
 def make_upright_bank(model: StitchedPuppet) -> UprightBank:
     """Draw the bank; made once for a model."""
     rng = np.random.default_rng(0)
     rows = farthest_points(model.vertices(model.rest_state()), FINE_POINTS)
     states: list[BodyState] = []
     points, normals, statures = [], [], []
-    while len(states) < POSES:
-        state = model.sample(rng, shape_scale=SHAPE_SCALE)
-        vertices = model.vertices(state)
+    for state, vertices in _draw_bodies(model, rng):
+        if len(states) == POSES:
+            break
         joints = dict(zip(model.joint_names, model.joints(vertices), strict=True))
         if not _is_upright(joints):
             continue
@@ -122,10 +111,19 @@ def make_upright_bank(model: StitchedPuppet) -> UprightBank:
         states.append(BodyState(state.center + down, state.rotation, state.pose, state.shape))
         points.append((vertices + down)[rows])
         normals.append(vertex_normals(vertices, model.faces)[rows])
-        statures.append(measure_stature(model, state))
+        statures.append(model.measure_height(state.shape))
     turns = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
     turned = [np.concatenate([np.stack(each) @ turn.T for turn in turns]) for each in (points, normals)]
     return UprightBank(states, turns, turned[0], turned[1], np.array(statures))
+
+
+def _draw_bodies(model: StitchedPuppet, rng: np.random.Generator) -> Iterator[tuple[BodyState, np.ndarray]]:
+    """Draw bodies and their vertices (V, 3) without end, many at a time, which takes a tenth of the time."""
+    while True:
+        bodies = model.sample_many(rng, POSES, shape_scale=SHAPE_SCALE)
+        arrays = (bodies.center, bodies.rotation, bodies.pose, bodies.shape, model.vertices(bodies))
+        for center, rotation, pose, shape, vertices in zip(*arrays, strict=True):
+            yield BodyState(center, rotation, pose, shape), vertices
 
 
 def _is_upright(joints: dict[str, np.ndarray]) -> bool:

@@ -16,9 +16,9 @@ from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.upright.upright_bank import (
     make_upright_bank,
-    measure_stature,
     stature_cost,
 )
+from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.threads import parallel_map, usable_threads
 
@@ -59,16 +59,23 @@ class UprightFitter:
         """Make the bank beforehand."""
         make_upright_bank(self._fitter.model)
 
-    def make_cloud(self, points: np.ndarray, viewpoint: np.ndarray, unknown: np.ndarray) -> SingleViewCloud:
+    def make_cloud(
+        self,
+        points: np.ndarray,
+        viewpoint: np.ndarray,
+        unknown: np.ndarray | None,
+        field: SensorField | None = None,
+    ) -> SingleViewCloud:
         """Return the cloud of a candidate; InputError when part of it lies behind the sensor.
 
         Args:
             points: (N, 3) metres.
             viewpoint: (3,) position of the sensor, metres.
-            unknown: (K, 3) m, see `ScanRays.find_unknown`.
+            unknown: (K, 3) m, see `ScanRays.find_unknown`; None where there is a field.
+            field: what the sensor can know of the candidate.
         """
         points = downsample(points, None, MAX_FIT_POINTS)[0]
-        return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, unknown)
+        return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, unknown, field)
 
     def find_rough(self, cloud: SingleViewCloud, floor: float) -> list[tuple[float, BodyState]]:
         """Return the bank's best bodies with their costs in metres."""
@@ -90,7 +97,7 @@ class UprightFitter:
             body = self._fitter.gauss_newton.run(start[1], cloud, self._none, weights, terms)
             if many:
                 body = self._fitter.gauss_newton.run(body, cloud, self._none, MANY_POINTS, terms)
-            stature = measure_stature(self._fitter.model, body)
+            stature = self._fitter.model.measure_height(body.shape)
             cost = self._fitter.hypotheses.pose_bank.cost(body, coarse) + float(stature_cost(np.array(stature)))
             return cost, body, stature
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from flowing_puppet_ros.cli.batch.task import BatchTask, TaskResult, execute
 from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.extras import import_extra
 
 if TYPE_CHECKING:
     from distributed import Client, Future
@@ -31,10 +32,7 @@ def run_on_cluster(tasks: Sequence[BatchTask], address: str) -> Iterator[tuple[i
         InputError: if there is no scheduler.
         PuppetError: if the scheduler goes away or has no worker for a minute.
     """
-    try:
-        import distributed  # noqa: F401
-    except ImportError as error:
-        raise InputError("--scheduler needs Dask: pip install 'flowing_puppet_ros[cluster]'") from error
+    import_extra("distributed", "cluster", "--scheduler")
     with _connect(address) as client:
         waiting = {client.submit(execute, task, pure=False): index for index, task in enumerate(tasks)}
         try:

@@ -14,14 +14,13 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
 from flowing_puppet_ros.cli.batch.task import BatchTask, TaskResult, execute
-from flowing_puppet_ros.threads import usable_threads
+from flowing_puppet_ros.threads import MAX_THREADS, usable_threads
 
 # Environment variables that set the libraries' numbers of threads; read when the libraries are imported.
 THREAD_VARIABLES = (
     *("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"),
     *("NUMBA_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"),
 )
-MAX_THREADS = 1024  # more than any machine has cores
 MAX_TRIES = 2  # of a task whose process dies
 
 

@@ -57,6 +57,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--again", action="store_true", help="redo finished inputs")
 
 
+def check_jobs(arguments: argparse.Namespace) -> None:
+    """Raise an InputError if --jobs is no number of processes or threads."""
+    if arguments.jobs is not None and arguments.jobs < 1:
+        raise InputError(f"--jobs is {arguments.jobs}; give 1 or more")
+
+
 def resolve_path(path: Path, arguments: argparse.Namespace) -> Path:
     """Return a path as the machines of a cluster find it, whose processes run in other folders."""
     return path if arguments.scheduler is None else path.absolute()
@@ -68,8 +74,7 @@ def run_batch(verb: Verb, sources: Sequence[Path], options: Any, out: Path, argu
     Results are reported in the order of `sources`. The status is 0 if all are done, 1 if some failed, and the highest
     of their statuses if all failed.
     """
-    if arguments.jobs is not None and arguments.jobs < 1:
-        raise InputError(f"--jobs is {arguments.jobs}; give 1 or more")
+    check_jobs(arguments)
     _refuse_duplicates(sources)
     make_out_folder(out)
     log = ResultLog(out / f"{verb.name}.jsonl", verb.files)

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import argparse
 
-from flowing_puppet_ros.cli.evaluate import bag, bodies, correspondence, hands, joints, likelihood, pcp, scenes, video
+from flowing_puppet_ros.cli.evaluate import bag, correspondence, hands, joints, likelihood, pcp, video
+from flowing_puppet_ros.cli.evaluate.clouds import bodies, rgbd, scenes
 
 KINDS = {
     "pcp": pcp,
@@ -13,6 +14,7 @@ KINDS = {
     "video": video,
     "bodies": bodies,
     "scenes": scenes,
+    "rgbd": rgbd,
     "correspondence": correspondence,
     "bag": bag,
     "likelihood": likelihood,

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,13 @@ from tqdm import tqdm
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame, measure_stature
+from flowing_puppet_ros.body.measurements.measure import DEFINITIONS, measure_fit
 from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
 from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit, has_size_of_person
+from flowing_puppet_ros.cli.scans.fit_depth import fit_view, read_view
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson, find_people, list_scene_ups
 from flowing_puppet_ros.cli.scans.fit_scene import fit_one_sided_scene
+from flowing_puppet_ros.cli.scans.given_joints import fit_from_joints
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -33,18 +36,19 @@ def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str
     `shown` draws a progress bar on stderr. PuppetError if the file cannot be used or shows no person.
     """
     started = time.perf_counter()
-    fitter = _make_fitter(options.model, options.settings)
-    _refuse_overwriting(source, options)
+    fitter = make_fitter(options.model, options.settings)
+    refuse_overwriting(source, options)
+    view = read_view(source, options)
+    if view is not None:
+        bodies, notes = fit_view(view, source, fitter, options)
+        return {"input": str(source), "people": _finish_all(source, bodies, notes, fitter, options, started)}
     scan = read_scan(source)
     seen = _find_one_sided(scan, fitter, options) if options.scene else []
     if seen:
-        each = (time.perf_counter() - started) / len(seen)  # found together
-        fits = [
-            _finish(options.out / f"{source.stem}-{number}.npz", fitter.model, found, "single", (), each)
-            for number, found in enumerate(seen, start=1)
-        ]
-        return {"input": str(source), "people": fits}
+        return {"input": str(source), "people": _finish_all(source, seen, (), fitter, options, started)}
     people = find_people(scan, source, fitter, options)
+    if options.joints and len(people) > 1:
+        raise InputError(f"{source} shows {len(people)} people and --joints are those of one; cut out one person")
     if not people[0].suffix:
         return {"input": str(source)} | _fit_person(source, people[0], fitter, options, started, shown)
     fits = []
@@ -61,21 +65,31 @@ def list_files(summary: dict[str, Any]) -> list[Path]:
 
 
 @lru_cache(maxsize=1)
-def _make_fitter(model: str, settings: FitterSettings) -> BodyFitter:
+def make_fitter(model: str, settings: FitterSettings) -> BodyFitter:
     """Make the fitter that all inputs of a process share."""
     return BodyFitter(StitchedPuppet.load(model), settings)
 
 
-def _refuse_overwriting(source: Path, options: FitOptions) -> None:
-    if not options.scene and source.suffix in (".npz", ".ply") and source.parent.resolve() == options.out.resolve():
+def refuse_overwriting(source: Path, options: FitOptions) -> None:
+    """Raise InputError when a result would have the name of its input."""
+    if (
+        not options.scene
+        and options.camera_info is None
+        and source.suffix in (".npz", ".ply")
+        and source.parent.resolve() == options.out.resolve()
+    ):
         raise InputError(f"the fit of {source} would overwrite it; choose another folder for --out")
 
 
 def _fit_person(
     path: Path, person: ScanPerson, fitter: BodyFitter, options: FitOptions, started: float, shown: bool
 ) -> dict[str, Any]:
-    output = options.out / f"{path.stem}{person.suffix}.npz"
-    with tqdm(total=100, desc=output.stem, unit="%", file=sys.stderr, disable=not shown) as bar:
+    stem = f"{path.stem}{person.suffix}"
+    if options.joints:
+        found = fit_from_joints(person, dict(options.joints), fitter, options)
+        view = "full" if person.sensor is None else "single"
+        return write_result(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
+    with tqdm(total=100, desc=stem, unit="%", file=sys.stderr, disable=not shown) as bar:
         found = fit_in_best_frame(
             fitter,
             person.points,
@@ -85,9 +99,9 @@ def _fit_person(
             sensor=person.sensor,
             progress=_progress_on(bar),
         )
-    _refuse_no_person(person, found)
+    refuse_no_person(person, found)
     view = "full" if person.sensor is None else "single"
-    return _finish(output, fitter.model, found, view, person.notes, time.perf_counter() - started)
+    return write_result(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
 
 
 def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list[FrameFit]:
@@ -104,12 +118,20 @@ def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list
     return [FrameFit(frame, unit, fit, True, True, measure_stature(fitter.model, fit.joints)) for fit in fits]
 
 
-def _finish(
-    output: Path, model: StitchedPuppet, found: FrameFit, view: str, notes: tuple[str, ...], seconds: float
+def write_result(
+    stem: str,
+    model: StitchedPuppet,
+    found: FrameFit,
+    view: str,
+    notes: tuple[str, ...],
+    seconds: float,
+    options: FitOptions,
 ) -> dict[str, Any]:
     """Write a fit and return its summary."""
+    output = options.out / f"{stem}.npz"
+    measured = _measure(model, found) if options.measure else {}
     try:
-        _write_fit(output, model, found, seconds)
+        _write_fit(output, model, found, seconds, measured)
     except OSError as error:
         raise PuppetError(f"{output} cannot be written: {error.strerror}") from error
     fit, unit = found.fit, found.unit
@@ -128,11 +150,35 @@ def _finish(
         "up_clear": found.up_clear,
         "view": view,
         "notes": [*notes, *_describe_frame(found)],
+        **({"measurements": measured} if measured else {}),
         "seconds": seconds,
     }
 
 
-def _refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
+def _finish_all(
+    source: Path,
+    seen: Sequence[FrameFit],
+    notes: tuple[str, ...],
+    fitter: BodyFitter,
+    options: FitOptions,
+    started: float,
+) -> list[dict[str, Any]]:
+    """Write the fits of people who were found together from one side, and return their summaries."""
+    each = (time.perf_counter() - started) / len(seen)
+    return [
+        write_result(f"{source.stem}-{number}", fitter.model, found, "single", notes, each, options)
+        for number, found in enumerate(seen, start=1)
+    ]
+
+
+def _measure(model: StitchedPuppet, found: FrameFit) -> dict[str, float]:
+    """Return the measurements of a person in the unit of the scan's metres: a child was fitted as an adult."""
+    shrink = found.unit.metres / found.unit.fitted
+    measured = measure_fit(model, found.fit.state, found.fit.vertices)
+    return {name: value * shrink ** DEFINITIONS[name].dimension for name, value in measured.items()}
+
+
+def refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
     """Raise InputError when a cloud has no person's size and, scaled to one, no person's shape."""
     guessed = found.unit.name == GUESS and len(person.units) > 1
     if guessed and not found.fit.reliable and not has_size_of_person(person.points):
@@ -172,7 +218,9 @@ def _progress_on(bar: tqdm) -> Callable[[float], None]:
     return lambda done: bar.update(int(100 * done) - bar.n) and None
 
 
-def _write_fit(output: Path, model: StitchedPuppet, found: FrameFit, seconds: float) -> None:
+def _write_fit(
+    output: Path, model: StitchedPuppet, found: FrameFit, seconds: float, measured: Mapping[str, float]
+) -> None:
     """Write the fit, in the scan's frame and unit, as `output` and as a mesh beside it."""
     frame, fit = found.frame, found.fit
     vertices = to_smallest_float(frame.to_scan(fit.vertices))
@@ -202,6 +250,8 @@ def _write_fit(output: Path, model: StitchedPuppet, found: FrameFit, seconds: fl
         "seconds": seconds,
         "model": model.name,
     }
+    if measured:
+        arrays |= {"measurement_names": np.array(list(measured)), "measurements": np.array(list(measured.values()))}
     # Write atomically, in case two machines make the same result or one is stopped.
     unfinished = output.with_name(f".{output.stem}.{os.getpid()}")
     try:

@@ -79,6 +79,10 @@ class FitOptions:
     scene: bool
     settings: FitterSettings
     segmentation: SegmentationSettings
+    camera_info: str | None = None
+    color: Path | None = None
+    measure: bool = False
+    joints: tuple[tuple[str, tuple[float, float, float, float]], ...] = ()
 
 
 def list_scene_ups(options: FitOptions) -> list[np.ndarray]:

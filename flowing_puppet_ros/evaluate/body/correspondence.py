@@ -143,9 +143,7 @@ def _measure_unit_and_stature(model: StitchedPuppet, vertices: np.ndarray, shape
 
     Edges keep their length in every pose, so their mean length gives the unit.
     """
-    rest = model.rest_state()
-    rest.shape[:] = shape
-    standing = model.vertices(rest)
+    standing = model.vertices(model.rest_state(shape))
     edges = model.faces[:, :2]
     lengths = [np.linalg.norm(mesh[edges[:, 0]] - mesh[edges[:, 1]], axis=1).mean() for mesh in (standing, vertices)]
     return float(lengths[0] / lengths[1]), float(np.ptp(standing[:, 2]))

@@ -6,6 +6,7 @@ Metres, z up. `evaluate.body.synthetic_scans` simulates a scanner, a depth camer
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,12 +32,14 @@ class TrueBody:
         joints: (J, 3) m, named by `BodySource.joint_names`.
         hard: whether the pose was drawn from joint limits alone, not from motion capture.
         stature: m, of the person standing.
+        rest: the same person in Anny's rest pose.
     """
 
     vertices: np.ndarray
     joints: np.ndarray
     hard: bool
     stature: float
+    rest: RestBody | None = None
 
     def template_vertices(self, model_name: str) -> np.ndarray:
         """Return the true positions (V, 3) m of the vertices of the shipped Stitched Puppet `model_name`."""
@@ -48,7 +51,11 @@ class TrueBody:
 
 
 class BodySource:
-    """Random people of both genders; `triangles` (F, 3) and `joint_names` are the same for all of them."""
+    """Random people of both genders.
+
+    The same for all of them: `triangles` (F, 3), `joint_names`, `bone_names`, `bone_of_vertex` (V,), which moves each
+    vertex most, and `rest_vertices` (V, 3) m, an average person's in the rest pose.
+    """
 
     def __init__(self, mocap: Path | None = None) -> None:
         """Load Anny and the motion capture, if any.
@@ -62,6 +69,9 @@ class BodySource:
         rest = self._anny.make_rest_body(self._anny.mean_phenotype())
         self.triangles = self._anny.triangles
         self.joint_names = tuple(self._anny.locate_landmarks(rest.vertices, rest.joints))
+        self.bone_names = self._anny.bone_names
+        self.bone_of_vertex = self._anny.skin_weights.argmax(axis=1)
+        self.rest_vertices = rest.vertices
 
     @property
     def has_mocap(self) -> bool:
@@ -72,20 +82,37 @@ class BodySource:
         """Draw a person of random yaw in a pose of the motion capture or, if `hard`, anywhere within joint limits."""
         if not hard and not self.has_mocap:
             raise InputError("poses of people need motion capture; give --mocap expmap_20hz.npz")
-        rest = self._anny.make_rest_body(self._anny.sample_phenotype(rng))
+        rest = self.draw_person(rng)
         pose = self._sampler.sample(rng, 1, limits_share=float(hard))[0]
         pose[0] = _draw_yaw(rng) @ rotation.exp(TILT_DEVIATION * rng.standard_normal(3))
         body = self._pose(rest, pose, np.zeros(3), hard)
         return body.translate(np.array([0.0, 0.0, -body.vertices[:, 2].min()]))
 
-    def draw_motion(self, rng: np.random.Generator, frames: int, rate: float) -> list[TrueBody]:
+    def draw_person(self, rng: np.random.Generator) -> RestBody:
+        """Draw the shape of a person."""
+        return self._anny.make_rest_body(self._anny.sample_phenotype(rng))
+
+    def pose_person(self, person: RestBody, angles: Mapping[str, np.ndarray], turn: np.ndarray) -> TrueBody:
+        """Pose a person by rotation vectors (3,) rad by bone, from the rest pose; `turn` (3, 3) is the pelvis's."""
+        vectors = np.zeros((len(self.bone_names), 3))
+        for bone, vector in angles.items():
+            vectors[self.bone_names.index(bone)] = vector
+        pose = rotation.exp(vectors)
+        pose[0] = turn
+        return self._pose(person, pose, np.zeros(3), hard=False)
+
+    def draw_motion(
+        self, rng: np.random.Generator, frames: int, rate: float, min_speed: float = MIN_SPEED_M
+    ) -> list[TrueBody]:
         """Draw one person moving for `frames` frames at `rate` Hz, interpolated from motion capture.
+
+        `min_speed` is the least mean motion of a joint in metres per frame of the motion capture.
 
         Raises:
             InputError: if no motion capture is long enough.
         """
-        poses, places = self._draw_sequence(rng, 2 + int(np.ceil((frames - 1) * MOCAP_RATE_HZ / rate)))
-        rest = self._anny.make_rest_body(self._anny.sample_phenotype(rng))
+        poses, places = self._draw_sequence(rng, 2 + int(np.ceil((frames - 1) * MOCAP_RATE_HZ / rate)), min_speed)
+        rest = self.draw_person(rng)
         turn = _draw_yaw(rng)
         bodies = []
         for time in np.arange(frames) * MOCAP_RATE_HZ / rate:
@@ -102,10 +129,10 @@ class BodySource:
         vertices, bones = self._anny.pose(rest, pose)
         named = self._anny.locate_landmarks(vertices, bones)
         return TrueBody(
-            vertices + place, np.stack([named[name] for name in self.joint_names]) + place, hard, rest.stature
+            vertices + place, np.stack([named[name] for name in self.joint_names]) + place, hard, rest.stature, rest
         )
 
-    def _draw_sequence(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def _draw_sequence(self, rng: np.random.Generator, count: int, min_speed: float) -> tuple[np.ndarray, np.ndarray]:
         """Draw bone rotations (count, B, 3, 3), pelvis included, and positions (count, 3) m of a moving person."""
         for sequence in rng.permutation(np.array(self._read_sequences(), dtype=object)):
             if len(sequence) < count:
@@ -116,9 +143,11 @@ class BodySource:
             pelvis = np.swapaxes(rotation.exp(frames[:, 3:6]), -1, -2)
             poses[:, 0] = FROM_MOCAP @ pelvis @ FROM_MOCAP.T
             places = (frames[:, :3] - frames[0, :3]) @ FROM_MOCAP.T * MOCAP_UNIT_M
-            if self._mean_speed(poses, places) > MIN_SPEED_M:
+            if self._mean_speed(poses, places) > min_speed:
                 return poses, places
-        raise InputError(f"{self._mocap} holds no motion of {count} frames; give longer motion capture")
+        raise InputError(
+            f"{self._mocap} holds no motion of {count} frames that is fast enough; give longer motion capture"
+        )
 
     def _read_sequences(self) -> list[np.ndarray]:
         if self._mocap is None:

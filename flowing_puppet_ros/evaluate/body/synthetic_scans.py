@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowing_puppet_ros.extras import import_extra
+
 VIEW_DIRECTIONS = 40  # number of directions that a whole scan is seen from
 VIEW_DISTANCE_M = 5.0  # of a whole scan
 HIT_TOLERANCE_M = 0.002  # a ray that ends this close to a surface point has hit it
@@ -51,7 +53,7 @@ class RaycastScene:
         self, vertices: np.ndarray, triangles: np.ndarray, around: Sequence[tuple[np.ndarray, np.ndarray]] = ()
     ) -> None:
         """Take the person's vertices (V, 3) and triangles (F, 3), and other meshes of the same form."""
-        import open3d as o3d
+        o3d = import_extra("open3d", "scans", "a scan of synthetic people")
 
         self._tensor = o3d.core.Tensor.from_numpy
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)

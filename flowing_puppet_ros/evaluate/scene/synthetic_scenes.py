@@ -14,6 +14,7 @@ import numpy as np
 
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
 from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, MAKERS, MAX_TRIES, Disc, Mesh
+from flowing_puppet_ros.extras import import_extra
 
 PLACES = ("room", "street", "hall")
 SCANNERS = ("spinning-32", "spinning-64", "solid-state", "depth")
@@ -103,7 +104,7 @@ def scan_scene(
     meshes: Sequence[Mesh], people: Sequence[Mesh], rng: np.random.Generator, scanner: str, height: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Scan meshes from (0, 0, `height`) m; return points (N, 3) in the sensor's frame and whose they are (N,)."""
-    import open3d as o3d
+    o3d = import_extra("open3d", "scans", "a scan of synthetic people")
 
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
     for vertices, triangles in (*people, *meshes):

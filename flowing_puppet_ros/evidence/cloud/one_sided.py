@@ -3,7 +3,8 @@
 
 A point of the body may lie on the seen surface or anywhere behind it. It must not lie in front of it, nor beside the
 silhouette, because the sensor saw through there. The cloud is its own depth image: directions are looked up in a grid
-of the nearest seen directions, whose spacing (as between the rings of a LiDAR) comes from the cloud.
+of the nearest seen directions, whose spacing (as between the rings of a LiDAR) comes from the cloud. Where the sensor's
+field says that nothing can be known, the cloud says nothing either.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from numba import njit
 
 from flowing_puppet_ros.evidence.cloud.data_term import fill_nearest
 from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours
+from flowing_puppet_ros.evidence.cloud.sensor_field import NO_FIELD, FieldArrays, SensorField, is_unknown
 
 MAX_CELLS = 60_000  # of the grid of directions
 SPACING_NEIGHBOUR = 4  # the spacing of directions is the distance to this neighbour ...
@@ -41,6 +43,7 @@ class OneSidedView:
         low: (2,) centre of the first cell, as directions.
         cell: edge of a cell, as directions.
         nearest: (w, h) int32, index of the point seen nearest to the cell's centre.
+        field: what the sensor can know, None where it sees everything.
     """
 
     viewpoint: np.ndarray
@@ -51,12 +54,20 @@ class OneSidedView:
     low: np.ndarray
     cell: float
     nearest: np.ndarray
+    field: SensorField | None = None
 
     @classmethod
-    def build(cls, points: np.ndarray, viewpoint: np.ndarray, unknown: np.ndarray | None = None) -> OneSidedView:
+    def build(
+        cls,
+        points: np.ndarray,
+        viewpoint: np.ndarray,
+        unknown: np.ndarray | None = None,
+        field: SensorField | None = None,
+    ) -> OneSidedView:
         """Index a cloud `points` (N, 3) m, seen from `viewpoint` (3,) m, which lies outside of it.
 
-        `unknown` (K, 3) m are places in whose directions the sensor saw nothing of what lies behind them.
+        `unknown` (K, 3) m are places in whose directions the sensor saw nothing of what lies behind them. `field` is
+        what the sensor can know of what is in the cloud.
         """
         axes = _axes(points.mean(axis=0) - viewpoint)
         directions, depth = _project(points, viewpoint, axes)
@@ -74,7 +85,7 @@ class OneSidedView:
         level = np.pad(directions[inside], ((0, 0), (0, 1)))
         nearest = inside[fill_nearest(level, np.append(low, 0.0), cell, np.append(shape, 1))[:, :, 0]].astype(np.int32)
         tolerance = TOLERANCE_SPACINGS * spacing
-        return cls(viewpoint, axes, directions, depth, tolerance, low, cell, np.ascontiguousarray(nearest))
+        return cls(viewpoint, axes, directions, depth, tolerance, low, cell, np.ascontiguousarray(nearest), field)
 
     def compare(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where `points` (N, 3) m lie relative to the seen surface.
@@ -106,9 +117,12 @@ class OneSidedView:
         """
         return _misfit(np.ascontiguousarray(points), np.ascontiguousarray(normals), *self._arrays())
 
-    def _arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, float, np.ndarray]:
+    def _arrays(
+        self,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, float, np.ndarray, FieldArrays]:
         return (
             self.viewpoint, self.axes, self.directions, self.depth, self.tolerance, self.low, self.cell, self.nearest,
+            NO_FIELD if self.field is None else self.field.arrays,
         )  # fmt: skip
 
 
@@ -155,9 +169,12 @@ def _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest
 
 
 @njit(cache=True, nogil=True)
-def _compare(points, viewpoint, axes, directions, seen, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
+def _compare(points, viewpoint, axes, directions, seen, tolerance, low, cell, nearest, field):  # type: ignore[no-untyped-def]
     beside, behind = np.zeros((len(points), 3)), np.empty(len(points))
     for k in range(len(points)):
+        if is_unknown(points[k, 0], points[k, 1], points[k, 2], field):
+            behind[k] = np.inf
+            continue
         found, depth, dx, dy = _look_up(
             points[k, 0], points[k, 1], points[k, 2], viewpoint, axes, directions, tolerance, low, cell, nearest
         )
@@ -171,16 +188,18 @@ def _compare(points, viewpoint, axes, directions, seen, tolerance, low, cell, ne
 
 
 @njit(cache=True, nogil=True)
-def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
+def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, cell, nearest, field):  # type: ignore[no-untyped-def]
     cost, facing = np.zeros(len(points)), np.zeros(points.shape[:2], dtype=np.bool_)
     for p in range(len(points)):
         for k in range(points.shape[1]):
             x, y, z = points[p, k, 0], points[p, k, 1], points[p, k, 2]
-            found, depth, dx, dy = _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest)
             toward = 0.0
             for axis in range(3):
                 toward += (viewpoint[axis] - points[p, k, axis]) * normals[p, k, axis]
             facing[p, k] = toward > 0
+            if is_unknown(x, y, z, field):
+                continue
+            found, depth, dx, dy = _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest)
             if seen[found] < 0:
                 continue
             behind = depth - seen[found]

@@ -12,6 +12,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.extras import import_extra
 
 MAX_SHAPES = 3
 """Sizes of input for which a network stays prepared; each takes some ten megabytes."""
@@ -34,14 +35,8 @@ class LiteRtNetwork:
         Raises:
             InputError: when LiteRT is not installed, or `data` is no network.
         """
-        try:
-            from ai_edge_litert.interpreter import Interpreter
-        except ModuleNotFoundError as error:
-            raise InputError(
-                "keypoint networks need LiteRT: pip install 'flowing_puppet_ros[neural]', then `flowing-puppet networks"
-                " --install`"
-            ) from error
-        self._make: Callable[[], Any] = lambda: Interpreter(model_content=data, num_threads=1)
+        interpreter = import_extra("ai_edge_litert.interpreter", "neural", "a keypoint network").Interpreter
+        self._make: Callable[[], Any] = lambda: interpreter(model_content=data, num_threads=1)
         self._prepared: dict[tuple[int, ...], Any] = {}
         self._lock = threading.Lock()
         try:

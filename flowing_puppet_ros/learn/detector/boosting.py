@@ -65,7 +65,7 @@ def _find_best_split(histogram: Array) -> tuple[int, int] | None:
     return int(column), int(code)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _make_histogram(columns: Array, chosen: Array, node: Array, gradient: Array, hessian: Array, nodes: int) -> Any:
     """Sum gradients and Hessians by node, feature and code; return (nodes, chosen, BINS, 2)."""
     out = np.zeros((nodes, len(chosen), BINS, 2), np.float64)

@@ -19,7 +19,7 @@ _SMOOTHING_PX = 2.0  # deviation of the Gaussian along the contour
 _MAX_CLEFT_M = 0.025  # width of clefts that are filled
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill(points: F64, triangles: I32, mask: U8) -> None:
     height, width = mask.shape
     for face in range(triangles.shape[0]):

@@ -65,7 +65,7 @@ def _make_fans(n_vertices: int, faces: Array) -> Array:
     return fan
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _collect_ring(vertex, faces, fan, out):  # type: ignore[no-untyped-def]
     count = 0
     for k in range(1, fan[vertex, 0] + 1):
@@ -84,7 +84,7 @@ def _collect_ring(vertex, faces, fan, out):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _normal(vertices, a, b, c):  # type: ignore[no-untyped-def]
     # Its length is twice the area. A tuple, since small arrays would cost more than the arithmetic.
     p, q, r = vertices[a], vertices[b], vertices[c]
@@ -93,18 +93,18 @@ def _normal(vertices, a, b, c):  # type: ignore[no-untyped-def]
     return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _cosine(a, b):  # type: ignore[no-untyped-def]
     size = np.sqrt(_dot(a, a) * _dot(b, b))
     return _dot(a, b) / size if size > 0 else -1.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _distance(vertices, a, b):  # type: ignore[no-untyped-def]
     total = 0.0
     for axis in range(3):
@@ -112,7 +112,7 @@ def _distance(vertices, a, b):  # type: ignore[no-untyped-def]
     return np.sqrt(total)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _shape(vertices, a, b, c):  # type: ignore[no-untyped-def]
     # 1 for an equilateral triangle, 0 for a sliver: area against the sum of squared edges.
     normal = _normal(vertices, a, b, c)
@@ -120,7 +120,7 @@ def _shape(vertices, a, b, c):  # type: ignore[no-untyped-def]
     return 2 * np.sqrt(3.0 * _dot(normal, normal)) / total if total > 0 else 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _quadrics(vertices, faces):  # type: ignore[no-untyped-def]
     # Per vertex the area-weighted sum of squared distances to its faces' planes (Garland and Heckbert 1997), as the
     # coefficients of 1, x, y, z, xx, xy, xz, yy, yz, zz; and the sum of the weights.
@@ -139,7 +139,7 @@ def _quadrics(vertices, faces):  # type: ignore[no-untyped-def]
     return quadrics
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _plane_distance(quadric, point):  # type: ignore[no-untyped-def]
     x, y, z = point
     terms = (1.0, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)
@@ -149,7 +149,7 @@ def _plane_distance(quadric, point):  # type: ignore[no-untyped-def]
     return np.sqrt(max(total, 0.0) / max(quadric[10], 1e-300))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _collapse_cost(u, v, vertices, faces, fan, boundary, spacing, inner, quadric):  # type: ignore[no-untyped-def]
     ring_u, ring_v = np.empty(4 * MAX_VALENCE, np.int64), np.empty(4 * MAX_VALENCE, np.int64)
     n_u, n_v = _collect_ring(u, faces, fan, ring_u), _collect_ring(v, faces, fan, ring_v)
@@ -187,7 +187,7 @@ def _collapse_cost(u, v, vertices, faces, fan, boundary, spacing, inner, quadric
     return cost - 1e6 if inner else cost
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _find_best_collapse(u, vertices, faces, fan, boundary, spacing, group, inner, quadrics):  # type: ignore[no-untyped-def]
     ring = np.empty(4 * MAX_VALENCE, np.int64)
     best, target = np.inf, -1
@@ -199,7 +199,7 @@ def _find_best_collapse(u, vertices, faces, fan, boundary, spacing, group, inner
     return best, target
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _remove_face(vertex, face, fan):  # type: ignore[no-untyped-def]
     for k in range(1, fan[vertex, 0] + 1):
         if fan[vertex, k] == face:
@@ -208,7 +208,7 @@ def _remove_face(vertex, face, fan):  # type: ignore[no-untyped-def]
             return
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _collapse_edge(u, v, faces, fan, alive):  # type: ignore[no-untyped-def]
     for k in range(1, fan[u, 0] + 1):
         index = fan[u, k]
@@ -226,7 +226,7 @@ def _collapse_edge(u, v, faces, fan, alive):  # type: ignore[no-untyped-def]
     fan[u, 0] = 0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _collapse_edges(vertices, faces, fan, alive, boundary, spacing, group, inner, count):  # type: ignore[no-untyped-def]
     n = len(vertices)
     costs, targets, remaining = np.full(n, np.inf), np.full(n, -1), 0
@@ -281,7 +281,7 @@ def _flip_edges(vertices: Array, faces: Array, boundary: Array, rounds: int = 10
             return
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _flip_improves(vertices, first, second, a, b, c, d):  # type: ignore[no-untyped-def]
     first_old = _normal(vertices, first[0], first[1], first[2])
     second_old = _normal(vertices, second[0], second[1], second[2])

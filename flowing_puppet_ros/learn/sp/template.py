@@ -83,7 +83,7 @@ def _find_inside(vertices: Array, head: Array) -> Array:
     return inside
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _open_share(points, corners, rays):  # type: ignore[no-untyped-def]
     # Moller and Trumbore 1997, in scalars for speed; hits closer than a millimetre are the point's own faces.
     free = np.zeros(len(points))

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
-from scipy.special import logsumexp
 
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
@@ -82,6 +81,8 @@ class MultiViewStructures:
                 )
                 # A density over pixels: metres shrink as the scale grows.
                 evidence[row, column] -= (len(index) - 2) * np.log(factor)
+        from scipy.special import logsumexp  # loaded here: most who draw or track a puppet know its view
+
         total = logsumexp(evidence, axis=1) + np.log(self.prior)
         return np.asarray(np.exp(total - logsumexp(total)))
 

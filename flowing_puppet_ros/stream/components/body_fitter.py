@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings, Progress
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.scans.scan_frame import parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.track.scene_tracker import (
     RegionSettings,
@@ -19,7 +19,12 @@ from flowing_puppet_ros.body.track.scene_tracker import (
     SceneTracker,
     crop_to_region,
 )
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
+from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
+from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
+from flowing_puppet_ros.fusion.tracker import FusedTracker
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.settings import nested, setting
@@ -28,7 +33,7 @@ from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyO
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriSettings
 from flowing_puppet_ros.stream.components.silhouette_bodies import SilhouetteBodies
 from flowing_puppet_ros.stream.depth_pairs import DepthPairs
-from flowing_puppet_ros.stream.messages.clouds import decode_cloud
+from flowing_puppet_ros.stream.messages.clouds import decode_pixels
 from flowing_puppet_ros.stream.messages.depth import make_depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.message_types import (
@@ -36,16 +41,22 @@ from flowing_puppet_ros.stream.messages.message_types import (
     CAMERA_INFO,
     IMAGE,
     POINT_CLOUD,
+    PUPPETS,
     SILHOUETTES,
+    TRANSFORMS,
     MessageFactory,
 )
 from flowing_puppet_ros.stream.messages.puppets import JointPosition, decode_body_joints, make_bodies, make_body
+from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
 from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 
 OPTICAL = re.compile(r"optical(_frame)?$")
 """Frames that look along z with y down (REP-103)."""
 ASSUMED_INTERVAL_NS = 100_000_000
 """Between clouds whose stamps do not advance (drivers that stamp nothing)."""
+COLOUR_PORTS = ("puppets", "puppets/camera_info", "/tf_static")
+MIN_OUTSIDE_SHARE = 0.1
+"""Of a cloud's points, outside of the camera's view, from which on people are found there without puppets."""
 MIN_CAMERA_DISTANCE_M = 0.1
 MAX_FIELD_OF_VIEW = 1.2  # tangent of half of it: 100 degrees from side to side
 
@@ -65,6 +76,7 @@ class BodyFitterSettings(SceneSettings):
         1, "clouds to wait for late initial joints before fitting a cloud without them", low=0, high=50, advanced=True
     )
     region: RegionSettings = nested(RegionSettings)
+    fusion: FusionSettings = nested(FusionSettings)
     fitter: FitterSettings = nested(FitterSettings)
     silhouettes: SilhouetteFitterSettings = nested(SilhouetteFitterSettings)
     output: BodyOutputSettings = nested(BodyOutputSettings)
@@ -85,6 +97,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         Port("points", POINT_CLOUD, "sensor"),
         Port("depth", IMAGE, "sensor", transport=COMPRESSED_DEPTH),
         Port("camera_info", CAMERA_INFO, "sensor"),
+        Port("puppets", PUPPETS, optional=True),
+        Port("puppets/camera_info", CAMERA_INFO, "sensor", optional=True),
+        Port("/tf_static", TRANSFORMS, "latched", optional=True),
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),
     )
@@ -96,6 +111,10 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._model = StitchedPuppet.load(settings.model)
         self._fitter = BodyFitter(self._model, settings.fitter)
         self._scene = SceneTracker(self._fitter, settings, self.report)
+        self._fused = FusedTracker(
+            PeopleFitter(self._fitter, settings.fusion), settings.tracker, settings.tracker.hold, self.report
+        )
+        self._puppets = PuppetPairs(self._model, settings.fusion)
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
         self._depth = DepthPairs(self.report)
         self._up_of_nameless = ""
@@ -113,6 +132,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""
         self._silhouettes.reset()
         self._scene.reset()
+        self._fused.reset()
+        self._puppets.reset()
         self._depth.reset()
         self._line.clear()
         self._initial.clear()
@@ -121,37 +142,48 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def flush(self) -> Output:
         """Fit the clouds that still wait."""
-        return self._fit_depth(self._depth.flush()) + self._release(final=True)
+        return self._fit_depth(self._depth.flush()) + self._release(final=True) + self._publish_silhouettes()
 
     def fit(
         self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None
-    ) -> tuple[Any, list[tuple[str, BodyFit]]]:
+    ) -> tuple[Any, list[TrackedBody]]:
         """Fit the bodies in a PointCloud2 message: those in `initial` (a BodyArray), else those of the scene, else one.
 
-        Nothing of other clouds is used or changed. Returns the BodyArray message and (id, fit) of each of its bodies,
-        in the cloud's frame. InputError in one sentence when the cloud cannot be used.
+        Nothing of other clouds is used or changed. Returns the BodyArray message and its bodies, in the cloud's frame.
+        InputError in one sentence when the cloud cannot be used.
         """
         scene, to_z_up = self._decode(cloud, of_depth=False)
         if initial is not None and initial.bodies:
-            fits = self._fit_initial(scene, to_z_up, initial, seed, progress)
+            bodies = self._fit_initial(scene, to_z_up, initial, seed, progress)
         else:
-            fits = self._scene.fit_once(scene, seed, progress)
-        fits = [(identity, _rotate_fit(fit, to_z_up.T)) for identity, fit in fits]
-        bodies = [make_body(self.factory, identity, self._model, fit) for identity, fit in fits]
-        return make_bodies(self.factory, cloud.header, bodies), fits
+            bodies = self._publish_ids(self._scene.fit_once(scene, seed, progress))
+        bodies = [body.rotate(to_z_up.T) for body in bodies]
+        messages = [make_body(self.factory, self._model, body) for body in bodies]
+        return make_bodies(self.factory, cloud.header, messages), bodies
+
+    def _step_scene(self, scene: SceneCloud, seed: int) -> tuple[list[TrackedBody], list[str]]:
+        """Return the bodies of everybody in a cloud alone, and the ids of those out of sight."""
+        bodies, occluded = self._scene.step(scene, seed, self.background)
+        return self._publish_ids(bodies), [self.publish_id(own) for own in occluded]
+
+    def _publish_ids(self, bodies: list[TrackedBody]) -> list[TrackedBody]:
+        return [replace(body, id=self.publish_id(body.id)) for body in bodies]
 
     def _decode(self, cloud: Any, of_depth: bool) -> tuple[SceneCloud, F64]:
         """Return the points of a cloud message in the region of interest, z up, and the rotation (3, 3) to there.
 
         That of a depth image is seen from one side, in an optical frame, whatever its name, whose y axis points down.
         """
-        points, normals = decode_cloud(cloud)
+        points, normals, pixel = decode_pixels(cloud)
+        image = RangeImage.of_organised(points, pixel, (int(cloud.height), int(cloud.width)))
         inside = crop_to_region(points, self.settings.region)
         if not inside.all():
             points, normals = points[inside], None if normals is None else normals[inside]
+            image = image and image.take(inside)
         to_z_up = rotation_to_z_up(parse_axis(self._find_up(cloud.header.frame_id, points, of_depth)))
         rotated = None if normals is None else normals @ to_z_up.T
-        return SceneCloud(points @ to_z_up.T, rotated, stamp_ns(cloud), of_depth), to_z_up
+        image = image and image.turn(to_z_up)
+        return SceneCloud(points @ to_z_up.T, rotated, stamp_ns(cloud), of_depth, image), to_z_up
 
     def _find_up(self, frame: str, points: F64, of_depth: bool) -> str:
         """Return the axis that is up in a frame; for one without a name the first cloud decides."""
@@ -172,21 +204,23 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def _fit_initial(
         self, scene: SceneCloud, to_z_up: F64, initial: Any, seed: int, progress: Progress | None = None
-    ) -> list[tuple[str, BodyFit]]:
+    ) -> list[TrackedBody]:
         """Fit each of the bodies in `initial` to the whole cloud, from its joints."""
         viewpoint = np.zeros(3) if self.settings.view == "single" or scene.single_view else None
-        fits = []
+        field = scene.image.make_field(slice(None)) if scene.image is not None and viewpoint is not None else None
+        bodies = []
         for number, body in enumerate(initial.bodies, start=1):
             fit = self._fitter.fit(
                 scene.points,
                 scene.normals,
                 initial=_rotate_joints(decode_body_joints(body), to_z_up),
                 viewpoint=viewpoint,
+                field=field,
                 seed=seed,
                 progress=progress,
             )
-            fits.append((body.id or f"b{number}", fit))
-        return sorted(fits, key=lambda pair: id_sort_key(pair[0]))
+            bodies.append(TrackedBody(body.id or self.publish_id(f"b{number}"), fit))
+        return sorted(bodies, key=lambda body: id_sort_key(body.id))
 
     def seed_of(self, stamp: int) -> int:
         """Return the seed of the fit to the cloud of a stamp (nanoseconds)."""
@@ -197,6 +231,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             return self._fit_silhouettes(message)
         if port in ("depth", "camera_info"):
             return self._fit_depth(self._depth.add(port, message))
+        if port in COLOUR_PORTS:
+            self._puppets.add(port, message)
+            return self._release(final=False)
         stamp = stamp_ns(message)
         if port == "points":
             self._line.waiting.append((stamp, (message, False)))
@@ -224,30 +261,70 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         while self._line.waiting:
             stamp, (cloud, of_depth) = self._line.waiting[0]
             initial = self._initial.get(stamp)
-            crowded = len(self._line.waiting) > self.settings.wait
-            if not (final or crowded or initial is not None or "initial" not in self._expected):
+            if not (final or self._is_ready(stamp, initial)):
                 break
             self._line.pop()
             self._initial.drop_until(stamp)
             outputs += self._fit_one(stamp, cloud, of_depth, initial)
         return outputs
 
+    def _is_ready(self, stamp: int, initial: Any | None) -> bool:
+        """Return whether all that is expected for the first cloud in line is there, or it has waited long enough."""
+        waiting = len(self._line.waiting) - 1
+        if "initial" in self._expected and initial is None and waiting < self.settings.wait:
+            return False
+        puppets = "puppets" in self._expected and waiting < self.settings.fusion.wait
+        return not puppets or self._puppets.is_ready(stamp)
+
     def _fit_one(self, stamp: int, cloud: Any, of_depth: bool, initial: Any | None) -> Output:
         self.counters["clouds"] += 1
-        fits: list[tuple[str, BodyFit]] = []
+        bodies: list[TrackedBody] = []
         occluded: list[str] = []
         try:
             scene, to_z_up = self._decode(cloud, of_depth)
             scene = replace(scene, stamp=self._advance_clock(stamp))
             if initial is not None and initial.bodies:
-                fits = self._fit_initial(scene, to_z_up, initial, self.seed_of(stamp))
+                bodies = self._fit_initial(scene, to_z_up, initial, self.seed_of(stamp))
             else:
-                fits, occluded = self._scene.step(scene, self.seed_of(stamp), self.background)
-            fits = [(identity, _rotate_fit(fit, to_z_up.T)) for identity, fit in fits]
+                bodies, occluded = self._fit_scene(scene, cloud.header, stamp, to_z_up)
+            bodies = [body.rotate(to_z_up.T) for body in bodies]
         except InputError as error:
             self.report.count_unusable(error)
-        self.counters["bodies"] += len(fits)
-        return self._outputs.make(cloud.header, fits, occluded, self._subscribed)
+        self.counters["bodies"] += len(bodies)
+        return self._outputs.make(cloud.header, bodies, occluded, self._subscribed)
+
+    def _fit_scene(
+        self, scene: SceneCloud, header: Any, stamp: int, to_z_up: F64
+    ) -> tuple[list[TrackedBody], list[str]]:
+        """Return the bodies of everybody, and the ids of those out of sight: with a camera's puppets, or without.
+
+        Where the camera looks, only who has a puppet has a body. Elsewhere people are found in the cloud alone.
+        """
+        seed = self.seed_of(stamp)
+        if "puppets" not in self._expected or not self.settings.scene:
+            return self._step_scene(scene, seed)
+        try:
+            paired = self._puppets.find(header, stamp, to_z_up)
+        except InputError as error:
+            self.report.warn(str(error))
+            self.counters["clouds without puppets"] += 1
+            return self._step_scene(scene, seed)
+        self._puppets.drop_until(stamp)
+        self._scene.check(scene)
+        seen = SeenCloud.of(scene.points, paired.camera)
+        image = scene.image or RangeImage.of_scan(scene.points, np.zeros(3))
+        bodies, own = self._fused.step(seen, image, paired.puppets, scene.stamp)
+        occluded = self._fused.occluded_ids
+        if paired.puppets and not own.any():
+            self.report.warn(
+                f"none of the {len(paired.puppets)} puppets lies on the cloud: nobody is near enough to the sensor, or "
+                "camera and cloud do not belong together"
+            )
+        outside = ~seen.in_view & ~own
+        if outside.mean() > MIN_OUTSIDE_SHARE:
+            others, hidden = self._step_scene(scene.take(outside), seed)
+            bodies, occluded = [*bodies, *others], [*occluded, *hidden]
+        return bodies, occluded
 
     def _advance_clock(self, stamp: int) -> int:
         """Return the time of a cloud, ns: its stamp, or some time after the cloud before it if that has the same."""
@@ -261,15 +338,20 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         return self._clock[1]
 
     def _fit_silhouettes(self, message: Any) -> Output:
+        """Fit one person; bodies go out together when the last one of the same images is there."""
         self.counters["silhouettes"] += 1
-        fits: list[tuple[str, BodyFit]] = []
+        outputs = self._publish_silhouettes() if self._silhouettes.is_other_instant(message) else []
         try:
-            fits.append(self._silhouettes.fit(message))
+            self._silhouettes.add(message)
         except InputError as error:
             self.report.count_unusable(error)
-        self.counters["bodies"] += len(fits)
-        self.counters["doubtful bodies"] += sum(not fit.reliable for _, fit in fits)
-        return self._outputs.make(message.header, fits, subscribed=self._subscribed)
+        return outputs + (self._publish_silhouettes() if self._silhouettes.is_complete else [])
+
+    def _publish_silhouettes(self) -> Output:
+        header, bodies = self._silhouettes.collect()
+        self.counters["bodies"] += len(bodies)
+        self.counters["doubtful bodies"] += sum(not body.fit.reliable for body in bodies)
+        return self._outputs.make(header, bodies, subscribed=self._subscribed) if header is not None else []
 
 
 def is_ahead_along_z(points: F64) -> bool:
@@ -286,8 +368,3 @@ def is_ahead_along_z(points: F64) -> bool:
 def _rotate_joints(joints: dict[str, JointPosition], rotation: F64) -> dict[str, JointPosition]:
     places = {name: rotation @ np.array(joint[:3]) for name, joint in joints.items()}
     return {name: (float(p[0]), float(p[1]), float(p[2]), joints[name][3]) for name, p in places.items()}
-
-
-def _rotate_fit(fit: BodyFit, rotation: F64) -> BodyFit:
-    state = replace(fit.state, center=fit.state.center @ rotation.T, rotation=rotation @ fit.state.rotation)
-    return replace(fit, state=state, vertices=fit.vertices @ rotation.T, joints=fit.joints @ rotation.T)

@@ -12,10 +12,18 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import I64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.fit.visibility import Visibility
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import Output, Port
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, to_name_component
+from flowing_puppet_ros.stream.messages.bodies.people import (
+    PlacedPerson,
+    make_people,
+    make_person_pose,
+    make_place,
+)
 from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames, make_urdf
 from flowing_puppet_ros.stream.messages.bodies.shapes import (
     make_deletions,
@@ -26,11 +34,16 @@ from flowing_puppet_ros.stream.messages.bodies.shapes import (
 )
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import header_ns, make_transform
-from flowing_puppet_ros.stream.messages.message_types import BODIES, MESH, POINT_CLOUD, TRANSFORMS, MessageFactory
+from flowing_puppet_ros.stream.messages.message_types import (
+    BODIES,
+    MESH,
+    PEOPLE,
+    PERSON_POSE,
+    POINT_CLOUD,
+    TRANSFORMS,
+    MessageFactory,
+)
 from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_body
-
-BodyFits = Sequence[tuple[str, BodyFit]]
-"""(id, fit in the cloud's frame) for each body."""
 
 URDF_CHANGE_M = 0.02
 """Metres by which a joint must move in its parent link before a person's URDF is published again."""
@@ -51,6 +64,10 @@ class BodyOutputSettings(Settings):
         2000, "maximum number of triangles of a body in body_meshes; 0: all of the model", low=0, high=100000
     )
     part_frames: bool = setting(True, "publish a TF frame <part>_<id> for every part of a body")
+    frame_prefix: str = setting("", "in front of the names of TF frames, where robots share a tree", advanced=True)
+    person: str = setting(
+        "", "id of the person on `person_pose`; empty: the nearest to the frame's origin", advanced=True
+    )
 
 
 class BodyOutputs:
@@ -63,6 +80,8 @@ class BodyOutputs:
         Port("body_vertices", POINT_CLOUD, lazy=True),
         Port("body_topology", MESH, "latched"),
         Port("/tf", TRANSFORMS),
+        Port("people", PEOPLE, lazy=True, optional=True),
+        Port("person_pose", PERSON_POSE, lazy=True),
     )
 
     def __init__(
@@ -74,24 +93,26 @@ class BodyOutputs:
         self._model = model
         self._skeleton = Skeleton(model)
         self._urdf_origins: dict[str, dict[str, np.ndarray]] = {}
-        self.ros4hri = Ros4HriPublisher(ros4hri, factory, "joint_states", "urdf")
+        self.ros4hri = Ros4HriPublisher(ros4hri, factory, "joint_states", "urdf", "position", "velocity")
         self._marker_ids: dict[str, int] = {}
         self._marker_count = 0
         self._last_mesh_stamp: int | None = None
         self._topology_sent = False
 
     def make(
-        self, header: Any, fits: BodyFits, hidden: Collection[str] = (), subscribed: Collection[str] = ()
+        self, header: Any, bodies: Sequence[TrackedBody], hidden: Collection[str] = (), subscribed: Collection[str] = ()
     ) -> Output:
-        """Return everything to publish for one cloud, whose stamp and frame are those of `header`.
+        """Return everything to publish for the `bodies` in one cloud, whose stamp and frame are those of `header`.
 
         `hidden` are the ids of people who are occluded: they have no body in this cloud but are not lost yet.
         `subscribed` are the lazy outputs that have subscribers.
         """
         factory = self._factory
-        alive = sorted({identity for identity, _ in fits} | set(hidden), key=id_sort_key)
-        bodies = [make_body(factory, identity, self._model, fit) for identity, fit in fits]
-        outputs: Output = [("bodies", make_bodies(factory, header, bodies))]
+        fits = [(body.id, body.fit) for body in bodies]
+        alive = sorted({body.id for body in bodies} | set(hidden), key=id_sort_key)
+        outputs: Output = [
+            ("bodies", make_bodies(factory, header, [make_body(factory, self._model, body) for body in bodies]))
+        ]
         if fits and not self._topology_sent:
             self._topology_sent = True
             outputs.append(("body_topology", make_topology(factory, self._model)))
@@ -104,9 +125,19 @@ class BodyOutputs:
         frames = [frame for identity, fit in fits for frame in self._make_transforms(header, identity, fit)]
         if frames:
             outputs.append(("/tf", factory.make(TRANSFORMS, transforms=frames)))
-        return outputs + (self._make_ros4hri(header, fits, alive) if self.ros4hri.enabled else [])
+        people = [self._place(body) for body in bodies]
+        if "people" in subscribed:
+            outputs.append(("people", make_people(factory, header, people)))
+        pose = make_person_pose(factory, header, people, self._settings.person) if "person_pose" in subscribed else None
+        if pose is not None:
+            outputs.append(("person_pose", pose))
+        return outputs + (self._make_ros4hri(header, fits, people, alive) if self.ros4hri.enabled else [])
 
-    def _make_mesh_markers(self, header: Any, fits: BodyFits, alive: Collection[str]) -> list[Any]:
+    def _place(self, body: TrackedBody) -> PlacedPerson:
+        origin, rotation = self._skeleton.body_frame(body.fit.joints, body.fit.state)
+        return PlacedPerson(body.id, origin, rotation, body.velocity, body.fit.confidence)
+
+    def _make_mesh_markers(self, header: Any, fits: Sequence[tuple[str, BodyFit]], alive: Collection[str]) -> list[Any]:
         """Return deletions of lost people at once, and meshes of the others no more often than is set."""
         lost = [self._marker_ids.pop(identity) for identity in list(self._marker_ids) if identity not in alive]
         markers = make_deletions(self._factory, header, lost)
@@ -122,14 +153,15 @@ class BodyOutputs:
                 self._marker_count += 1
                 self._marker_ids[identity] = self._marker_count
             number = self._marker_ids[identity]
-            markers.append(make_mesh_marker(self._factory, header, number, self._preview_faces, fit.vertices))
+            inferred = fit.visibility.vertices == Visibility.INFERRED
+            markers.append(make_mesh_marker(self._factory, header, number, self._preview_faces, fit.vertices, inferred))
         return markers
 
     @cached_property
     def _preview_faces(self) -> I64:
         return preview_faces(self._model, self._settings.max_mesh_triangles)
 
-    def _make_vertex_cloud(self, header: Any, fits: BodyFits) -> Any:
+    def _make_vertex_cloud(self, header: Any, fits: Sequence[tuple[str, BodyFit]]) -> Any:
         """Return all vertices as an organised cloud: one row per body, in the order of `bodies`."""
         cloud = make_cloud(self._factory, header, np.vstack([fit.vertices for _, fit in fits]))
         cloud.height, cloud.width = len(fits), len(fits[0][1].vertices)
@@ -141,7 +173,8 @@ class BodyOutputs:
         factory = self._factory
         origin, rotation = self._skeleton.body_frame(fit.joints, fit.state)
         identity = to_name_component(identity)
-        frames = [make_transform(factory, header, f"body_{identity}", origin, rotation)]
+        body_name = f"{self._settings.frame_prefix}body_{identity}"
+        frames = [make_transform(factory, header, body_name, origin, rotation)]
         frames_in_body = {}
         if self.ros4hri.enabled:
             angles = self._skeleton.joint_angles(fit.joints, fit.state)
@@ -152,18 +185,26 @@ class BodyOutputs:
             frames_in_body |= {
                 name: (rotation.T @ (center - origin), rotation.T @ part) for name, center, part in parts
             }
-        body_header = factory.make("std_msgs/msg/Header", stamp=header.stamp, frame_id=f"body_{identity}")
+        body_header = factory.make("std_msgs/msg/Header", stamp=header.stamp, frame_id=body_name)
         return frames + [
-            make_transform(factory, body_header, f"{name}_{identity}", position, orientation)
+            make_transform(
+                factory, body_header, f"{self._settings.frame_prefix}{name}_{identity}", position, orientation
+            )
             for name, (position, orientation) in frames_in_body.items()
         ]
 
-    def _make_ros4hri(self, header: Any, fits: BodyFits, alive: Sequence[str]) -> Output:
+    def _make_ros4hri(
+        self,
+        header: Any,
+        fits: Sequence[tuple[str, BodyFit]],
+        people: Sequence[PlacedPerson],
+        alive: Sequence[str],
+    ) -> Output:
         messages: dict[str, dict[str, Any]] = {}
         self._urdf_origins = {
             identity: origins for identity, origins in self._urdf_origins.items() if identity in alive
         }
-        for identity, fit in fits:
+        for (identity, fit), person in zip(fits, people, strict=True):
             angles = self._skeleton.joint_angles(fit.joints, fit.state)
             messages[identity] = {
                 "joint_states": self._factory.make(
@@ -171,7 +212,8 @@ class BodyOutputs:
                     header=header,
                     name=[f"{name}_{to_name_component(identity)}" for name in MOVING_JOINTS],
                     position=np.array([angles[name] for name in MOVING_JOINTS]),
-                )
+                ),
+                **make_place(self._factory, header, person),
             }
             origins, known = self._skeleton.joint_origins(fit.state.shape), self._urdf_origins.get(identity)
             if known is None or max(np.linalg.norm(origins[name] - known[name]) for name in known) > URDF_CHANGE_M:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -234,7 +234,8 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
             return None
 
     def _publish(self, header: Any, earlier: Any, image: U8, result: TrackResult) -> Output:
-        puppets = make_puppets(self.factory, header, self._model, result.puppets)
+        named = [replace(puppet, id=self.publish_id(puppet.id)) for puppet in result.puppets]
+        puppets = make_puppets(self.factory, header, self._model, named)
         outputs: Output = [("puppets", puppets)]
         if self._humans.enabled:
             made = make_image_messages(self.factory, header, image, puppets.puppets)

@@ -63,7 +63,7 @@ def parameter_yaml(name: str) -> str:
         "# SPDX-License-Identifier: Apache-2.0",
         f"# Parameters of the node {name} at their defaults; `make config` writes this file from the settings.",
         "# Advanced parameters, which the documentation lists, can be set in the same way.",
-        f"/**/{name}:",
+        "/**:",
         "  ros__parameters:",
     ]
     parts: list[str] = []

@@ -24,6 +24,8 @@ PERSON_TOPICS = {
     "skeleton2d": (_HRI + "Skeleton2D", "reliable"),
     "joint_states": ("sensor_msgs/msg/JointState", "reliable"),
     "urdf": ("std_msgs/msg/String", "latched"),
+    "position": ("geometry_msgs/msg/PointStamped", "reliable"),
+    "velocity": ("geometry_msgs/msg/TwistStamped", "reliable"),
 }
 """Topics of a person below `bodies/<id>`: type and QoS."""
 CLIPPED_CONFIDENCE = 0.1

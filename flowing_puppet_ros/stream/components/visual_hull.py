@@ -3,17 +3,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
+from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.multiview.association.people_tracker import PersonInSpace
+from flowing_puppet_ros.multiview.association.settings import AssociationSettings
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.hull_builder import HullBuilder, HullBuilderSettings, MultiViewPerson
-from flowing_puppet_ros.multiview.visual_hull import MIN_VIEWS
-from flowing_puppet_ros.settings import setting
+from flowing_puppet_ros.settings import nested, setting
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
 from flowing_puppet_ros.stream.components import warm_up
-from flowing_puppet_ros.stream.components.person_views import PersonView, match_person, observe_person
+from flowing_puppet_ros.stream.components.person_views import (
+    CameraFrame,
+    PersonMatcher,
+    learn_background,
+    observe_person,
+)
 from flowing_puppet_ros.stream.messages.bodies.silhouettes import make_silhouettes
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header, stamp_ns
@@ -47,10 +57,11 @@ class VisualHullSettings(HullBuilderSettings):
     hull_every: int = setting(
         6, "sets of images with a person from one hull to the next; every set gives silhouettes", low=1, high=9999
     )
+    association: AssociationSettings = nested(AssociationSettings)
 
 
 class VisualHullComponent(Component[VisualHullSettings]):
-    """Segments one person in the images, carves its hull, and triangulates its joints from the puppets."""
+    """Finds people across the cameras, segments each, triangulates its joints from the puppets, and carves its hull."""
 
     settings_type = VisualHullSettings
     fixed = frozenset({"cameras"})
@@ -71,6 +82,7 @@ class VisualHullComponent(Component[VisualHullSettings]):
             Port("/tf_static", TRANSFORMS, "latched"),
         )
         self._builder = HullBuilder(settings)
+        self._matcher = PersonMatcher(settings.association, settings.triangulation)
         self._frame_tree = FrameTree()
         self._infos: dict[str, Any] = {}
         self._camera_sync = {name: TimeSynchronizer(_CAMERA_TOPICS) for name in self._camera_names}
@@ -89,8 +101,9 @@ class VisualHullComponent(Component[VisualHullSettings]):
             other.handle(port, message)
 
     def reset(self) -> None:
-        """Drop the backgrounds and what waits; keep calibrations and frames."""
+        """Drop the backgrounds, the people and what waits; keep calibrations and frames. Ids go on."""
         self._builder.reset()
+        self._matcher.reset()
         for synchronizer in (*self._camera_sync.values(), self._set_sync):
             synchronizer.reset()
         self._last_stamp = None
@@ -129,26 +142,41 @@ class VisualHullComponent(Component[VisualHullSettings]):
         stamp = next(iter(complete.values()))[0]
         if self._last_stamp is not None and stamp < self._last_stamp:
             self._builder.reset()
+            self._matcher.reset()
             self.counters["restarts"] += 1
             self._person_sets = 0
         self._last_stamp = stamp
         self.counters["sets"] += 1
-        views = self._observe(complete, self._calibrate_cameras(complete))
-        if len(views) < MIN_VIEWS:
+        cameras = self._calibrate_cameras(complete)
+        frames = self._decode_frames(complete, cameras)
+        people = self._matcher.match(stamp, cameras, frames)
+        if not people:
             return []
         self._person_sets += 1
         carve = self._person_sets % self.settings.hull_every == 0
         if not carve and "silhouettes" not in self._subscribed:
             return []
-        person = self._builder.segment({name: view.observation for name, view in views.items()})
+        segmented = [(person.id, self._segment(frames, person, puppets)) for person, puppets in people]
         header = make_header(self.factory, stamp, self._frame)
-        names = next(iter(views.values())).joint_names
-        joints = make_joints(self.factory, names, person.joints, person.confidence)
+        bodies = [self._make_body(self.publish_id(identity), person) for identity, person in segmented]
+        headers = {name: complete[name][1]["image"].header for name in frames}
+        outputs = self._make_silhouettes(header, bodies, [person for _, person in segmented], headers)
+        return outputs + self._make_hull(header, bodies, [person for _, person in segmented]) if carve else outputs
+
+    def _segment(
+        self, frames: Mapping[str, CameraFrame], person: PersonInSpace, puppets: Mapping[str, Any]
+    ) -> MultiViewPerson:
+        views = {
+            name: observe_person(self._builder, name, frames[name], puppet, person) for name, puppet in puppets.items()
+        }
+        return self._builder.segment(views, person.id)
+
+    def _make_body(self, identity: str, person: MultiViewPerson) -> Any:
+        names = self._matcher.joint_names
+        seen = [Visibility.SEEN] * len(names)
+        joints = make_joints(self.factory, names, person.joints, person.confidence, seen)
         confidence = float(person.confidence.mean())
-        body = self.factory.make("flowing_puppet_msgs/msg/Body", id="b1", confidence=confidence, joints=joints)
-        headers = {name: complete[name][1]["image"].header for name in views}
-        outputs = self._make_silhouettes(header, body, person, headers)
-        return outputs + self._make_hull(header, body, person) if carve else outputs
+        return self.factory.make("flowing_puppet_msgs/msg/Body", id=identity, confidence=confidence, joints=joints)
 
     def _calibrate_cameras(self, complete: dict[str, tuple[int, Any]]) -> dict[str, Camera]:
         """Return the calibrated cameras of a set; the others are warned of and left out."""
@@ -181,40 +209,56 @@ class VisualHullComponent(Component[VisualHullSettings]):
         except InputError as error:
             raise InputError(f"{name}: {error}") from error
 
-    def _observe(self, complete: dict[str, tuple[int, Any]], cameras: dict[str, Camera]) -> dict[str, PersonView]:
-        """Observe the main person in every camera that sees it; unusable images are warned of and left out."""
-        people = {name: list(complete[name][1]["puppets"].puppets) for name in cameras}
-        chosen = match_person(cameras, people, self.settings.triangulation)
-        views = {}
-        for name, puppet in chosen.items():
+    def _decode_frames(
+        self, complete: dict[str, tuple[int, Any]], cameras: Mapping[str, Camera]
+    ) -> dict[str, CameraFrame]:
+        """Decode the images in which there are puppets and learn their backgrounds; unusable ones are left out."""
+        frames = {}
+        for name in cameras:
             item = complete[name][1]
+            if not item["puppets"].puppets:
+                continue
             try:
                 image, labels = decode_image(item["image"]), decode_labels(item["part_labels"])
-                views[name] = observe_person(self._builder, name, image, labels, puppet)
+                frames[name] = CameraFrame(image, labels, list(item["puppets"].puppets))
+                learn_background(self._builder, name, frames[name])
             except InputError as error:
+                frames.pop(name, None)
                 self.report.count_unusable(error)
-        return views
+        return frames
 
-    def _make_silhouettes(self, header: Any, body: Any, person: MultiViewPerson, headers: dict[str, Any]) -> Output:
+    def _make_silhouettes(
+        self, header: Any, bodies: Sequence[Any], people: Sequence[MultiViewPerson], headers: dict[str, Any]
+    ) -> Output:
         if "silhouettes" not in self._subscribed:
             return []
-        if person.problem:
-            self.report.warn(person.problem)
-            self.counters["sets without silhouettes"] += 1
-            return []
-        self.counters["silhouettes"] += 1
-        cameras = self._builder.cameras
-        return [("silhouettes", make_silhouettes(self.factory, header, body, cameras, person.masks, headers))]
+        usable = []
+        for body, person in zip(bodies, people, strict=True):
+            if person.problem:
+                self.report.warn(person.problem)
+                self.counters["sets without silhouettes"] += 1
+            else:
+                usable.append((body, person))
+        self.counters["silhouettes"] += len(usable)
+        cameras, ids = self._builder.cameras, [body.id for body, _ in usable]
+        return [
+            ("silhouettes", make_silhouettes(self.factory, header, body, cameras, person.masks, headers, ids))
+            for body, person in usable
+        ]
 
-    def _make_hull(self, header: Any, body: Any, person: MultiViewPerson) -> Output:
-        outputs: Output = [("hull/joints", make_bodies(self.factory, header, [body] if body.joints else []))]
-        hull = self._builder.carve(person)
-        if hull.problem:
-            self.report.warn(hull.problem)
-            self.counters["sets without hull"] += 1
-        else:
-            self.counters["hulls"] += 1
-            outputs.append(("hull", make_cloud(self.factory, header, hull.points, hull.normals)))
+    def _make_hull(self, header: Any, bodies: Sequence[Any], people: Sequence[MultiViewPerson]) -> Output:
+        outputs: Output = [("hull/joints", make_bodies(self.factory, header, [body for body in bodies if body.joints]))]
+        hulls = [self._builder.carve(person) for person in people]
+        for hull in hulls:
+            if hull.problem:
+                self.report.warn(hull.problem)
+                self.counters["sets without hull"] += 1
+        carved = [hull for hull in hulls if not hull.problem]
+        self.counters["hulls"] += len(carved)
+        if carved:
+            points = np.concatenate([hull.points for hull in carved])
+            normals = np.concatenate([hull.normals for hull in carved])
+            outputs.append(("hull", make_cloud(self.factory, header, points, normals)))
         return outputs
 
 

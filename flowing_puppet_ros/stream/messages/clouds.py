@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, Array
+from flowing_puppet_ros.arrays import F64, I64, Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory, message_bytes
 
@@ -20,11 +20,16 @@ _NORMALS = ("normal_x", "normal_y", "normal_z")
 
 
 def decode_cloud(message: Any) -> tuple[F64, F64 | None]:
-    """Return the finite points (N, 3) in metres and, when the cloud has normal_x/y/z, their normals (N, 3).
+    """Return points and normals as `decode_pixels` does, without their places in the cloud."""
+    return decode_pixels(message)[:2]
 
-    An organised cloud is flattened. Points with a NaN, infinite or absurd coordinate are left out, whatever `is_dense`
-    says; a normal that is not finite becomes zero. InputError if there are no x, y, z fields or the data does not fit
-    the sizes in the message.
+
+def decode_pixels(message: Any) -> tuple[F64, F64 | None, I64]:
+    """Return the finite points (N, 3) in metres, their normals (N, 3) if any, and their places (N,) in the cloud.
+
+    An organised cloud is flattened, row after row. Points with a NaN, infinite or absurd coordinate are left out,
+    whatever `is_dense` says; a normal that is not finite becomes zero. InputError if there are no x, y, z fields or the
+    data does not fit the sizes in the message.
     """
     types = {field.name: field for field in message.fields}
     missing = [name for name in "xyz" if name not in types]
@@ -35,10 +40,11 @@ def decode_cloud(message: Any) -> tuple[F64, F64 | None]:
     good = np.isfinite(points).all(axis=1)
     if good.any():
         good[good] = np.abs(points[good] - np.median(points[good], axis=0)).max(axis=1) < _MAX_DISTANCE_M
+    places = np.flatnonzero(good)
     if not all(name in types for name in _NORMALS):
-        return points[good], None
+        return points[good], None, places
     normals = np.stack([records[name].astype(float) for name in _NORMALS], axis=1)[good]
-    return points[good], np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
+    return points[good], np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0), places
 
 
 def _read_records(message: Any, fields: dict[str, Any]) -> Array:
@@ -66,7 +72,11 @@ def _read_records(message: Any, fields: dict[str, Any]) -> Array:
 
 
 def make_cloud(factory: MessageFactory, header: Any, points: Array, normals: Array | None = None) -> Any:
-    """Return a dense, unorganised float32 PointCloud2 of `points` (N, 3) in metres and their `normals` (N, 3)."""
+    """Return a float32 PointCloud2 of `points` (N, 3) in metres and their `normals` (N, 3).
+
+    Points (H, W, 3) make an organised cloud, with NaN where nothing is known.
+    """
+    height = points.shape[0] if points.ndim == 3 else 1
     columns = [np.asarray(points, np.float32).reshape(-1, 3)]
     names = ["x", "y", "z"]
     if normals is not None:
@@ -80,12 +90,12 @@ def make_cloud(factory: MessageFactory, header: Any, points: Array, normals: Arr
     return factory.make(
         "sensor_msgs/msg/PointCloud2",
         header=header,
-        height=1,
-        width=len(table),
+        height=height,
+        width=len(table) // height,
         fields=fields,
         is_bigendian=False,
         point_step=4 * len(names),
-        row_step=4 * len(names) * len(table),
+        row_step=4 * len(names) * (len(table) // height),
         data=table.reshape(-1).view(np.uint8),
-        is_dense=True,
+        is_dense=height == 1,
     )

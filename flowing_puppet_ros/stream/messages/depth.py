@@ -19,11 +19,18 @@ MAX_POINTS = 80_000
 
 
 def back_project(depth: F32, info: Any) -> F32:
-    """Return the points (N, 3) in metres of `depth` (H, W), metres, NaN unknown, in the camera's optical frame.
+    """Return the points (N, 3) in metres of the known pixels of a depth image; see `back_project_image`."""
+    points = back_project_image(depth, info)
+    return points[np.isfinite(points[:, :, 2])]
+
+
+def back_project_image(depth: F32, info: Any) -> F32:
+    """Return the points (h, w, 3) in metres of `depth` (H, W), metres, NaN unknown, in the camera's optical frame.
 
     The image is rectified, as REP-118 images are: pixel (u, v) at depth z lies at ((u - cx) z / fx, (v - cy) z / fy, z)
     with the projection matrix `p` of the CameraInfo, or its `k` when `p` is not given. x is right, y down, z forward
-    (REP-103). InputError if the camera is not calibrated, or calibrated for another image size.
+    (REP-103). Of a large image every n-th pixel of every n-th row is taken. InputError if the camera is not calibrated,
+    or calibrated for another image size.
     """
     height, width = depth.shape
     if (int(info.width), int(info.height)) != (width, height):
@@ -34,7 +41,7 @@ def back_project(depth: F32, info: Any) -> F32:
     z = depth[np.ix_(rows, columns)]
     right = ((columns - cx) / fx).astype(np.float32)[None, :] * z
     down = ((rows - cy) / fy).astype(np.float32)[:, None] * z
-    return np.stack([right, down, z], axis=2)[np.isfinite(z)]
+    return np.stack([right, down, z], axis=2)
 
 
 def _read_pinhole(info: Any) -> tuple[float, float, float, float]:
@@ -52,7 +59,7 @@ def _read_pinhole(info: Any) -> tuple[float, float, float, float]:
 
 
 def make_depth_cloud(factory: MessageFactory, image: Any, info: Any) -> Any:
-    """Return the PointCloud2 message of a depth Image and its CameraInfo; InputError if that is None."""
+    """Return the organised PointCloud2 message of a depth Image and its CameraInfo; InputError if that is None."""
     if info is None:
         raise InputError("no camera_info came yet: a depth image cannot be used without it; publish or remap it")
-    return make_cloud(factory, image.header, back_project(decode_depth(image), info))
+    return make_cloud(factory, image.header, back_project_image(decode_depth(image), info))

@@ -46,6 +46,11 @@ def make_point(factory: MessageFactory, xyz: Sequence[float] | Array) -> Any:
     return factory.make("geometry_msgs/msg/Point", x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
 
 
+def make_vector(factory: MessageFactory, xyz: Sequence[float] | Array) -> Any:
+    """Return a geometry_msgs/Vector3."""
+    return factory.make("geometry_msgs/msg/Vector3", x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
+
+
 def rotation_matrix(q: Sequence[float] | Array) -> F64:
     """Return the rotation matrix (3, 3) of a quaternion (x, y, z, w) of any non-zero length; InputError otherwise."""
     length = math.sqrt(sum(float(c) ** 2 for c in q))
@@ -78,14 +83,13 @@ def make_pose(factory: MessageFactory, position: Array, rotation: Array) -> Any:
 
 def make_transform(factory: MessageFactory, header: Any, child: str, position: Array, rotation: Array) -> Any:
     """Return a TransformStamped: the pose (metres) of frame `child` in the frame of `header`."""
-    x, y, z = (float(c) for c in position)
     return factory.make(
         "geometry_msgs/msg/TransformStamped",
         header=header,
         child_frame_id=child,
         transform=factory.make(
             "geometry_msgs/msg/Transform",
-            translation=factory.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+            translation=make_vector(factory, position),
             rotation=make_quaternion(factory, rotation),
         ),
     )

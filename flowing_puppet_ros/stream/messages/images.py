@@ -4,6 +4,9 @@
 from __future__ import annotations
 
 import re
+from collections import deque
+from collections.abc import Callable
+from threading import Lock
 from typing import Any
 
 import cv2
@@ -72,8 +75,55 @@ _VIDEO = {codec: re.compile(rf"(?<![a-z0-9])(?:{names})(?![0-9])") for codec, na
 _DEPTH = {"16uc1": ("u2", 0.001), "mono16": ("u2", 0.001), "32fc1": ("f4", 1.0)}
 
 
+class SharedImages:
+    """Images that several components decode: once for all, while they are among the newest `max_images`."""
+
+    def __init__(self, max_images: int) -> None:
+        """Keep at most `max_images` decoded images."""
+        self._max_images = max_images
+        self._kept: deque[SharedImage] = deque()
+
+    def share(self, message: Any, readers: int) -> SharedImage:
+        """Return an image message in a form that `decode_image` decodes once for that many readers."""
+        return SharedImage(message, readers, self._keep)
+
+    def _keep(self, image: SharedImage) -> None:
+        self._kept.append(image)
+        if len(self._kept) > self._max_images:
+            self._kept.popleft().forget()
+
+
+class SharedImage:
+    """An image message whose pixels are kept from its first reader to its last; nobody may change them."""
+
+    def __init__(self, message: Any, readers: int, keep: Callable[[SharedImage], None]) -> None:
+        """Wrap a message; `keep` is called with every image that holds pixels from now on."""
+        self.header = message.header
+        self._message, self._readers, self._keep = message, readers, keep
+        self._pixels: U8 | None = None
+        self._lock = Lock()
+
+    def decode(self) -> U8:
+        """Return the RGB image (H, W, 3); InputError when it cannot be decoded."""
+        with self._lock:
+            pixels = self._pixels
+            if pixels is None:
+                self._pixels = pixels = decode_image(self._message)
+                self._keep(self)
+            self._readers -= 1
+            if self._readers <= 0:
+                self.forget()
+            return pixels
+
+    def forget(self) -> None:
+        """Drop the pixels; who wants them decodes them again."""
+        self._pixels = None
+
+
 def decode_image(message: Any) -> U8:
     """Return the RGB image (H, W, 3) of an Image or a CompressedImage; InputError when it cannot be decoded."""
+    if isinstance(message, SharedImage):
+        return message.decode()
     if hasattr(message, "format"):
         return _decode_compressed(message)
     encoding = message.encoding.lower().strip()
@@ -90,9 +140,11 @@ def decode_image(message: Any) -> U8:
     if conversion is None:
         # Kernels are compiled for writeable arrays, which all other conversions return.
         return np.array(pixels)
+    if channels == 2 and pixels.shape[1] % 2:  # two pixels share their colours; not every OpenCV minds
+        raise _not_whole(message)
     try:
         return np.asarray(cv2.cvtColor(np.ascontiguousarray(pixels), conversion), np.uint8)
-    except cv2.error as error:  # packed formats need an even width, Bayer patterns two rows
+    except cv2.error as error:  # Bayer patterns need two rows
         raise _not_whole(message) from error
 
 
@@ -144,14 +196,14 @@ def find_video_codec(form: str) -> str:
 
 
 def _decode_file(data: U8, form: str) -> U8:
-    flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(data, flags) if len(data) else None
     except cv2.error:  # the header names more pixels than OpenCV accepts
         image = None
     if image is None:
         raise InputError(f"a compressed image of format {form!r} and {len(data)} bytes cannot be decoded")
-    return np.asarray(image, np.uint8)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def _read_rows(message: Any, channels: int, dtype: np.dtype[Any]) -> Array:

@@ -21,6 +21,8 @@ IDS_LIST = "hri_msgs/msg/IdsList"
 SKELETON_2D = "hri_msgs/msg/Skeleton2D"
 SILHOUETTES = "flowing_puppet_msgs/msg/SilhouetteSet"
 DETECTIONS_2D = "vision_msgs/msg/Detection2DArray"
+PEOPLE = "people_msgs/msg/People"
+PERSON_POSE = "geometry_msgs/msg/PoseStamped"
 ANNOTATIONS = "foxglove_msgs/msg/ImageAnnotations"
 
 

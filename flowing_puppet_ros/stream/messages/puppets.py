@@ -9,16 +9,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Array
-from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
+from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose, make_vector
 from flowing_puppet_ros.stream.messages.message_types import BODIES, PUPPETS, MessageFactory
 
 if TYPE_CHECKING:
-    from flowing_puppet_ros.body.fit.fitter import BodyFit
+    from flowing_puppet_ros.body.track.tracked_body import TrackedBody
     from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
     from flowing_puppet_ros.model.ds.puppet import DeformableStructures
     from flowing_puppet_ros.model.sp import StitchedPuppet
 
 _MESSAGES = "flowing_puppet_msgs/msg/"
+
+JOINT_CONFIDENCE = np.array([0.3, 0.8, 1.0])
+"""Confidence of a joint that is inferred, near the cloud, or seen, relative to that of the body."""
 
 type JointPosition = tuple[float, float, float, float]
 """x, y, z in metres, and a confidence in [0, 1]."""
@@ -66,11 +69,15 @@ def _make_puppet(factory: MessageFactory, model: DeformableStructures, puppet: T
     )
 
 
-def make_joints(factory: MessageFactory, names: Sequence[str], joints: Array, confidence: Array) -> list[Any]:
-    """Return the BodyJoints of `joints` (J, 3) in metres with `confidence` (J,); joints that are NaN are left out."""
+def make_joints(
+    factory: MessageFactory, names: Sequence[str], joints: Array, confidence: Array, visibility: Sequence[int] | Array
+) -> list[Any]:
+    """Return the BodyJoints of `joints` (J, 3) in metres with `confidence` (J,) and `Visibility` (J,), without NaN."""
     return [
-        factory.make(_MESSAGES + "BodyJoint", name=name, position=make_point(factory, xyz), confidence=c)
-        for name, xyz, c in zip(names, joints, confidence, strict=True)
+        factory.make(
+            _MESSAGES + "BodyJoint", name=name, position=make_point(factory, xyz), confidence=c, visibility=int(v)
+        )
+        for name, xyz, c, v in zip(names, joints, confidence, visibility, strict=True)
         if np.isfinite(xyz).all()
     ]
 
@@ -82,9 +89,9 @@ def decode_body_joints(body: Any) -> dict[str, JointPosition]:
     }
 
 
-def make_body(factory: MessageFactory, identity: str, model: StitchedPuppet, fit: BodyFit) -> Any:
-    """Return the Body message of a fit, in the frame of the points that it was fitted to."""
-    state = fit.state
+def make_body(factory: MessageFactory, model: StitchedPuppet, body: TrackedBody) -> Any:
+    """Return the Body message of a body of `model`, in the frame of the points that it was fitted to."""
+    fit, state = body.fit, body.fit.state
     parts = []
     for index, name in enumerate(model.tree.names):
         used = model.pose_basis[index].shape[-1]
@@ -96,16 +103,22 @@ def make_body(factory: MessageFactory, identity: str, model: StitchedPuppet, fit
                 shape_coefficients=state.shape[index],
                 pose_coefficients=state.pose[index, :used],
                 confidence=fit.part_confidence[index],
+                visibility=int(fit.visibility.parts[index]),
             )
         )
-    confidence = np.full(len(fit.joints), fit.confidence)
+    visibility = fit.visibility.joints
+    confidence = fit.confidence * JOINT_CONFIDENCE[visibility]
     return factory.make(
         _MESSAGES + "Body",
-        id=identity,
+        id=body.id,
+        state=int(body.status),
         model=model.name,
         energy=fit.energy,
         confidence=fit.confidence,
-        joints=make_joints(factory, model.joint_names, fit.joints, confidence),
+        reliable=fit.reliable,
+        height=model.measure_height(state.shape),
+        velocity=make_vector(factory, body.velocity),
+        joints=make_joints(factory, model.joint_names, fit.joints, confidence, visibility),
         parts=parts,
     )
 

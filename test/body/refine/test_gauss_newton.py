@@ -6,8 +6,11 @@ import numpy as np
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic, two_way_distance
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton, RefineWeights
+from flowing_puppet_ros.body.refine.joint_rows import JointRows
+from flowing_puppet_ros.body.refine.normal_equations import NormalEquations
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.model import rotation as so3
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 
 def test_a_further_term_draws_the_body_where_it_says() -> None:
@@ -49,3 +52,31 @@ def test_loose_parts_follow_a_foreign_surface_more_closely() -> None:
     loose = refiner.run(firm, cloud, none, LOOSE_STITCHING)
     apart = [two_way_distance(model.vertices(body), model.faces, cloud) for body in (start, firm, loose)]
     assert apart[2] < apart[1] - 0.0001 < apart[0]
+
+
+def test_derivatives_of_the_joints_are_those_of_small_steps() -> None:
+    """By the rotation and translation of each part in its own frame, by its pose and by the shape."""
+    model = StitchedPuppet.load("neutral")
+    equations, state = NormalEquations(model), model.sample(np.random.default_rng(2))
+    rows, chosen, small = JointRows(model, equations), np.array([0, 3, 7, len(model.joint_names) - 1]), 1e-6
+    derived = rows.derive(chosen, equations.pose_points(state), state.rotation)
+
+    def move(unknown: int, amount: float) -> np.ndarray:
+        center, rotation, pose, shape = (
+            array.copy() for array in (state.center, state.rotation, state.pose, state.shape)
+        )
+        part = int(np.searchsorted(equations.first, unknown, side="right")) - 1
+        place = unknown - int(equations.first[part])
+        if part == len(model.tree):
+            shape[:, place] += amount
+        elif place < 3:
+            rotation[part] = rotation[part] @ so3.exp(amount * np.eye(3)[place])
+        elif place < 6:
+            center[part] += amount * rotation[part][:, place - 3]
+        else:
+            pose[part, place - 6] += amount
+        return model.joints(model.vertices(BodyState(center, rotation, pose, shape)))[chosen]
+
+    stepped = [(move(unknown, small) - move(unknown, -small)) / (2 * small) for unknown in range(equations.size)]
+    np.testing.assert_allclose(derived, np.stack(stepped, axis=2), atol=1e-8)
+    assert (np.abs(derived).max(axis=(0, 1)) > 1e-3).sum() > 30

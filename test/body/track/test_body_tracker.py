@@ -12,6 +12,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettin
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, sample_surface, scan_whole
+from flowing_puppet_ros.evidence.cloud.sensor_field import PINHOLE, SensorField, SensorProjection
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -31,12 +32,13 @@ class _KnowingFitter(BodyFitter):
         *,
         initial: Mapping[str, tuple[float, float, float, float]] | None = None,
         viewpoint: np.ndarray | None = None,
+        field: SensorField | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
         nonrigid: bool = True,
         quick: bool = False,
     ) -> BodyFit:
-        return self.assess(self.truth, self.prepare_cloud(points, normals, viewpoint))
+        return self.assess(self.truth, self.prepare_cloud(points, normals, viewpoint, field))
 
 
 @pytest.fixture(scope="module")
@@ -210,3 +212,29 @@ def test_clouds_without_normals_are_tracked(fitter: _KnowingFitter, person: Body
         )
         fit = _step(tracker, scan.points, None, frame * FRAME)
         assert _error(fitter, fit, truth) < 0.015
+
+
+def test_legs_that_are_out_of_view_stay_where_they_are(fitter: _KnowingFitter, person: BodyState) -> None:
+    """Of the person who comes nearer the sensor sees no more than what is above the hips; the body stays whole."""
+    viewpoint = person.center[0] + np.array([3.0, 0.0, 0.3])
+    axes = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
+    projection = SensorProjection(viewpoint, axes, np.full(2, 100.0), np.zeros(2), PINHOLE)
+    field = SensorField(projection, np.array([-np.inf, -np.inf, np.inf, 10.0]), np.zeros((0, 0), np.float32))
+    feet = np.isin(fitter.model.part_of_vertex, [fitter.model.tree.index(f"{side}_foot") for side in ("left", "right")])
+    error, gap = {}, {}
+    for limit in (field, None):
+        tracker = BodyTracker(fitter, SETTINGS)
+        fitter.truth = person
+        for frame in range(4):
+            truth = _at(person, frame, speed=0.02)
+            points, normals = _cloud(fitter.model, truth, frame)
+            seen = (((viewpoint - points) * normals).sum(axis=1) > 0) & ~field.find_unknown(points)
+            fit = tracker.track_or_refit(
+                PersonCloud(points[seen], normals[seen], frame * FRAME, viewpoint, field=limit)
+            )
+        vertices = fitter.model.vertices(truth)
+        assert field.find_unknown(vertices[feet]).all()
+        gap[limit] = np.linalg.norm(fit.vertices - vertices, axis=1)[feet].mean()
+        error[limit] = fit.two_way_distance
+    assert gap[field] < 0.05 < gap[None]
+    assert error[field] < 0.02 < error[None]

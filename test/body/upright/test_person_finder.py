@@ -10,7 +10,7 @@ from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
 from flowing_puppet_ros.body.track.scene_tracker import SceneCloud, SceneSettings, SceneTracker
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
-from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank, measure_stature
+from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank
 from flowing_puppet_ros.evaluate.body.synthetic_scans import make_box
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import scan_scene
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -56,7 +56,7 @@ def test_the_person_is_found_at_their_height_and_the_cupboard_is_not(
     person, fit = found[0]
     assert person.rows is not None and (owner[person.rows] == 0).mean() > 0.95
     assert np.linalg.norm(fit.vertices[:, :2].mean(axis=0) - PLACE) < 0.12
-    assert abs(measure_stature(StitchedPuppet.load(), fit.state) - stature) < 0.08
+    assert abs(StitchedPuppet.load().measure_height(fit.state.shape) - stature) < 0.08
     assert abs(fit.vertices[:, 2].min() + HEIGHT) < 0.05
     assert fit.confidence > 0.7
     assert fit.vertices.tobytes() == found[1][1].vertices.tobytes()
@@ -70,9 +70,9 @@ def test_a_new_person_has_a_body_in_the_first_scan_and_keeps_the_id(
     tracker = SceneTracker(BodyFitter(StitchedPuppet.load(), FitterSettings()), SceneSettings())
     for step in range(4):
         moved = points + np.where(owner[:, None] == 0, [0.0, 0.1 * step, 0.0], 0.0)
-        ((identity, fit),) = tracker.step(SceneCloud(moved, None, (step + 1) * 100_000_000), step)[0]
-        assert identity == "b1"
-        assert np.linalg.norm(fit.vertices[:, :2].mean(axis=0) - PLACE - [0, 0.1 * step]) < 0.15
+        (body,) = tracker.step(SceneCloud(moved, None, (step + 1) * 100_000_000), step)[0]
+        assert body.id == "b1"
+        assert np.linalg.norm(body.fit.vertices[:, :2].mean(axis=0) - PLACE - [0, 0.1 * step]) < 0.15
     empty = points[owner != 0]
     assert tracker.step(SceneCloud(empty, None, 500_000_000), 9) == ([], ["b1"])
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -58,6 +59,8 @@ def load(
     **told: Any,
 ) -> UserNetwork:
     """Write a network and its description, and load it."""
+    if kind == "onnx" and tuple(map(int, cv2.__version__.split(".")[:2])) < (4, 7):
+        pytest.skip("OpenCV 4.6 cannot run the constant outputs of the tiny network")
     write: Writer = write_tflite if kind == "tflite" else write_onnx
     (folder / f"tiny.{kind}").write_bytes(write(SIZE, outputs, factors))
     lines = {"file": f"tiny.{kind}", "decoder": decoder, "input": list(SIZE), "joints": NAMES} | told

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Components: what waits for what, the same answer in any order of arrival, restarts, lazy outputs, bad input."""
 
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_flow, decode_image, make_image
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, PUPPETS
+from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
 
 GOLDEN = Path(__file__).resolve().parents[3] / "bags" / "golden" / "golden.mcap"
 FACTORY = BagMessageFactory()
@@ -301,3 +303,59 @@ def test_silhouettes_that_cannot_be_used_are_one_sentence(recorded: dict[str, li
     made = dict(fitter.handle("silhouettes", second))
     assert [body.id for body in made["bodies"].bodies] == ["b1"]
     assert (fitter.counters["bodies"], fitter.counters["unusable"]) == (1, 1)
+
+
+def test_the_bodies_of_one_instant_come_together_in_the_order_of_their_ids(recorded: dict[str, list[Any]]) -> None:
+    hull = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2"), FACTORY)
+    hull.set_subscribed("silhouettes", True)
+    first, second = (message for _, message in drive(hull, hull_stream(recorded)))
+    assert first.people == ["b1"]
+
+    def named(message: Any, identity: str, people: list[str]) -> Any:
+        copy = deepcopy(message)
+        copy.person.id, copy.people = identity, people
+        return copy
+
+    both = ["b1", "b2"]
+    fitter = BodyFitterComponent(BodyFitterSettings.from_mapping({"silhouettes.gauss_newton_steps": 2}), FACTORY)
+    assert fitter.handle("silhouettes", named(first, "b2", both)) == []
+    made = dict(fitter.handle("silhouettes", named(first, "b1", both)))
+    assert [body.id for body in made["bodies"].bodies] == both
+    # Of the next instant one set is lost: who is there comes out when something newer comes, or at the end.
+    assert fitter.handle("silhouettes", named(second, "b2", both)) == []
+    made = dict(fitter.flush())
+    assert [body.id for body in made["bodies"].bodies] == ["b2"] and made["bodies"].header == second.header
+    fitter.handle("silhouettes", named(first, "b1", both))
+    made = dict(fitter.handle("silhouettes", named(second, "b1", ["b1"])))
+    assert made["bodies"].header == second.header
+    assert fitter.counters["bodies"] == 5
+
+
+def test_a_hull_finds_a_second_person_across_the_cameras(recorded: dict[str, list[Any]]) -> None:
+    """Another puppet, 0.9 m beside the first in space: both have joints under their ids, one has a silhouette."""
+    stream, shift = hull_stream(recorded), np.array([0.0, 0.9, 0.0])
+    settings = VisualHullSettings.from_mapping({"cameras": "cam1,cam2", "hull_every": 1, "association.confirm_sets": 1})
+    alone = VisualHullComponent(settings, FACTORY)
+    joints = decode_body_joints(next(m for port, m in drive(alone, stream) if port == "hull/joints").bodies[0])
+    cameras = alone._builder.cameras
+    crowd = []
+    for port, message in stream:
+        copy = deepcopy(message)
+        if port.endswith("/puppets"):
+            other = deepcopy(copy.puppets[0])
+            other.id, other.parts, other.confidence = "other", [], 0.1
+            for joint in other.joints:
+                place = np.array(joints[joint.name][:3]) + shift if joint.name in joints else np.full(3, np.nan)
+                (joint.x, joint.y), _ = cameras[port.split("/")[0]].project(place)
+            copy.puppets.append(other)
+        crowd.append((port, copy))
+    component = VisualHullComponent(settings, FACTORY)
+    component.set_subscribed("silhouettes", True)
+    made = drive(component, crowd)
+    found = next(message for port, message in made if port == "hull/joints")
+    assert [body.id for body in found.bodies] == ["b1", "b2"]
+    places = {body.id: decode_body_joints(body) for body in found.bodies}
+    main, other = (min(places.values(), key=lambda each: sign * each["neck"][1]) for sign in (1, -1))
+    for name in set(main) & set(other):
+        np.testing.assert_allclose(np.subtract(other[name][:3], main[name][:3]), shift, atol=0.03)
+    assert len({m.person.id for port, m in made if port == "silhouettes"}) == 1

@@ -251,7 +251,7 @@ def test_what_goes_wrong_in_the_background_is_told_and_ends_nothing(
 def test_goals_fit_everybody_and_touch_no_track(person: np.ndarray, floor: np.ndarray, fits: list[np.ndarray]) -> None:
     stage = Stage(person, floor)
     message, found = stage.component.fit(stage.cloud((0, 0), (2, 1)), None, seed=0)
-    assert [body.id for body in message.bodies] == ["b1", "b2"] == [identity for identity, _ in found]
+    assert [body.id for body in message.bodies] == ["b1", "b2"] == [body.id for body in found]
     assert stage.show((0, 0)) == {(0, 0): "b1"}
     alone = make_cloud(FACTORY, make_header(FACTORY, 1, "map"), person[person[:, 2] > 1.2])
     assert len(stage.component.fit(alone, None, seed=0)[1]) == 1, "a cloud of a person's size is one"

@@ -53,6 +53,27 @@ def test_packed_colours_come_back_exactly() -> None:
             np.testing.assert_array_equal(decoded, rgb, err_msg=encoding)
 
 
+def test_a_shared_image_is_decoded_once_while_it_is_kept() -> None:
+    shelf = images.SharedImages(max_images=2)
+    pictures = [ramp() + k for k in range(3)]
+    first, *others = [shelf.share(message(picture, "rgb8"), readers=4) for picture in pictures]
+    decoded = images.decode_image(first)
+    np.testing.assert_array_equal(decoded, pictures[0])
+    assert first.header is HEADER
+    assert images.decode_image(first) is decoded
+    for other, picture in zip(others, pictures[1:], strict=True):
+        np.testing.assert_array_equal(images.decode_image(other), picture)
+    again = images.decode_image(first)
+    assert again is not decoded, "two newer ones are kept in its place"
+    np.testing.assert_array_equal(again, decoded)
+    assert images.decode_image(first) is again, "its last reader"
+    assert images.decode_image(first) is not again
+    broken = shelf.share(message(pictures[0], "no encoding"), readers=2)
+    for _ in range(2):
+        with pytest.raises(InputError, match="no encoding"):
+            images.decode_image(broken)
+
+
 @pytest.mark.parametrize("big", [False, True])
 def test_grey_becomes_three_equal_channels(big: Any) -> None:
     grey = ramp()[:, :, 0]

@@ -8,6 +8,7 @@ y to the left, z to the head. Lengths are those of the fitted person.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from xml.sax.saxutils import quoteattr
@@ -232,5 +233,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 def _euler_angles(matrix: np.ndarray, order: str) -> tuple[float, float, float]:
     """Return the angles about the positive axes, in the order of the joints from the trunk outwards."""
-    a, b, c = Rotation.from_matrix(matrix).as_euler(order, suppress_warnings=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # where the first and third axis coincide the third angle is 0
+        a, b, c = Rotation.from_matrix(matrix).as_euler(order)
     return float(a), float(b), float(c)

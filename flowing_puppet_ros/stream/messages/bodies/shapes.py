@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import I64, Array
+from flowing_puppet_ros.stream.messages.bodies.mesh_preview import simplify_mesh
 from flowing_puppet_ros.stream.messages.geometry import make_point, make_pose
 from flowing_puppet_ros.stream.messages.message_types import MESH, MessageFactory
 
@@ -19,13 +20,19 @@ _MARKER = "visualization_msgs/msg/Marker"
 _TRIANGLE_LIST, _ADD, _DELETE = 11, 0, 2  # of visualization_msgs/Marker
 _NAMESPACE = "bodies"
 _LIFETIME_S = 5  # viewers delete a marker that is not renewed
-_SKIN_RGB = (0.85, 0.68, 0.55)
+_SKIN_RGB, _PALE_RGB = (0.85, 0.68, 0.55), (0.86, 0.86, 0.88)
 
 
-def make_mesh_marker(factory: MessageFactory, header: Any, number: int, faces: Array, vertices: Array) -> Any:
-    """Return the TRIANGLE_LIST marker of a body: `faces` (F, 3), `vertices` (V, 3) in metres in the header's frame."""
+def make_mesh_marker(
+    factory: MessageFactory, header: Any, number: int, faces: Array, vertices: Array, inferred: Array
+) -> Any:
+    """Return the TRIANGLE_LIST marker of a body: `faces` (F, 3), `vertices` (V, 3) in metres in the header's frame.
+
+    `inferred` (V,) bool are the vertices that only the model tells: they are pale.
+    """
     points = [make_point(factory, vertex) for vertex in vertices]
-    red, green, blue = _SKIN_RGB
+    corners = np.asarray(faces).ravel()
+    skin, pale = (factory.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=1.0) for r, g, b in (_SKIN_RGB, _PALE_RGB))
     return factory.make(
         _MARKER,
         header=header,
@@ -35,9 +42,10 @@ def make_mesh_marker(factory: MessageFactory, header: Any, number: int, faces: A
         action=_ADD,
         pose=make_pose(factory, np.zeros(3), np.eye(3)),
         scale=factory.make("geometry_msgs/msg/Vector3", x=1.0, y=1.0, z=1.0),
-        color=factory.make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
+        color=skin,
         lifetime=factory.make("builtin_interfaces/msg/Duration", sec=_LIFETIME_S, nanosec=0),
-        points=[points[index] for index in np.asarray(faces).ravel()],
+        points=[points[index] for index in corners],
+        colors=[pale if inferred[index] else skin for index in corners] if inferred[corners].any() else [],
     )
 
 
@@ -69,19 +77,8 @@ def make_topology(factory: MessageFactory, model: StitchedPuppet) -> Any:
 
 
 def preview_faces(model: StitchedPuppet, triangles: int) -> I64:
-    """Return about `triangles` faces (F', 3) over the model's own vertices; all of the model's faces when 0.
-
-    Quadric edge collapse (Garland and Heckbert 1997) of the body at rest. Every remaining vertex is replaced by the
-    nearest one of the model, so that the coarse mesh has the pose and shape of the full one.
-    """
-    if not 0 < triangles < len(model.faces):
-        return np.asarray(model.faces, np.int64)
-    import open3d as o3d
-    from scipy.spatial import cKDTree
-
-    vertices = model.vertices(model.rest_state())
-    mesh = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(vertices), o3d.utility.Vector3iVector(model.faces))
-    coarse = mesh.simplify_quadric_decimation(triangles)
-    faces = cKDTree(vertices).query(np.asarray(coarse.vertices))[1][np.asarray(coarse.triangles)]
-    a, b, c = faces.T
-    return np.asarray(faces[(a != b) & (b != c) & (c != a)], np.int64)
+    """Return about `triangles` faces (F', 3) over the model's own vertices; all of the model's faces when 0."""
+    faces = np.asarray(model.faces, np.int64)
+    if not 0 < triangles < len(faces):
+        return faces
+    return simplify_mesh(model.vertices(model.rest_state()), faces, triangles)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,11 +19,18 @@ Masks = Mapping[str, U8]
 
 
 def make_silhouettes(
-    factory: MessageFactory, header: Any, person: Any, cameras: Mapping[str, Camera], masks: Masks, headers: Any
+    factory: MessageFactory,
+    header: Any,
+    person: Any,
+    cameras: Mapping[str, Camera],
+    masks: Masks,
+    headers: Any,
+    people: Sequence[str] = (),
 ) -> Any:
     """Return the SilhouetteSet of `person` (a Body with joints) from the mask (h, w) of each camera, by camera name.
 
-    `header` has the stamp and the common frame; `headers` (camera name -> header) are those of the images.
+    `header` has the stamp and the common frame; `headers` (camera name -> header) are those of the images. `people`
+    are the ids of all who have a set of this stamp.
     """
     silhouettes = [
         factory.make(
@@ -35,7 +42,7 @@ def make_silhouettes(
         )
         for name, mask in masks.items()
     ]
-    return factory.make(SILHOUETTES, header=header, person=person, silhouettes=silhouettes)
+    return factory.make(SILHOUETTES, header=header, person=person, silhouettes=silhouettes, people=people)
 
 
 def _make_info(factory: MessageFactory, header: Any, camera: Camera) -> Any:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.bodies import KINDS, BodyScore, draw_scans, score_fit, summarise
+from flowing_puppet_ros.evaluate.body.measurements import measure_errors, summarise_errors
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -28,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--people-seed", type=int, default=1, help="seed of the people and their scans [%(default)s]")
     parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture; without it all poses are hard")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for bodies_KIND.csv and bodies_KIND.json")
+    parser.add_argument("--measure", action="store_true", help="also print errors of measurements of fits")
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
     FitterSettings.add_arguments(parser)
 
@@ -44,14 +46,24 @@ def run(arguments: argparse.Namespace) -> int:
     source = BodySource(arguments.mocap)
     scans = draw_scans(arguments.kind, source, arguments.count, arguments.people_seed)
     scores: list[BodyScore] = []
+    errors: list[dict[str, float]] = []
     with tqdm(scans, total=arguments.count, file=sys.stderr, disable=arguments.json) as bar:
         for body, scene, cloud in bar:
-            scores.append(score_fit(fitter, body, scene, cloud, source.joint_names)[1])
+            fit, score = score_fit(fitter, body, scene, cloud, source.joint_names)
+            scores.append(score)
+            if arguments.measure:
+                errors.append(measure_errors(fitter.model, fit, body, source.triangles))
             bar.set_postfix_str(f"{100 * scores[-1].vertex_error:.2f} cm")
     figures = summarise(scores)
     if arguments.out is not None:
         rows = [asdict(score) for score in scores]
         write_csv(arguments.out / f"bodies_{arguments.kind}.csv", rows)
         write_json(arguments.out / f"bodies_{arguments.kind}.json", {"summary": figures, "bodies": rows})
-    print(format_json(figures) if arguments.json else format_table([{"kind": arguments.kind} | figures]))
+    measured = summarise_errors(errors) if errors else []
+    if arguments.json:
+        print(format_json(figures | ({"measurements": measured} if measured else {})))
+    else:
+        print(format_table([{"kind": arguments.kind} | figures]))
+        if measured:
+            print(format_table(measured))
     return 0

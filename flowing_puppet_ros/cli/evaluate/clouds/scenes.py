@@ -19,12 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES, parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.scans.scene_labels import LabelledScene, label_scene, read_labels
 from flowing_puppet_ros.body.track.scene_tracker import SceneCloud, SceneSettings, SceneTracker
-from flowing_puppet_ros.body.upright.upright_bank import measure_stature
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.scene.scene_score import (
@@ -95,9 +95,9 @@ def run(arguments: argparse.Namespace) -> int:
     seconds = []
     for number, scan in enumerate(tqdm(scans, file=sys.stderr, disable=arguments.json)):
         started = time.process_time()
-        fits = _find(tracker, scan, number, arguments.sequence)
+        bodies = _find(tracker, scan, number, arguments.sequence)
         seconds.append(time.process_time() - started)
-        found = [_describe(model, identity, fit, scan.truth.sensor) for identity, fit in fits]
+        found = [_describe(model, body, scan.truth.sensor) for body in bodies]
         scored = score_scene(scan.name, scan.truth, found, arguments.min_labelled_points, np.radians(arguments.sector))
         people += scored[0]
         ghosts += scored[1]
@@ -116,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _find(tracker: SceneTracker, scan: _Scan, number: int, sequence: bool) -> list[tuple[str, BodyFit]]:
+def _find(tracker: SceneTracker, scan: _Scan, number: int, sequence: bool) -> list[TrackedBody]:
     cloud = SceneCloud(scan.points - scan.truth.sensor, None, FRAME_NS * (number + 1), single_view=True)
     try:
         return tracker.step(cloud, number)[0] if sequence else tracker.fit_once(cloud, number)
@@ -124,10 +124,11 @@ def _find(tracker: SceneTracker, scan: _Scan, number: int, sequence: bool) -> li
         return []  # nobody
 
 
-def _describe(model: StitchedPuppet, identity: str, fit: BodyFit, sensor: np.ndarray) -> ReportedPerson:
-    stature = measure_stature(model, fit.state)
+def _describe(model: StitchedPuppet, body: TrackedBody, sensor: np.ndarray) -> ReportedPerson:
+    fit = body.fit
+    stature = model.measure_height(fit.state.shape)
     joints = dict(zip(model.joint_names, fit.joints + sensor, strict=True))
-    return ReportedPerson(joints, fit.vertices + sensor, stature, identity, fit.confidence)
+    return ReportedPerson(joints, fit.vertices + sensor, stature, body.id, fit.confidence)
 
 
 def _read_scans(arguments: argparse.Namespace) -> Iterator[_Scan]:

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A body with its id, and what its earlier places tell: whether it is new, and how fast it moves."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
+
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.body.fit.fitter import BodyFit
+
+VELOCITY_WINDOW_NS = 500_000_000
+"""Time over which a velocity is measured: shorter ones show the noise of the fits, longer ones lag behind a turn."""
+
+
+class TrackStatus(IntEnum):
+    """How a body came to be; the values are those of the message Body."""
+
+    TRACKED = 0
+    HIDDEN = 1
+    NEW = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackedBody:
+    """A body of a person with an `id`; `velocity` (3,) m/s of the torso, in the frame of the fit, 0 while unknown."""
+
+    id: str
+    fit: BodyFit
+    status: TrackStatus = TrackStatus.NEW
+    velocity: F64 = field(default_factory=lambda: np.zeros(3))
+
+    def rotate(self, rotation: F64) -> TrackedBody:
+        """Return it in a frame that is turned by `rotation` (3, 3) about the origin."""
+        fit, state = self.fit, self.fit.state
+        state = replace(state, center=state.center @ rotation.T, rotation=rotation @ state.rotation)
+        turned = replace(fit, state=state, vertices=fit.vertices @ rotation.T, joints=fit.joints @ rotation.T)
+        return replace(self, fit=turned, velocity=rotation @ self.velocity)
+
+
+class TorsoMotion:
+    """The places of a person's torso in the last half second."""
+
+    def __init__(self) -> None:
+        """Start without any."""
+        self._places: deque[tuple[int, F64]] = deque()
+
+    def add(self, identity: str, stamp: int, fit: BodyFit, hidden: bool = False) -> TrackedBody:
+        """Take the person's body at a stamp (ns) and return it with its status and velocity.
+
+        The velocity is the slope of the line that fits the places best. A stamp that is not later than the last starts
+        anew.
+        """
+        if self._places and stamp <= self._places[-1][0]:
+            self._places.clear()
+        known = bool(self._places)
+        while self._places and stamp - self._places[0][0] > VELOCITY_WINDOW_NS:
+            self._places.popleft()
+        self._places.append((stamp, fit.state.center[0].copy()))
+        status = TrackStatus.HIDDEN if hidden else TrackStatus.TRACKED if known else TrackStatus.NEW
+        return TrackedBody(identity, fit, status, self._measure_velocity())
+
+    def _measure_velocity(self) -> F64:
+        if len(self._places) < 2:
+            return np.zeros(3)
+        seconds = 1e-9 * np.array([stamp - self._places[0][0] for stamp, _ in self._places])
+        places = np.stack([place for _, place in self._places])
+        apart = seconds - seconds.mean()
+        return np.asarray(apart @ (places - places.mean(axis=0)) / (apart @ apart))

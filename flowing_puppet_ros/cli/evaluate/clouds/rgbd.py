@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`flowing-puppet evaluate rgbd`: bodies from colour and depth of drawn people whose every vertex is known."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
+from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
+from flowing_puppet_ros.evaluate.rgbd.methods import FusionMethod, RgbdMethod, SearchMethod
+from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summarise_rgbd
+from flowing_puppet_ros.evaluate.rgbd.tracking import MotionScore, summarise_motions, track_motion
+from flowing_puppet_ros.evaluate.rgbd.views import CUTS, RgbdStudio, make_pair, make_registered
+from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
+from flowing_puppet_ros.image.networks.choice import IMAGE_SIDE_PX, load_networks
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.settings import make_out_folder
+
+MOTION_S = 2.5
+METHODS = ("fusion", "networks", "search")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `flowing-puppet evaluate rgbd`."""
+    parser.add_argument("--cuts", nargs="+", choices=CUTS, default=CUTS, help="what is seen of the people [all]")
+    parser.add_argument(
+        "--method",
+        choices=METHODS,
+        default="fusion",
+        help="fusion: true joints with noise, and depth; networks: what the keypoint networks find in the drawn image,"
+        " and depth; search: depth alone, whose points are whose being known [%(default)s]",
+    )
+    parser.add_argument("--count", type=int, default=20, help="frames of each kind [%(default)s]")
+    parser.add_argument("--people", type=int, default=1, help="people side by side in a frame [%(default)s]")
+    parser.add_argument("--people-seed", type=int, default=1, help="seed of the people and the sensor [%(default)s]")
+    parser.add_argument("--sensor", choices=tuple(SENSORS), default="structured", help="kind of sensor [%(default)s]")
+    parser.add_argument(
+        "--noise", type=float, default=5.0, help="of the joints, px at a focal length of 525 px [%(default)s]"
+    )
+    parser.add_argument(
+        "--unregistered", action="store_true", help="the colour camera is 5 cm beside, larger, with another lens"
+    )
+    parser.add_argument(
+        "--any-pose", action="store_true", help="whole people crouch, bend and sit too, as motion capture has it"
+    )
+    parser.add_argument(
+        "--motions", type=int, metavar="N", help="track so many fast motions instead, of 2.5 s each, of one person"
+    )
+    parser.add_argument(
+        "--rates", nargs="+", type=float, default=[15.0, 30.0], help="at which they are tracked, Hz [15 30]"
+    )
+    parser.add_argument(
+        "--lag", type=float, default=0.0, help="by which colour is later than depth in motions, seconds [%(default)s]"
+    )
+    parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture that the poses are from")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for rgbd.csv and rgbd.json")
+    parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
+    FitterSettings.add_arguments(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fit the people of every frame, print the figures and return the exit status."""
+    if arguments.mocap is None:
+        raise InputError("drawn people stand and walk as motion capture does; give --mocap expmap_20hz.npz")
+    if arguments.count < 1 or arguments.people < 1 or arguments.people_seed < 0 or not 0 <= arguments.noise <= 100:
+        raise InputError("--count and --people are at least 1, --people-seed at least 0 and --noise between 0 and 100")
+    fitter = BodyFitter(StitchedPuppet.load(), FitterSettings.from_arguments(arguments))
+    fitter.warm_up()
+    method = _make_method(arguments.method, fitter)
+    if arguments.out is not None:
+        make_out_folder(arguments.out)
+    cameras = make_pair() if arguments.unregistered else make_registered()
+    studio = RgbdStudio(BodySource(arguments.mocap), cameras, arguments.sensor)
+    if arguments.motions is not None:
+        motions = _track_motions(arguments, fitter, studio)
+        print(format_json({"motions": motions}) if arguments.json else format_table(motions))
+        return 0
+    scores: list[RgbdScore] = []
+    rows = [(cut, number) for cut in arguments.cuts for number in range(arguments.count)]
+    for cut, number in tqdm(rows, file=sys.stderr, disable=arguments.json):
+        rng = np.random.default_rng([arguments.people_seed, CUTS.index(cut), number])
+        frame = studio.draw_frame(rng, cut, arguments.people, arguments.noise, arguments.any_pose)
+        fits, to_world, seconds = method.find(frame)
+        each = seconds / len(fits)
+        scores += [score_body(fitter.model, fit, to_world, frame, k, cut, each) for k, fit in enumerate(fits)]
+    figures = [summarise_rgbd([score for score in scores if score.cut == cut]) for cut in arguments.cuts]
+    if arguments.out is not None:
+        table = [asdict(score) for score in scores]
+        write_csv(arguments.out / "rgbd.csv", table)
+        write_json(arguments.out / "rgbd.json", {"summary": figures, "bodies": table})
+    print(format_json({"summary": figures}) if arguments.json else format_table(figures))
+    return 0
+
+
+def _track_motions(arguments: argparse.Namespace, fitter: BodyFitter, studio: RgbdStudio) -> list[dict[str, float]]:
+    """Track the motions and return the figures of each rate."""
+    rates = sorted(set(arguments.rates), reverse=True)
+    if arguments.motions < 1 or not 0 <= arguments.lag <= 1:
+        raise InputError("--motions is at least 1 and --lag between 0 and 1 s")
+    if any(rate <= 0 or rates[0] % rate for rate in rates):
+        raise InputError(f"--rates are {arguments.rates} Hz; the highest must be a multiple of the others")
+    scores: list[list[MotionScore]] = [[] for _ in rates]
+    for number in tqdm(range(arguments.motions), file=sys.stderr, disable=arguments.json):
+        rng = np.random.default_rng([arguments.people_seed, 100, number])
+        found = track_motion(fitter, studio, rng, rates, MOTION_S, arguments.lag, arguments.noise)
+        for each, score in zip(scores, found, strict=True):
+            each.append(score)
+    return [summarise_motions(each) for each in reversed(scores)]
+
+
+def _make_method(name: str, fitter: BodyFitter) -> RgbdMethod:
+    if name == "search":
+        return SearchMethod(fitter)
+    return FusionMethod(fitter, load_networks("neural", IMAGE_SIDE_PX) if name == "networks" else None)

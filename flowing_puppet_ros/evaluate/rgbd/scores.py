@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors of bodies fitted to colour and depth of people whose every vertex is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.evaluate.body.bodies import is_flipped
+from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS
+from flowing_puppet_ros.evaluate.rgbd.views import RgbdFrame
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+MIN_WRONG_M = 0.06  # mean error of the vertices, or of the seen joints of people who are cut off, of a wrong body
+MIN_LOST_M = 0.15  # error of a seen elbow or wrist that is lost
+
+
+@dataclass(frozen=True, slots=True)
+class RgbdScore:
+    """One fit against the truth; distances are means in metres, NaN where there is nothing to compare.
+
+    Attributes:
+        cut: one of CUTS.
+        found: whether there is a body.
+        vertex_error: over all vertices of the template.
+        seen_error, unseen_error: over the limbs' joints that are in view, and over the others, see `SeenKeypoints`.
+        visible_error: over the joints that nothing hides, not even the person's own body.
+        stature_error: fitted minus true.
+        flipped: whether the body is nearer to the truth with left and right swapped.
+        wrong: whether the vertices of a whole person, or the seen joints of others, are off by more than 6 cm.
+        lost_arms, seen_arms: elbows and wrists in view that are off by more than 15 cm, and all in view.
+        reliable: as reported by the fit.
+        seconds: processor time of the fit.
+    """
+
+    cut: str
+    found: bool
+    vertex_error: float
+    seen_error: float
+    unseen_error: float
+    visible_error: float
+    stature_error: float
+    flipped: bool
+    wrong: bool
+    lost_arms: int
+    seen_arms: int
+    reliable: bool
+    seconds: float
+
+
+def score_body(
+    model: StitchedPuppet, fit: BodyFit | None, to_world: F64, frame: RgbdFrame, person: int, cut: str, seconds: float
+) -> RgbdScore:
+    """Compare a fit, or that there is none, with the `person`-th body of a frame.
+
+    `to_world` (4, 4) takes the fit's frame into the frame's world.
+    """
+    truth, seen = frame.bodies[person], frame.seen[person]
+    arms = np.array([name.endswith(("elbow", "wrist")) for name in LIMB_JOINTS]) & seen.in_view
+    nan = float("nan")
+    if fit is None:
+        number = int(arms.sum())
+        return RgbdScore(cut, False, nan, nan, nan, nan, nan, False, True, number, number, False, seconds)
+    vertices = fit.vertices @ to_world[:3, :3].T + to_world[:3, 3]
+    joints = (fit.joints @ to_world[:3, :3].T + to_world[:3, 3])[
+        [model.joint_names.index(name) for name in LIMB_JOINTS]
+    ]
+    template = truth.template_vertices(model.name)
+    vertex_error = float(np.linalg.norm(vertices - template, axis=1).mean())
+    error = np.linalg.norm(joints - frame.joints[person], axis=1)
+    seen_error = _mean(error[seen.in_view])
+    return RgbdScore(
+        cut=cut,
+        found=True,
+        vertex_error=vertex_error,
+        seen_error=seen_error,
+        unseen_error=_mean(error[~seen.in_view]),
+        visible_error=_mean(error[seen.visible]),
+        stature_error=model.measure_height(fit.state.shape) - truth.stature,
+        flipped=is_flipped(vertices, template, model),
+        wrong=(vertex_error if cut == "whole" else seen_error) > MIN_WRONG_M,
+        lost_arms=int((error[arms] > MIN_LOST_M).sum()),
+        seen_arms=int(arms.sum()),
+        reliable=fit.reliable,
+        seconds=seconds,
+    )
+
+
+def summarise_rgbd(scores: Sequence[RgbdScore]) -> dict[str, float | str]:
+    """Summarise the fits of one kind; distances in centimetres, over the bodies that were found."""
+
+    def mean(name: str) -> float:
+        return 100 * _mean(np.array([getattr(score, name) for score in scores]))
+
+    stature = 100 * np.array([score.stature_error for score in scores])
+    return {
+        "cut": scores[0].cut,
+        "bodies": len(scores),
+        "missed": sum(not score.found for score in scores),
+        "vertices_cm": mean("vertex_error"),
+        "seen_cm": mean("seen_error"),
+        "visible_cm": mean("visible_error"),
+        "unseen_cm": mean("unseen_error"),
+        "stature_cm": _mean(stature),
+        "stature_off_cm": _mean(np.abs(stature)),
+        "flipped": sum(score.flipped for score in scores),
+        "over_6_cm": sum(score.wrong for score in scores),
+        "unreliable": sum(not score.reliable for score in scores),
+        "wrong_reliable": sum(score.wrong and score.reliable for score in scores),
+        "seconds": float(np.mean([score.seconds for score in scores])),
+    }
+
+
+def _mean(values: F64) -> float:
+    """Return the mean of the values that are known, NaN without any."""
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else float("nan")

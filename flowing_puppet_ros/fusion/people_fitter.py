@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The people of one image in one cloud: joints lifted, points shared out, a body fitted to each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.body.cloud.limb_crop import list_capsules
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.segmentation.planes import PlaneCache, find_planes, is_clear_of_planes
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
+from flowing_puppet_ros.fusion.joint_fit import HIDDEN_SHARE, MIN_LIMB_CONFIDENCE, JointFitter
+from flowing_puppet_ros.fusion.lift import LiftedJoints, lift_joints
+from flowing_puppet_ros.fusion.ownership import assign_points
+from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, trunk_rows
+from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
+from flowing_puppet_ros.model.sp import BodyState
+from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.threads import one_blas_thread, parallel_map, usable_threads
+
+MAX_LIMB_M = 0.6
+"""Length of a limb that takes points by itself."""
+CLAIM_ROUNDS = 2
+"""In the first, joints that a neighbour hides are lifted onto the neighbour."""
+
+
+@dataclass(frozen=True)
+class FusionSettings(Settings):
+    """Settings of the fits to puppets and cloud."""
+
+    joint_strength: float = setting(
+        0.02, "weight of a certain joint of a puppet relative to the whole cloud", low=0.0, high=1.0, advanced=True
+    )
+    min_points: int = setting(60, "minimum points of a person whom a body is fitted to", low=50, high=100000,
+                              advanced=True)  # fmt: skip
+    min_confidence: float = setting(
+        0.3, "confidence from which on a body that is not reliable is published", low=0.0, high=1.0, advanced=True
+    )
+    max_lag: float = setting(
+        0.35, "time from a cloud to the nearest puppets up to which they belong together", unit="s", low=0.0, high=5.0
+    )  # fmt: skip
+    wait: int = setting(
+        3, "clouds to wait for late puppets before one is used without them", low=0, high=50, advanced=True
+    )
+    rectified: bool = setting(
+        False, "puppets are those of a rectified image, as P of puppets/camera_info says, not K and D", advanced=True
+    )
+    plane_clearance: float = setting(
+        0.03, "distance from floor and walls up to which points are nobody's", unit="m", low=0.005, high=0.5,
+        advanced=True,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Claim:
+    """What belongs to one puppet: its lifted `joints`, the body that they describe and its points (N,)."""
+
+    puppet: PuppetJoints
+    joints: LiftedJoints
+    start: BodyState
+    own: Bools
+
+
+class PeopleFitter:
+    """Fits a body to each puppet of an image that has points in a cloud."""
+
+    def __init__(self, fitter: BodyFitter, settings: FusionSettings) -> None:
+        """Fit with the model and the parts of `fitter`."""
+        self.joint_fitter = JointFitter(fitter, settings.joint_strength)
+        self.model = fitter.model
+        self._settings = settings
+        self.fitter = fitter
+        self.min_points = settings.min_points
+        self.threads = usable_threads(fitter.settings.threads)
+        self._trunk = trunk_rows(fitter.model)
+
+    def fit_people(
+        self, cloud: SeenCloud, puppets: Sequence[PuppetJoints], image: RangeImage | None
+    ) -> list[tuple[str, BodyFit]]:
+        """Return (id, body) of the puppets that have enough points; the same for any number of threads.
+
+        `image` is the cloud's range image, which says what the sensor can know of each person.
+        """
+        with one_blas_thread():
+            clear, floor = self.find_clear(cloud.points)
+            claims, _ = self.claim(cloud, puppets, clear)
+            people = [make_person(cloud, image, claim.own, floor, 0) for claim in claims]
+            found = parallel_map(
+                lambda pair: self.fit_claim(*pair), list(zip(claims, people, strict=True)), self.threads
+            )
+        return [
+            (claim.puppet.id, fit)
+            for claim, fit in zip(claims, found, strict=True)
+            if fit is not None and self.is_proven(fit)
+        ]
+
+    def find_clear(self, points: F64, cache: PlaneCache | None = None) -> tuple[Bools, Bools]:
+        """Return which points (N,) are neither floor nor wall, and which are floor; `cache` has those of before."""
+        origin, clearance = np.zeros(3), self._settings.plane_clearance
+        known = cache.get(points, clearance, origin) if cache else None
+        floor, walls = known or find_planes(points, clearance)
+        if cache and known is None:
+            cache.put(points, clearance, floor, walls, origin)
+        clear = is_clear_of_planes(points, self._settings.plane_clearance, floor, walls)
+        on_floor = np.zeros(len(points), dtype=bool) if floor is None else (
+            floor.height(points) <= self._settings.plane_clearance
+        )  # fmt: skip
+        return clear, on_floor
+
+    def claim(
+        self,
+        cloud: SeenCloud,
+        puppets: Sequence[PuppetJoints],
+        clear: Bools,
+        known: Sequence[BodyState | None] = (),
+        others: Sequence[BodyState] = (),
+    ) -> tuple[list[Claim], list[Bools]]:
+        """Share the `clear` (N,) points out among the puppets, and other people of whom there is no puppet.
+
+        Args:
+            cloud: with pixels.
+            puppets: in its camera's image.
+            clear: (N,) points that may be anybody's.
+            known: where the bodies of the puppets should be, None for new ones.
+            others: where the bodies of the other people should be.
+
+        Returns:
+            The claims of the puppets that have enough points, and the points (N,) of the others.
+        """
+        bodies = list(known) or [None] * len(puppets)
+        own = [clear] * len(puppets)
+        claims: list[Claim | None] = []
+        extra = [self._list_body(body) for body in others]
+        for _round in range(CLAIM_ROUNDS if any(body is None for body in bodies) else 1):
+            claims = [
+                self._start(cloud, puppet, points, body)
+                for puppet, points, body in zip(puppets, own, bodies, strict=True)
+            ]
+            limbs = [np.empty((0, 8)) if claim is None else self._list_capsules(claim) for claim in claims]
+            owner = np.full(len(cloud.points), -1, dtype=np.int32)
+            owner[clear] = assign_points(cloud.points[clear], [*limbs, *extra])
+            own = [owner == number for number in range(len(puppets))]
+        found = [
+            replace(claim, joints=lift_joints(self.model, claim.puppet, cloud, points), own=points)
+            for claim, points in zip(claims, own, strict=True)
+            if claim is not None and np.count_nonzero(points) >= self.min_points
+        ]
+        return found, [owner == len(puppets) + number for number in range(len(others))] if claims or others else []
+
+    def _start(self, cloud: SeenCloud, puppet: PuppetJoints, usable: Bools, body: BodyState | None) -> Claim | None:
+        """Return a puppet's joints on the `usable` (N,) points and the body that they describe, None without one.
+
+        Where the body should be is known better from the clouds before: then it is `body`.
+        """
+        joints = lift_joints(self.model, puppet, cloud, usable)
+        try:
+            return Claim(puppet, joints, self.joint_fitter.start(joints) if body is None else body, usable)
+        except InputError:
+            return None
+
+    def _list_capsules(self, claim: Claim) -> F64:
+        """Return the capsules (C, 8) of a body, and of limbs with certain joints, should the body miss them."""
+        names, joints = self.model.joint_names, claim.joints
+        certain = joints.found & ~joints.hidden & (joints.confidence >= MIN_LIMB_CONFIDENCE)
+        seen = {name: place for name, place, sure in zip(names, joints.points, certain, strict=True) if sure}
+        limbs = list_capsules(seen)
+        limbs = limbs[np.linalg.norm(limbs[:, :3] - limbs[:, 3:6], axis=1) < MAX_LIMB_M]
+        return np.concatenate([self._list_body(claim.start), limbs])
+
+    def _list_body(self, body: BodyState) -> F64:
+        return list_capsules(
+            dict(zip(self.model.joint_names, self.model.joints(self.model.vertices(body)), strict=True))
+        )
+
+    def fit_claim(self, claim: Claim, person: PersonCloud) -> BodyFit | None:
+        """Return the body of a puppet's own points, from its joints; None where there is none."""
+        try:
+            cloud = self.joint_fitter.make_cloud(person.points, person.field)
+            return self.joint_fitter.fit(cloud, self.joint_fitter.start(claim.joints), claim.joints)
+        except InputError:
+            return None
+
+    def complete_targets(self, claim: Claim, targets: JointTargets, body: BodyState) -> JointTargets:
+        """Return targets with the joints that have no depth, each on its ray where the body's joint is nearest."""
+        rays, puppet = np.nan_to_num(claim.joints.rays), claim.puppet
+        joints = self.model.joints(self.model.vertices(body))
+        missing = puppet.known & ~claim.joints.found
+        along = ((joints - claim.joints.centre) * rays).sum(axis=1, keepdims=True)
+        weight = self._settings.joint_strength * HIDDEN_SHARE * puppet.confidence**2
+        return JointTargets(
+            np.where(missing[:, None], claim.joints.centre + along * rays, targets.points),
+            np.where(missing, weight, targets.weight),
+            rays,
+        )
+
+    def is_proven(self, fit: BodyFit) -> bool:
+        """Return whether a body shows that the puppet is a person: a reliable one, or one that is not all wrong."""
+        return fit.reliable or fit.confidence >= self._settings.min_confidence
+
+    def find_trunk(self, body: BodyState) -> F64:
+        """Return the middle (3,) of a body's trunk, metres."""
+        return np.asarray(self.model.joints(self.model.vertices(body))[self._trunk].mean(axis=0))
+
+    def find_trunk_pixel(self, puppet: PuppetJoints) -> F64:
+        """Return the middle (2,) of a puppet's trunk, pixels; NaN where it has none."""
+        places = puppet.pixels[self._trunk]
+        places = places[np.isfinite(places).all(axis=1)]
+        return np.asarray(places.mean(axis=0)) if len(places) else np.full(2, np.nan)
+
+
+def make_person(cloud: SeenCloud, image: RangeImage | None, own: Bools, floor: Bools, stamp: int) -> PersonCloud:
+    """Return a person's `own` (N,) points with what the sensor at the origin can know of the person.
+
+    The floor (N,) hides nobody: who stood below it would be hidden by it, and longer legs would cost nothing.
+    """
+    field = None if image is None else image.make_field(own | floor)
+    return PersonCloud(cloud.points[own], None, stamp, np.zeros(3), np.flatnonzero(own), field=field)

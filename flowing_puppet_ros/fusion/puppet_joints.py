@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joints of puppets, whoever found them, in the body model's order; and puppets carried to another stamp."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
+from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+# From a network's ankle to the model's, which lies lower: share of the way from the knee to the ankle.
+ANKLE_DROP = 0.10
+MIN_PUPPET_JOINTS = 4
+"""Known joints of a puppet that is believed to be a person."""
+_TRUNK = ("neck", "belly", "face", "right_shoulder", "left_shoulder", "right_hip", "left_hip")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PuppetJoints:
+    """One person in an image.
+
+    Attributes:
+        id: stable over time; empty when whoever found the person does not track.
+        pixels: (J, 2) in the body model's order, NaN where unknown.
+        confidence: (J,) 0 to 1, 0 where unknown.
+        hidden: (J,) whether the puppet's own parts hide the joint from the camera.
+    """
+
+    id: str
+    pixels: F64
+    confidence: F64
+    hidden: Bools
+
+    @property
+    def known(self) -> Bools:
+        """Which joints (J,) have a place, however doubtful."""
+        return np.isfinite(self.pixels).all(axis=1)
+
+    def swap_sides(self, model: StitchedPuppet) -> PuppetJoints:
+        """Return the puppet with left called right."""
+        other = list(find_other_sides(model.joint_names))
+        return replace(self, pixels=self.pixels[other], confidence=self.confidence[other], hidden=self.hidden[other])
+
+
+@lru_cache(maxsize=8)
+def find_other_sides(names: tuple[str, ...]) -> tuple[int, ...]:
+    """Return for each joint the index of that of the other side, its own for joints of the middle."""
+    swapped = {"left": "right", "right": "left"}
+    found = []
+    for name in names:
+        side, _, rest = name.partition("_")
+        found.append(names.index(f"{swapped[side]}_{rest}") if side in swapped else names.index(name))
+    return tuple(found)
+
+
+def place_joints(
+    model: StitchedPuppet,
+    identity: str,
+    names: Sequence[str],
+    pixels: F64,
+    confidence: F64,
+    hidden: Sequence[str] = (),
+) -> PuppetJoints | None:
+    """Return a puppet's joints in the body model's order, None when too few are known.
+
+    A puppet's own joints (those with a belly) are taken as they are; a detector's shoulders, hips and head are moved to
+    where puppets have them, and everybody's ankles down to where the body model has them.
+
+    Args:
+        model: the body model.
+        identity: the puppet's id.
+        names: of the joints, in any spelling that `image.formats.keypoints` understands.
+        pixels: (K, 2), NaN where unknown.
+        confidence: (K,) 0 to 1.
+        hidden: names of the joints that the puppet's own parts hide.
+    """
+    flat = _load_flat_model()
+    joints, certain = joints_from_keypoints(flat, Keypoints(tuple(names), pixels, np.maximum(confidence, 1e-3)))
+    found = np.full((len(model.joint_names), 2), np.nan)
+    weight = np.zeros(len(model.joint_names))
+    behind = np.zeros(len(model.joint_names), dtype=bool)
+    for name, place, sure in zip(flat.joint_names, joints, certain, strict=True):
+        index = model.joint_names.index(name)
+        found[index], weight[index], behind[index] = place, sure, name in hidden
+    for side in ("right", "left"):
+        knee, ankle = (model.joint_names.index(f"{side}_{name}") for name in ("knee", "ankle"))
+        found[ankle] = found[ankle] + ANKLE_DROP * (found[ankle] - found[knee])
+    weight[~np.isfinite(found).all(axis=1)] = 0.0
+    made = PuppetJoints(identity, found, weight, behind)
+    return made if np.count_nonzero(made.known) >= MIN_PUPPET_JOINTS else None
+
+
+def carry_puppets(earlier: Sequence[PuppetJoints], later: Sequence[PuppetJoints], share: float) -> list[PuppetJoints]:
+    """Return the puppets at a time between or beyond two images: `share` 0 is the earlier one, 1 the later one.
+
+    Joints move evenly. A puppet that only one of the images has stays where it is, if that image is the nearer one.
+    """
+    before = {puppet.id: puppet for puppet in earlier if puppet.id}
+    after = {puppet.id for puppet in later if puppet.id}
+    nearer_is_later = share >= 0.5
+    found = []
+    for puppet in later:
+        known = before.get(puppet.id)
+        if known is not None:
+            moved = known.pixels + share * (puppet.pixels - known.pixels)
+            base = puppet if nearer_is_later else known
+            found.append(replace(base, pixels=np.where(np.isfinite(moved), moved, base.pixels)))
+        elif nearer_is_later:
+            found.append(puppet)
+    if not nearer_is_later:
+        found += [puppet for puppet in earlier if puppet.id not in after]
+    return found
+
+
+def trunk_rows(model: StitchedPuppet) -> list[int]:
+    """Return the rows of the joints of trunk and head that puppets have."""
+    return [model.joint_names.index(name) for name in _TRUNK]
+
+
+@lru_cache(maxsize=1)
+def _load_flat_model() -> DeformableStructures:
+    return DeformableStructures.load("neutral", 14)

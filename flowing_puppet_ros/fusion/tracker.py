@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Track the people whom a camera sees as puppets through the clouds of a sensor, each under the puppet's id.
+
+puppet | depth | what is done
+yes    | yes   | the body moves on by a few steps, with the joints as soft evidence across their rays;
+|       | a new or lost one is fitted anew from the joints
+yes    | no    | the person keeps the id and has no body in this cloud
+no     | yes   | who is known is tracked by the cloud alone for as long as ids are held; nobody is new
+no     | no    | the id is held for a while
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from flowing_puppet_ros.arrays import Bools
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.segmentation.planes import PlaneCache
+from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
+from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
+from flowing_puppet_ros.fusion.people_fitter import Claim, PeopleFitter, make_person
+from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints
+from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
+from flowing_puppet_ros.model.sp import BodyState
+from flowing_puppet_ros.reporting import Report
+from flowing_puppet_ros.threads import one_blas_thread, parallel_map
+
+REFIT_INTERVAL_NS = 1_000_000_000
+"""From one fit of an unreliable body from its joints to the next."""
+MAX_SAME_PERSON_M = 0.6
+"""Between the trunks of a puppet without an id and of the known body that it is."""
+
+
+@dataclass(slots=True, eq=False)
+class _PuppetTrack:
+    """One person: the `stamp` ns of the last sign, that of the last fit from joints, whether it is `proven`."""
+
+    id: str
+    tracker: BodyTracker
+    stamp: int
+    fitted: int = 0
+    proven: bool = False
+    motion: TorsoMotion = field(default_factory=TorsoMotion)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _TrackJob:
+    """What one person is tracked with; `joints` is None without a puppet."""
+
+    track: _PuppetTrack
+    person: PersonCloud
+    claim: Claim | None
+
+
+class FusedTracker:
+    """Tracks the people in view of one camera."""
+
+    def __init__(
+        self, people: PeopleFitter, settings: BodyTrackerSettings, hold: float, report: Report | None = None
+    ) -> None:
+        """Fit with `people`; ids are held for `hold` seconds without a sign of the person."""
+        self._people = people
+        self._settings = settings
+        self._hold_ns = round(1e9 * hold)
+        self._report = report or Report()
+        self._named = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everybody; made-up ids go on, so that none is used twice."""
+        self._tracks: dict[str, _PuppetTrack] = {}
+        self._planes = PlaneCache()
+        self._stamp: int | None = None
+        self._shown: set[str] = set()
+
+    @property
+    def occluded_ids(self) -> list[str]:
+        """Ids of the people who have had a body and have none in the last cloud."""
+        return [track.id for track in self._tracks.values() if track.proven and track.id not in self._shown]
+
+    def step(
+        self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints], stamp: int
+    ) -> tuple[list[TrackedBody], Bools]:
+        """Return the bodies of everybody who is seen, and which points (N,) are theirs.
+
+        Args:
+            cloud: with the pixels of the camera that saw the puppets.
+            image: the cloud's range image, of which each person's field is made.
+            puppets: at the time of the cloud.
+            stamp: of the cloud in nanoseconds; one before the last restarts the tracker.
+        """
+        if self._stamp is not None and stamp < self._stamp:
+            self.reset()
+        self._stamp = stamp
+        with one_blas_thread():
+            jobs, own = self._share_out(cloud, image, self._name(puppets, cloud, stamp), stamp)
+            fits = parallel_map(lambda job: self._track(job, stamp), jobs, self._people.threads)
+        found: list[TrackedBody] = []
+        for job, fit in zip(jobs, fits, strict=True):
+            if isinstance(fit, InputError):
+                self._report.count_unusable(fit)
+            elif fit is not None:
+                job.track.stamp = stamp
+                job.track.proven = job.track.proven or self._people.is_proven(fit)
+                if job.track.proven:
+                    hidden = job.track.tracker.hidden
+                    found.append(job.track.motion.add(job.track.id, stamp, fit, hidden))
+        self._shown = {body.id for body in found}
+        self._report.counters["tracked people"] += len(found)
+        self._drop_lost(stamp)
+        return sorted(found, key=lambda body: (len(body.id), body.id)), own
+
+    def _share_out(
+        self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints], stamp: int
+    ) -> tuple[list[_TrackJob], Bools]:
+        """Return what everybody is tracked with, and which points (N,) are anybody's."""
+        clear, floor = self._people.find_clear(cloud.points, self._planes)
+        seen = {puppet.id for puppet in puppets}
+        known = {identity: track.tracker.predict(stamp) for identity, track in self._tracks.items()}
+        alone = {identity: body for identity, body in known.items() if body is not None and identity not in seen}
+        bodies: list[BodyState | None] = [known.get(puppet.id) for puppet in puppets]
+        claims, unclaimed = self._people.claim(cloud, puppets, clear, bodies, list(alone.values()))
+        jobs = []
+        for claim in claims:
+            track = self._tracks.get(claim.puppet.id) or self._start_track(claim.puppet.id, stamp)
+            jobs.append(_TrackJob(track, make_person(cloud, image, claim.own, floor, stamp), claim))
+        for identity, own in zip(alone, unclaimed, strict=True):
+            if np.count_nonzero(own) >= self._people.min_points:
+                person = make_person(cloud, image, own, floor, stamp)
+                jobs.append(_TrackJob(self._tracks[identity], person, None))
+        for puppet in puppets:
+            if puppet.id in self._tracks:
+                self._tracks[puppet.id].stamp = stamp
+        anybody = np.zeros(len(cloud.points), dtype=bool)
+        for job in jobs:
+            anybody[job.person.rows] = True
+        return jobs, anybody
+
+    def _track(self, job: _TrackJob, stamp: int) -> BodyFit | InputError | None:
+        """Return the person's body: tracked, or fitted from the joints where there is none, or none that is good."""
+        tracker, claim = job.track.tracker, job.claim
+        try:
+            targets = None if claim is None else self._make_targets(claim, tracker.predict(stamp))
+            fit = tracker.track(job.person, targets)
+            if claim is None:
+                return None if tracker.lost else fit
+            doubtful = fit is not None and not fit.reliable and not tracker.hidden
+            doubtful = doubtful and stamp - job.track.fitted >= REFIT_INTERVAL_NS
+            if fit is None or tracker.lost or doubtful:
+                job.track.fitted = stamp
+                fresh = self._people.fit_claim(claim, job.person)
+                if fit is None or (fresh is not None and fresh.two_way_distance < fit.two_way_distance):
+                    if fresh is not None:
+                        tracker.start(job.person, fresh)
+                    return fresh
+                tracker.accept()
+        except InputError as error:
+            return error
+        return fit
+
+    def _make_targets(self, claim: Claim, body: BodyState | None) -> JointTargets:
+        """Return the joints' pull; those without a depth are at the predicted body's, since only their rays count."""
+        targets = self._people.joint_fitter.make_targets(claim.joints)
+        if body is None or targets.rays is None:
+            return targets
+        return self._people.complete_targets(claim, targets, body)
+
+    def _name(self, puppets: Sequence[PuppetJoints], cloud: SeenCloud, stamp: int) -> list[PuppetJoints]:
+        """Return the puppets with ids: those without one get that of the known body at their place, or a new one."""
+        named = [puppet for puppet in puppets if puppet.id]
+        nameless = [puppet for puppet in puppets if not puppet.id]
+        if not nameless:
+            return named
+        free = {
+            identity: cloud.camera.project(self._people.find_trunk(track.tracker.last.state))
+            for identity, track in self._tracks.items()
+            if track.tracker.last is not None and all(puppet.id != identity for puppet in named)
+        }
+        pairs = []
+        for number, puppet in enumerate(nameless):
+            for identity, (pixel, depth) in free.items():
+                apart = float(np.linalg.norm(self._people.find_trunk_pixel(puppet) - pixel))
+                pairs.append((apart * float(depth) / cloud.camera.focal, number, identity))
+        names: dict[int, str] = {}
+        for gap, number, identity in sorted(pairs):
+            if gap < MAX_SAME_PERSON_M and number not in names and identity not in names.values():
+                names[number] = identity
+        for number, puppet in enumerate(nameless):
+            if number not in names:
+                self._named += 1
+                names[number] = f"p{self._named}"
+            named.append(replace(puppet, id=names[number]))
+        return named
+
+    def _start_track(self, identity: str, stamp: int) -> _PuppetTrack:
+        track = _PuppetTrack(identity, BodyTracker(self._people.fitter, self._settings), stamp)
+        self._tracks[identity] = track
+        return track
+
+    def _drop_lost(self, stamp: int) -> None:
+        for identity, track in list(self._tracks.items()):
+            if stamp - track.stamp > self._hold_ns:
+                self._report.counters["lost people"] += track.proven
+                del self._tracks[identity]

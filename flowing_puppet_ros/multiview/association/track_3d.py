@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is remembered of a person in space: where the joints were and went, how large, what colours, whose tracks."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64
+
+_VELOCITY_SHARE = 0.3  # of the newest displacement in the smoothed velocity
+_MAX_SPEED_M_S = 4.0
+_MAX_EXTRAPOLATION_S = 0.5
+_SIZES = 101  # in the running median of sizes
+_BONES = (
+    *(("shoulder", "elbow"), ("elbow", "wrist"), ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle")),
+    *(("shoulder", "shoulder"), ("hip", "hip")),
+)
+
+
+@dataclass(slots=True, eq=False)
+class PersonTrack3D:
+    """A person in space.
+
+    Attributes:
+        id: unique in the run.
+        joints: (J, 3) m where they were last placed, NaN where never.
+        stamp: ns, when two views last agreed.
+        velocity: (3,) m/s of the body.
+        members: camera -> id in that camera's tracker, of the last set.
+        votes: (camera, id in it) -> sets in which they were this person.
+        colours: camera -> histogram of the torso.
+        bones: pairs of joints whose distance does not change.
+    """
+
+    id: str
+    joints: F64
+    stamp: int
+    velocity: F64 = field(default_factory=lambda: np.zeros(3))
+    members: dict[str, str] = field(default_factory=dict)
+    votes: dict[tuple[str, str], int] = field(default_factory=dict)
+    colours: dict[str, F64] = field(default_factory=dict)
+    bones: Sequence[tuple[int, int]] = ()
+    _sizes: deque[F64] = field(default_factory=lambda: deque(maxlen=_SIZES))
+
+    @property
+    def centre(self) -> F64:
+        """Middle (3,) of the joints, m."""
+        return np.asarray(np.nanmedian(self.joints, axis=0))
+
+    def predict(self, stamp: int) -> F64:
+        """Return the joints (J, 3) m expected at a stamp, ns."""
+        seconds = min(max(0.0, (stamp - self.stamp) * 1e-9), _MAX_EXTRAPOLATION_S)
+        return self.joints + self.velocity * seconds
+
+    def update(self, stamp: int, joints: F64) -> None:
+        """Take joints (J, 3) m, NaN where unknown: those keep moving with the body."""
+        seconds = (stamp - self.stamp) * 1e-9
+        known = np.isfinite(joints).all(axis=1)
+        if 0 < seconds < _MAX_EXTRAPOLATION_S:
+            both = known & np.isfinite(self.joints).all(axis=1)
+            if both.any():
+                newest = np.median((joints - self.joints)[both], axis=0) / seconds
+                speed = float(np.linalg.norm(newest))
+                newest *= min(1.0, _MAX_SPEED_M_S / max(speed, 1e-9))
+                self.velocity = (1 - _VELOCITY_SHARE) * self.velocity + _VELOCITY_SHARE * newest
+        else:
+            self.velocity = np.zeros(3)
+        self.joints = np.where(known[:, None], joints, self.predict(stamp))
+        self.stamp = stamp
+        self._sizes.append(measure_sizes(joints, self.bones))
+
+    def relocate(self, stamp: int, joints: F64) -> None:
+        """Start again somewhere else, as the same person."""
+        self.joints, self.stamp, self.velocity = joints.copy(), stamp, np.zeros(3)
+        self.members = {}
+
+    def compare_size(self, joints: F64) -> float:
+        """Return the median relative difference of joint distances to a person with joints (J, 3) m; NaN if unknown."""
+        if not self._sizes:
+            return np.nan
+        with np.errstate(all="ignore"):
+            own = np.nanmedian(np.stack(self._sizes), axis=0)
+            ratio = np.abs(np.log(measure_sizes(joints, self.bones) / own))
+        ratio = ratio[np.isfinite(ratio)]
+        return float(np.median(ratio)) if len(ratio) else np.nan
+
+
+def find_bones(names: Sequence[str]) -> list[tuple[int, int]]:
+    """Return the pairs of joints, by their places in `names`, between which a bone or the stiff trunk lies."""
+    place = {name: index for index, name in enumerate(names)}
+    pairs = []
+    for first, second in _BONES:
+        for side in ("left", "right"):
+            other = "right" if first == second else side
+            ends = f"{side}_{first}", f"{other}_{second}"
+            if ends[0] != ends[1] and all(end in place for end in ends):
+                pairs.append((place[ends[0]], place[ends[1]]))
+    return pairs
+
+
+def measure_sizes(joints: F64, bones: Sequence[tuple[int, int]]) -> F64:
+    """Return the lengths (B,) m of bones between joints (J, 3), NaN where unknown."""
+    if not bones:
+        return np.zeros(0)
+    first, second = np.array(bones).T
+    return np.asarray(np.linalg.norm(joints[first] - joints[second], axis=1))

@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Bundle adjustment over joints: cameras and clocks by least squares, the joints themselves eliminated.
+
+For given cameras the best place of each joint follows in closed form from its rays (variable projection), so that only
+the cameras are unknown. Weights are those of a robust loss, fixed within a round and found anew after it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.multiview.bundle.joint_tracks import PeopleTracks
+from flowing_puppet_ros.multiview.camera import Camera
+
+_MAX_INSTANTS = 60
+_SCALES_PX = (20.0, 10.0, 6.0, 5.0, 5.0)  # of the robust loss, round by round, at 1000 px focal length
+_TRIANGULATION_STEPS = 4
+_MAX_EVALUATIONS = 8  # of derivatives in a round
+# How far a camera is expected to be from where the former calibration has it: this keeps what the joints leave free,
+# and is robust, so that a camera that was pushed is not held back.
+_TURN, _MOVE_M, _CLOCK_PERIODS, _FOCAL, _CENTRE = np.radians(0.3), 0.02, 3.0, 0.003, 0.003
+_PRIOR_JOINTS = 10.0  # joints that weigh as much as the expectation
+_CLOCK_STEP = 0.25  # periods over which the velocity of joints is measured
+
+
+@dataclass(frozen=True, slots=True)
+class Freedom:
+    """What is adjusted beside the extrinsics: clocks, and focal length and principal point of each camera."""
+
+    clocks: bool = True
+    intrinsics: bool = False
+
+    @property
+    def per_camera(self) -> int:
+        """Number of unknowns of a camera: turn (3), move (3), clock, focal length, principal point (2)."""
+        return 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjusted:
+    """Cameras and clocks: `cameras` by name, and `offsets` in seconds to add to each camera's stamps."""
+
+    cameras: dict[str, Camera]
+    offsets: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Instants:
+    """Rays of the joints at chosen instants: times (M,) s, and the tracks of each person."""
+
+    times: F64
+    tracks: PeopleTracks
+    names: tuple[str, ...]
+
+    def observe(self, offsets: F64) -> tuple[F64, F64]:
+        """Return the joints (C, N, 2) on the image planes and weights (C, N), with a camera's `offsets` (C,) s."""
+        count = len(self.tracks.names)
+        people = list(self.tracks.tracks.values())
+        size = len(self.times), count
+        plane, weight = [], []
+        for name, offset in zip(self.names, offsets, strict=True):
+            found = [
+                person[name].interpolate(self.times - offset)
+                if name in person
+                else (np.zeros((*size, 2)), np.zeros(size))
+                for person in people
+            ]
+            plane.append(np.concatenate([each.reshape(-1, 2) for each, _ in found]))
+            weight.append(np.concatenate([each.reshape(-1) for _, each in found]))
+        return np.stack(plane), np.stack(weight)
+
+
+def choose_instants(tracks: PeopleTracks, names: Sequence[str]) -> _Instants:
+    """Return instants that are spread over the time in which people are seen."""
+    first, last = tracks.span
+    count = int(min(_MAX_INSTANTS, max(2, round((last - first) / tracks.period))))
+    times = np.linspace(first, last, count + 2)[1:-1]
+    return _Instants(times, tracks, tuple(names))
+
+
+def triangulate_linear(rotation: F64, translation: F64, plane: F64, weight: F64) -> F64:
+    """Return the points (N, 3) nearest to weighted rays: the minimum of the squared error on the image planes.
+
+    `rotation` (C, 3, 3), `translation` (C, 3), `plane` (C, N, 2), `weight` (C, N); NaN with fewer than two rays. The
+    linear solution is refined by dividing by the depths that it finds.
+    """
+    depth = np.ones(weight.shape)
+    points = np.full((weight.shape[1], 3), np.nan)
+    enough = (weight > 0).sum(axis=0) >= 2
+    for _ in range(_TRIANGULATION_STEPS):
+        scale = np.sqrt(weight) / depth
+        # (R_xy - plane R_z) X = plane t_z - t_xy
+        rows = (rotation[:, None, :2] - plane[..., None] * rotation[:, None, 2:]) * scale[..., None, None]
+        right = (plane * translation[:, None, 2:] - translation[:, None, :2]) * scale[..., None]
+        normal = np.einsum("cnij,cnik->njk", rows, rows) + 1e-12 * np.eye(3)
+        points = np.linalg.solve(normal, np.einsum("cnij,cni->nj", rows, right)[..., None])[..., 0]
+        depth = np.einsum("cj,nj->cn", rotation[:, 2], points) + translation[:, None, 2]
+        depth = np.where(depth > 0.1, depth, 0.1)
+    return np.where(enough[:, None], points, np.nan)
+
+
+def measure_residuals(rotation: F64, translation: F64, plane: F64, points: F64) -> F64:
+    """Return projections minus observations (C, N, 2) on the image planes; 0 where `points` (N, 3) are NaN."""
+    local = np.einsum("cij,nj->cni", rotation, points) + translation[:, None]
+    return np.nan_to_num(local[..., :2] / np.maximum(local[..., 2:], 0.1) - plane)
+
+
+def adjust(
+    cameras: Mapping[str, Camera],
+    offsets: Mapping[str, float],
+    former: Mapping[str, Camera],
+    tracks: PeopleTracks,
+    freedom: Freedom,
+) -> Adjusted:
+    """Adjust cameras and clocks to the tracks, starting from `cameras` and expecting them near the `former` ones.
+
+    The first camera's clock is the common one.
+    """
+    names = list(cameras)
+    instants = choose_instants(tracks, names)
+    start = np.array([offsets.get(name, 0.0) for name in names])
+    state, expected = (
+        _State.of([cameras[name] for name in names], start),
+        _State.of([former[name] for name in names], start),
+    )
+    focal = np.array([cameras[name].focal for name in names])
+    for scale in _SCALES_PX:
+        state = _adjust_round(state, expected, instants, focal, scale, freedom)
+    found = {name: state.apply(index, cameras[name]) for index, name in enumerate(names)}
+    return Adjusted(found, {name: float(state.offset[index]) for index, name in enumerate(names)})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _State:
+    """Cameras as arrays: rotation (C, 3, 3), centre (C, 3), offset (C,) s, lens (C, 3): focal factor, centre."""
+
+    rotation: F64
+    centre: F64
+    offset: F64
+    lens: F64
+
+    @classmethod
+    def of(cls, cameras: Sequence[Camera], offset: F64) -> _State:
+        """Return the state of cameras whose lenses are as they are."""
+        rotation, centre = np.stack([c.rotation for c in cameras]), np.stack([c.centre for c in cameras])
+        return cls(rotation, centre, offset, np.tile([1.0, 0.0, 0.0], (len(cameras), 1)))
+
+    @property
+    def translation(self) -> F64:
+        """World to camera (C, 3), m."""
+        return -np.einsum("cij,cj->ci", self.rotation, self.centre)
+
+    def move(self, step: F64, period: float) -> _State:
+        """Return the state after a step (C, 10): turn of the camera, move of its centre, clock, lens."""
+        turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+        return _State(
+            turn @ self.rotation, self.centre + step[:, 3:6], self.offset + step[:, 6] * period, self.lens + step[:, 7:]
+        )
+
+    def subtract(self, other: _State, period: float) -> F64:
+        """Return the step (C, 10) that leads from another state here."""
+        turn = Rotation.from_matrix(self.rotation @ np.swapaxes(other.rotation, 1, 2)).as_rotvec()
+        clock = (self.offset - other.offset)[:, None] / period
+        return np.concatenate([turn, self.centre - other.centre, clock, self.lens - other.lens], axis=1)
+
+    def to_plane(self, plane: F64) -> F64:
+        """Return points (C, N, 2) on the image planes of the former lenses on those of these."""
+        return (plane - self.lens[:, None, 1:]) / self.lens[:, None, :1]
+
+    def apply(self, index: int, camera: Camera) -> Camera:
+        """Return a camera with what was found for it."""
+        factor, cx, cy = self.lens[index]
+        matrix = camera.matrix.copy()
+        matrix[:2, 2] += matrix[:2, :2] @ np.array([cx, cy])
+        matrix[:2, :2] *= factor
+        return replace(camera, matrix=matrix, rotation=self.rotation[index], translation=self.translation[index])
+
+
+def _adjust_round(
+    state: _State, expected: _State, instants: _Instants, focal: F64, scale: float, freedom: Freedom
+) -> _State:
+    """Adjust with the weights of the robust loss at the state, of width `scale` px at 1000 px focal length."""
+    cameras, period, width = len(focal), instants.tracks.period, scale / 1000.0
+    plane, confidence = instants.observe(state.offset)
+    weight = _reweight(state, state.to_plane(plane), confidence, width)
+    used = (weight > 0).sum(axis=0) >= 2
+    plane, weight = plane[:, used], weight[:, used]
+    # Joints move with their images' velocity while the clock is adjusted; positive offsets show earlier images.
+    later, earlier = (instants.observe(state.offset + side * _CLOCK_STEP * period)[0][:, used] for side in (-1, 1))
+    velocity = (later - earlier) / (2 * _CLOCK_STEP)
+    free = np.zeros((cameras, freedom.per_camera), bool)
+    free[:, :6] = True
+    free[1:, 6] = freedom.clocks
+    free[:, 7:] = freedom.intrinsics
+    sigma = np.array([_TURN] * 3 + [_MOVE_M] * 3 + [_CLOCK_PERIODS, _FOCAL, _CENTRE, _CENTRE])
+    root = np.sqrt(weight)[..., None] * (focal / focal.mean())[:, None, None] / width
+    deviation = state.subtract(expected, period) / sigma
+    # Cauchy's weights: of turn and move of each camera together, as the sum of their squares has it.
+    trust = np.sqrt(_PRIOR_JOINTS / (1 + (deviation[:, :6] ** 2).sum(axis=1, keepdims=True) / 6))
+
+    def unpack(values: F64) -> F64:
+        step = np.zeros((cameras, freedom.per_camera))
+        step[free] = values
+        return step
+
+    def residuals(values: F64) -> F64:
+        step = unpack(values)
+        moved = state.move(step, period)
+        seen = moved.to_plane(plane - step[:, 6, None, None] * velocity)
+        points = triangulate_linear(moved.rotation, moved.translation, seen, weight)
+        error = measure_residuals(moved.rotation, moved.translation, seen, points)
+        off = trust * (deviation + step / sigma)
+        return np.concatenate([(root * error).ravel(), off[free]])
+
+    start, units = np.zeros(int(free.sum())), np.broadcast_to(sigma, free.shape)[free]
+    found = least_squares(residuals, start, x_scale=units, diff_step=1e-4, max_nfev=_MAX_EVALUATIONS)
+    return state.move(unpack(found.x), period)
+
+
+def _reweight(state: _State, plane: F64, confidence: F64, width: float) -> F64:
+    """Return the weights (C, N) of Geman-McClure at the robust places of the joints."""
+    weight = confidence
+    for _ in range(8):
+        points = triangulate_linear(state.rotation, state.translation, plane, weight)
+        error = np.linalg.norm(measure_residuals(state.rotation, state.translation, plane, points), axis=2)
+        weight = confidence / (1 + (error / width) ** 2) ** 2
+    return weight

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A rig refined by the people in its images: cameras, clocks, and how well they agree before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.multiview.association.height import measure_height
+from flowing_puppet_ros.multiview.association.settings import AssociationSettings
+from flowing_puppet_ros.multiview.bundle.adjustment import (
+    Adjusted,
+    Freedom,
+    adjust,
+    choose_instants,
+    measure_residuals,
+    triangulate_linear,
+)
+from flowing_puppet_ros.multiview.bundle.clocks import find_coarse_offsets
+from flowing_puppet_ros.multiview.bundle.gauge import match_baselines, place_as_before, scale_to
+from flowing_puppet_ros.multiview.bundle.joint_tracks import CameraFrames, PeopleTracks, associate_tracks
+from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
+
+# People are associated although cameras are off by some degrees and clocks by some images.
+_ASSOCIATION = AssociationSettings(max_epipolar_distance=0.35, max_joint_distance=0.6, max_view_error=0.35)
+_TRIANGULATION = TriangulationSettings(max_ray_distance=0.3)
+_MIN_OBSERVATIONS = 60  # joints of a camera at all instants
+_PASSES = 2  # the second associates people by the cameras of the first
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """What fixes the size: the former baselines, or `distance` m of two `cameras`, or a person's `height` m."""
+
+    cameras: tuple[str, str] | None = None
+    distance: float = 0.0
+    height: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Agreement:
+    """Distances of joints from their projections by camera, px, mean and median over all of them."""
+
+    mean: dict[str, float]
+    median: dict[str, float]
+    all_mean: float
+    all_median: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedRig:
+    """A refined rig: cameras, seconds to add to each camera's stamps, agreement before and after, heights m."""
+
+    cameras: dict[str, Camera]
+    offsets: dict[str, float]
+    before: Agreement
+    after: Agreement
+    heights: dict[str, float]
+    period: float
+
+
+def refine_rig(
+    names: Sequence[str],
+    cameras: Mapping[str, Camera],
+    frames: CameraFrames,
+    freedom: Freedom,
+    scale: Scale,
+    max_offset: float = 1.0,
+) -> RefinedRig:
+    """Refine approximate `cameras` by the people in their `frames`, whose joints are called `names`.
+
+    PuppetError when no person is seen by two cameras long enough, or a camera sees nobody whom others see.
+    """
+    coarse = find_coarse_offsets(names, cameras, frames, max_offset) if freedom.clocks else dict.fromkeys(cameras, 0.0)
+    current = Adjusted(dict(cameras), coarse)
+    first: PeopleTracks | None = None
+    for _ in range(_PASSES):
+        tracks = associate_tracks(names, current.cameras, frames, current.offsets, _ASSOCIATION, _TRIANGULATION)
+        _check_tracks(tracks, list(cameras))
+        first = first or tracks
+        current = adjust(current.cameras, current.offsets, cameras, tracks, freedom)
+        factor = match_baselines(current.cameras, cameras)
+        current = replace(current, cameras=place_as_before(scale_to(current.cameras, factor), cameras))
+    assert first is not None
+    factor, heights = _find_scale(tracks, current, scale)
+    zero = dict.fromkeys(cameras, 0.0)
+    return RefinedRig(
+        scale_to(current.cameras, factor),
+        current.offsets,
+        measure_agreement(cameras, zero, tracks),
+        measure_agreement(current.cameras, current.offsets, tracks),
+        {person: height * factor for person, height in heights.items()},
+        tracks.period,
+    )
+
+
+def _check_tracks(tracks: PeopleTracks, names: list[str]) -> None:
+    counts = dict.fromkeys(names, 0)
+    for person in tracks.tracks.values():
+        for name, track in person.items():
+            counts[name] += int(np.count_nonzero(track.weight))
+    poor = [name for name, count in counts.items() if count < _MIN_OBSERVATIONS]
+    if poor:
+        raise PuppetError(
+            f"{', '.join(poor)} shows nobody whom the other cameras show: check that the calibration belongs to these "
+            "videos, that no two cameras are swapped, and that people walk where several cameras see them"
+        )
+
+
+def _find_scale(tracks: PeopleTracks, rig: Adjusted, scale: Scale) -> tuple[float, dict[str, float]]:
+    """Return the factor for all lengths and everybody's height before it, m."""
+    joints, people = _triangulate_everybody(tracks, rig.cameras, rig.offsets)
+    heights = {person: measure_height(tracks.names, each) for person, each in zip(people, joints, strict=True)}
+    known = {person: height for person, height in heights.items() if np.isfinite(height)}
+    if scale.cameras is not None:
+        unknown = [name for name in scale.cameras if name not in rig.cameras]
+        if unknown:
+            raise InputError(f"there is no camera {unknown[0]!r}; the cameras are {', '.join(rig.cameras)}")
+        first, second = (rig.cameras[name].centre for name in scale.cameras)
+        return scale.distance / float(np.linalg.norm(first - second)), known
+    if scale.height:
+        if not known:
+            raise InputError("nobody's legs and trunk are seen by two cameras: the height fixes no scale")
+        return scale.height / next(iter(known.values())), known
+    return 1.0, known
+
+
+def _triangulate_everybody(
+    tracks: PeopleTracks, cameras: Mapping[str, Camera], offsets: Mapping[str, float]
+) -> tuple[F64, list[str]]:
+    """Return the joints (P, T, J, 3) m of everybody at the chosen instants, and their ids."""
+    instants = choose_instants(tracks, list(cameras))
+    plane, weight = instants.observe(np.array([offsets.get(name, 0.0) for name in cameras]))
+    points = triangulate_linear(*_poses(cameras), plane, weight)
+    return points.reshape(len(tracks.tracks), len(instants.times), len(tracks.names), 3), list(tracks.tracks)
+
+
+def _poses(cameras: Mapping[str, Camera]) -> tuple[F64, F64]:
+    return np.stack([c.rotation for c in cameras.values()]), np.stack([c.translation for c in cameras.values()])
+
+
+def measure_agreement(cameras: Mapping[str, Camera], offsets: Mapping[str, float], tracks: PeopleTracks) -> Agreement:
+    """Measure how far joints are from the projections of their least-squares place in space, px."""
+    instants = choose_instants(tracks, list(cameras))
+    plane, weight = instants.observe(np.array([offsets.get(name, 0.0) for name in cameras]))
+    poses = _poses(cameras)
+    points = triangulate_linear(*poses, plane, weight)
+    focal = np.array([camera.focal for camera in cameras.values()])
+    error = np.linalg.norm(measure_residuals(*poses, plane, points), axis=2) * focal[:, None]
+    used = (weight > 0) & np.isfinite(points).all(axis=1)
+    by_camera = {name: error[k][used[k]] for k, name in enumerate(cameras) if used[k].any()}
+    return Agreement(
+        {name: float(each.mean()) for name, each in by_camera.items()},
+        {name: float(np.median(each)) for name, each in by_camera.items()},
+        float(error[used].mean()) if used.any() else float("nan"),
+        float(np.median(error[used])) if used.any() else float("nan"),
+    )

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fit bodies to the people before a camera with colour and depth: `ros2 launch flowing_puppet_ros rgbd.launch.py`.
+
+`camera:=/camera` names the driver's namespace; without it there may be one camera only. The layouts of RealSense,
+Orbbec, ZED, Azure Kinect, HSR and OpenNI drivers are known.
+"""
+
+from __future__ import annotations
+
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+from flowing_puppet_ros.node.launching.actions import Values, describe_launch, humans, make_node
+from flowing_puppet_ros.node.launching.rgbd_topics import find_rgbd
+
+ARGUMENTS = {
+    "camera": ("", "namespace of the camera's driver; empty: that of the only camera with colour and depth"),
+    "detections": ("detections", "keypoints of people that another node finds, if one does"),
+}
+
+
+def start(values: Values) -> list[Node]:
+    """Return the tracker of the colour images, and the body fitter that joins its puppets with the depth images."""
+    topics = find_rgbd(values["camera"])
+    tracker = make_node(values, "puppet_tracker", {"image": topics.image, "detections": values["detections"]})
+    inputs = {"depth": topics.depth, "camera_info": topics.depth_info, "puppets/camera_info": topics.image_info}
+    chosen = {"fusion.rectified": True} if topics.rectified else {}
+    return [tracker, make_node(values, "body_fitter", inputs, **chosen, **humans(values))]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return the arguments and the nodes that follow from them."""
+    return describe_launch(ARGUMENTS, start)

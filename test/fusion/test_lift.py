@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Joints lifted into clouds of planes and boxes, where the depth is known."""
+
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.fusion.lift import lift_joints
+from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints
+from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.multiview.camera import Camera
+
+PLACES = {
+    "neck": (320, 150), "belly": (320, 250), "right_shoulder": (280, 170), "left_shoulder": (360, 170),
+    "right_hip": (300, 280), "left_hip": (340, 280), "right_elbow": (250, 220), "left_elbow": (390, 220),
+    "left_wrist": (400, 270), "right_wrist": (240, 270),
+}  # fmt: skip
+
+
+def camera(aside: float = 0.0, lens: tuple[float, ...] = ()) -> Camera:
+    return Camera.from_info([500, 0, 320, 0, 500, 240, 0, 0, 1], lens, 640, 480, np.eye(3), [-aside, 0, 0])
+
+
+def wall(depth: float, low: float = -1.5, high: float = 1.5, step: float = 0.008) -> np.ndarray:
+    """Return the points of a wall at a depth, between two x."""
+    x, y = np.meshgrid(np.arange(low, high, step), np.arange(-1.2, 1.2, step))
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, depth)], axis=1)
+
+
+def puppet(model: StitchedPuppet, **moved: tuple[float, float]) -> PuppetJoints:
+    pixels, confidence = np.full((len(model.joint_names), 2), np.nan), np.zeros(len(model.joint_names))
+    for name, place in {**PLACES, **moved}.items():
+        pixels[model.joint_names.index(name)] = place
+        confidence[model.joint_names.index(name)] = 0.8
+    return PuppetJoints("a1", pixels, confidence, np.zeros(len(confidence), dtype=bool))
+
+
+@pytest.mark.parametrize(("aside", "lens"), [(0.0, ()), (0.05, ()), (0.0, (0.1, -0.2, 0.001, 0.0, 0.05))])
+def test_joints_lie_behind_the_surface_on_their_rays(
+    model: StitchedPuppet, aside: float, lens: tuple[float, ...]
+) -> None:
+    seen = SeenCloud.of(wall(2.5), camera(aside, lens))
+    lifted = lift_joints(model, puppet(model), seen, np.ones(len(seen.points), dtype=bool))
+    elbow, hip = model.joint_names.index("left_elbow"), model.joint_names.index("left_hip")
+    for row, behind in ((elbow, 0.04), (hip, 0.10)):
+        ray = lifted.rays[row]
+        on_wall = np.array([aside, 0, 0]) + ray * 2.5 / ray[2]
+        np.testing.assert_allclose(lifted.points[row], on_wall + behind * ray, atol=1e-6)
+        np.testing.assert_allclose(
+            camera(aside, lens).project(lifted.points[row])[0], puppet(model).pixels[row], atol=1e-6
+        )
+    assert lifted.depth == pytest.approx(2.5)
+
+
+def test_a_joint_without_points_has_no_depth_and_no_confidence(model: StitchedPuppet) -> None:
+    seen = SeenCloud.of(wall(2.5), camera())
+    usable = seen.points[:, 0] < 0.3  # what is to the right belongs to somebody else
+    lifted = lift_joints(model, puppet(model), seen, usable)
+    row = model.joint_names.index("left_wrist")
+    assert not lifted.found[row]
+    assert lifted.confidence[row] == 0
+    assert np.isfinite(lifted.rays[row]).all()
+    assert lifted.confidence[model.joint_names.index("right_wrist")] == 0.8
+
+
+def test_what_lies_far_behind_the_trunk_is_not_the_person(model: StitchedPuppet) -> None:
+    cloud = np.concatenate([wall(2.5, -0.3, 0.3), wall(4.5, 0.3, 2.5)])
+    lifted = lift_joints(
+        model, puppet(model, left_wrist=(460, 270)), SeenCloud.of(cloud, camera()), np.full(len(cloud), True)
+    )
+    assert not lifted.found[model.joint_names.index("left_wrist")]
+
+
+def test_a_limb_whose_surface_falls_back_has_missed_it_and_one_that_comes_nearer_has_not(model: StitchedPuppet) -> None:
+    behind = np.concatenate([wall(2.5, -1.5, 0.36), wall(2.75, 0.41, 1.5)])
+    before = np.concatenate([wall(2.5, -1.5, 0.36), wall(2.2, 0.36, 1.5)])
+    row = model.joint_names.index("left_wrist")
+    for cloud, expected in ((behind, True), (before, False), (wall(2.5), False)):
+        lifted = lift_joints(model, puppet(model), SeenCloud.of(cloud, camera()), np.full(len(cloud), True))
+        assert lifted.hidden[row] == expected
+        assert not lifted.hidden[model.joint_names.index("right_wrist")]
+
+
+def test_nothing_is_found_in_no_points(model: StitchedPuppet) -> None:
+    lifted = lift_joints(model, puppet(model), SeenCloud.of(wall(2.5), camera()), np.zeros(len(wall(2.5)), dtype=bool))
+    assert not lifted.found.any()
+    assert np.isnan(lifted.depth)
+
+
+def test_a_camera_beside_the_sensor_does_not_see_what_something_nearer_hides_from_it() -> None:
+    board = wall(1.0, -0.2, 0.2)
+    cloud = np.concatenate([board, wall(3.0)])
+    seen = SeenCloud.of(cloud, camera(aside=0.3))
+    # The camera 0.3 m to the right looks past the board's right edge at x = 0.2 to x = 0.0 on the wall.
+    hidden = ~seen.seen[len(board) :]
+    x, y = cloud[len(board) :, 0], cloud[len(board) :, 1]
+    deep = (np.abs(y) < 0.8) & seen.in_view[len(board) :]
+    assert hidden[deep & (x > -1.1) & (x < -0.1)].mean() > 0.97
+    assert not hidden[deep & (x > 0.1) & (x < 1.2)].any()
+    assert (seen.seen | ~seen.in_view)[: len(board)].all()

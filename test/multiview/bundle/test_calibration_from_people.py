@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras and clocks found from people who walk, against those with which their pixels were made."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from walkers import NAMES, photograph, ring, walker  # type: ignore[import-not-found]
+
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.multiview.bundle.adjustment import Freedom
+from flowing_puppet_ros.multiview.bundle.calibrate import RefinedRig, Scale, refine_rig
+from flowing_puppet_ros.multiview.bundle.clocks import find_coarse_offsets
+from flowing_puppet_ros.multiview.bundle.joint_tracks import CameraFrames
+from flowing_puppet_ros.multiview.camera import Camera
+
+RATE = 30.0
+CAMERAS = ring()
+
+
+def people_at(t: float) -> dict[str, F64]:
+    """Return two people who walk in circles, each the other way round."""
+    a = 0.9 * t
+    return {
+        "ann": walker((1.2 * np.cos(a), 1.2 * np.sin(a)), a + np.pi / 2, 6 * t, 1.65),
+        "bob": walker((0.6 * np.sin(a), -0.8 * np.cos(a)), a, 5 * t, 1.85),
+    }
+
+
+def record(late: dict[str, float] | None = None, count: int = 90, noise: float = 2.0) -> CameraFrames:
+    """Return what the cameras' trackers say; the clock of a camera is `late` by so many images."""
+    random = np.random.default_rng(5)
+    found: dict[str, list[tuple[float, list[object]]]] = {name: [] for name in CAMERAS}
+    for k in range(count):
+        for name, camera in CAMERAS.items():
+            group = photograph({name: camera}, people_at(k / RATE), noise, random, hide=False)[name]
+            found[name].append((k / RATE + (late or {}).get(name, 0.0) / RATE, group))
+    return found  # type: ignore[return-value]
+
+
+def turn(camera: Camera, degrees: float, axis: tuple[float, float, float]) -> Camera:
+    """Return a camera that was turned where it stands."""
+    rotation = Rotation.from_rotvec(np.radians(degrees) * np.array(axis)).as_matrix() @ camera.rotation
+    return replace(camera, rotation=rotation, translation=-rotation @ camera.centre)
+
+
+def angle(one: Camera, other: Camera) -> float:
+    return float(np.degrees(Rotation.from_matrix(one.rotation @ other.rotation.T).magnitude()))
+
+
+@pytest.fixture(scope="module")
+def refined() -> RefinedRig:
+    """A rig with one camera turned by two degrees and another one late by 3.4 images."""
+    start = dict(CAMERAS) | {"cam2": turn(CAMERAS["cam2"], 2.0, (0.6, 0.8, 0.0))}
+    return refine_rig(NAMES, start, record({"cam3": 3.4}), Freedom(), Scale())
+
+
+@pytest.mark.slow
+def test_a_turned_camera_is_turned_back(refined: RefinedRig) -> None:
+    for name, camera in CAMERAS.items():
+        assert angle(refined.cameras[name], camera) < 0.1, name
+        assert np.linalg.norm(refined.cameras[name].centre - camera.centre) < 0.01, name
+
+
+@pytest.mark.slow
+def test_a_late_clock_is_found_to_a_tenth_of_an_image(refined: RefinedRig) -> None:
+    offsets = np.array([refined.offsets[name] for name in CAMERAS]) * RATE
+    np.testing.assert_allclose(offsets, [0, 0, -3.4, 0], atol=0.1)
+
+
+@pytest.mark.slow
+def test_the_report_is_that_of_the_noise(refined: RefinedRig) -> None:
+    """The mean length of a two-dimensional error of 2 px is 2 sqrt(pi / 2), less what three unknowns of eight take."""
+    assert refined.before.mean["cam2"] > 15
+    expected = 2 * np.sqrt(np.pi / 2) * np.sqrt(5 / 8)
+    assert refined.after.all_mean == pytest.approx(expected, rel=0.1)
+    assert sorted(refined.heights.values()) == pytest.approx([1.65, 1.85], rel=0.06)
+
+
+@pytest.mark.slow
+def test_scale_by_a_distance_or_a_height() -> None:
+    frames, freedom = record(count=30), Freedom(clocks=False)
+    known = float(np.linalg.norm(CAMERAS["cam1"].centre - CAMERAS["cam3"].centre))
+    doubled = refine_rig(NAMES, CAMERAS, frames, freedom, Scale(("cam1", "cam3"), 2 * known))
+    gap = np.linalg.norm(doubled.cameras["cam1"].centre - doubled.cameras["cam3"].centre)
+    assert gap == pytest.approx(2 * known)
+    by_height = refine_rig(NAMES, CAMERAS, frames, freedom, Scale(height=1.0))
+    assert next(iter(by_height.heights.values())) == pytest.approx(1.0)
+    with pytest.raises(InputError, match="there is no camera 'cam9'"):
+        refine_rig(NAMES, CAMERAS, frames, freedom, Scale(("cam1", "cam9"), 1.0))
+
+
+def test_clocks_that_differ_by_half_a_second_are_found_to_an_image() -> None:
+    found = find_coarse_offsets(NAMES, CAMERAS, record({"cam4": 15.0}, noise=0.5), 1.0)
+    assert found["cam4"] * RATE == pytest.approx(-15, abs=1)
+    assert found["cam2"] == found["cam3"] == 0
+
+
+def test_a_camera_that_sees_nobody_else_is_one_sentence() -> None:
+    frames = dict(record(count=12))
+    frames["cam2"] = [(time, []) for time, _ in frames["cam2"]]
+    with pytest.raises(PuppetError, match="cam2 shows nobody whom the other cameras show"):
+        refine_rig(NAMES, CAMERAS, frames, Freedom(clocks=False), Scale())
