@@ -37,7 +37,7 @@ class BodyEnergy:
 
     def measure(self, state: BodyState, cloud: DataCost) -> float:
         """Return the energy of a body, metres being its unit of length."""
-        world = self._points.pose(state).world
+        world = self._points.pose(state.center, state.rotation, state.pose, state.shape).world
         normals = (state.rotation[self._owner] @ self._normals[:, :, None])[:, None, :, 0]
         distance, mismatch = cloud.data_cost(world[self._surface][:, None], normals)
         gaps = ((world[self._pairs[0]] - world[self._pairs[1]]) ** 2).sum(axis=1)
