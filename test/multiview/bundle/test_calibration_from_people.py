@@ -54,7 +54,7 @@ def angle(one: Camera, other: Camera) -> float:
 def refined() -> RefinedRig:
     """A rig with one camera turned by two degrees and another one late by 3.4 images."""
     start = dict(CAMERAS) | {"cam2": turn(CAMERAS["cam2"], 2.0, (0.6, 0.8, 0.0))}
-    return refine_rig(NAMES, start, record({"cam3": 3.4}, 60), Freedom(), Scale())
+    return refine_rig(NAMES, start, record({"cam3": 3.4}), Freedom(), Scale())
 
 
 @pytest.mark.slow
