@@ -3,16 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
 
 from flowing_puppet_ros.arrays import Array
-
-if TYPE_CHECKING:
-    from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,23 +39,24 @@ class BodyPoints:
         basis: (M, 3, D + S) derivatives by the part's pose coefficients, then by the shape coefficients, then zeros.
     """
 
-    def __init__(self, model: StitchedPuppet) -> None:
-        parts = range(len(model.tree))
-        self.poses = np.array([model.pose_count(part) for part in parts])
-        self.starts = np.concatenate([[0], np.cumsum([len(rows) for rows in model.part_vertices])])
-        self.rows = np.concatenate(model.part_vertices).astype(np.int64)
-        self.share = 1.0 / np.bincount(self.rows, minlength=len(model.part_of_vertex))
-        self.mean = np.concatenate([model.mean_shape[i] + model.mean_pose[i] for i in parts])
-        self.basis = np.zeros((len(self.rows), 3, self.poses.max() + model.shape_count))
+    def __init__(
+        self, rows: Sequence[Array], mean: Sequence[Array], pose_basis: Sequence[Array], shape_basis: Sequence[Array]
+    ) -> None:
+        """Stack what each part has: vertices (K,), mean (K, 3), bases (K, 3, P) and (K, 3, S)."""
+        self.poses = np.array([basis.shape[2] for basis in pose_basis])
+        self.starts = np.concatenate([[0], np.cumsum([len(own) for own in rows])])
+        self.rows = np.concatenate(rows).astype(np.int64)
+        self.share = 1.0 / np.bincount(self.rows)
+        self.mean = np.concatenate(mean)
+        shapes = shape_basis[0].shape[2]
+        self.basis = np.zeros((len(self.rows), 3, self.poses.max() + shapes))
         for part, count in enumerate(self.poses):
             own = self.basis[self.starts[part] : self.starts[part + 1]]
-            own[:, :, :count] = model.pose_basis[part]
-            own[:, :, count : count + model.shape_count] = model.shape_basis[part]
+            own[:, :, :count], own[:, :, count : count + shapes] = pose_basis[part], shape_basis[part]
 
-    def pose(self, state: BodyState) -> PosedPoints:
-        """Return the points of one body."""
-        body = (state.center, state.rotation, state.pose, state.shape)
-        arrays = tuple(np.ascontiguousarray(array, dtype=np.float64) for array in body)
+    def pose(self, center: Array, rotation: Array, pose: Array, shape: Array) -> PosedPoints:
+        """Return the points of one body, of which `BodyState` has the arrays."""
+        arrays = tuple(np.ascontiguousarray(array, dtype=np.float64) for array in (center, rotation, pose, shape))
         layout = (self.mean, self.basis, self.poses, self.starts, self.rows, self.share)
         return PosedPoints(*_pose(arrays, layout))
 
