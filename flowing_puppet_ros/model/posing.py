@@ -11,8 +11,6 @@ from numba import njit
 
 from flowing_puppet_ros.arrays import Array
 
-type PartArrays = Sequence[Array]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosedPoints:
@@ -41,24 +39,24 @@ class BodyPoints:
         basis: (M, 3, D + S) derivatives by the part's pose coefficients, then by the shape coefficients, then zeros.
     """
 
-    def __init__(self, rows: PartArrays, mean: PartArrays, pose_basis: PartArrays, shape_basis: PartArrays) -> None:
-        """Take for each part its template vertices (N_i,), its mean (N_i, 3) m, and its bases (N_i, 3, P_i) and S."""
-        shapes = shape_basis[0].shape[2]
+    def __init__(
+        self, rows: Sequence[Array], mean: Sequence[Array], pose_basis: Sequence[Array], shape_basis: Sequence[Array]
+    ) -> None:
+        """Stack what each part has: vertices (K,), mean (K, 3), bases (K, 3, P) and (K, 3, S)."""
         self.poses = np.array([basis.shape[2] for basis in pose_basis])
         self.starts = np.concatenate([[0], np.cumsum([len(own) for own in rows])])
         self.rows = np.concatenate(rows).astype(np.int64)
         self.share = 1.0 / np.bincount(self.rows)
         self.mean = np.concatenate(mean)
+        shapes = shape_basis[0].shape[2]
         self.basis = np.zeros((len(self.rows), 3, self.poses.max() + shapes))
         for part, count in enumerate(self.poses):
             own = self.basis[self.starts[part] : self.starts[part + 1]]
-            own[:, :, :count] = pose_basis[part]
-            own[:, :, count : count + shapes] = shape_basis[part]
+            own[:, :, :count], own[:, :, count : count + shapes] = pose_basis[part], shape_basis[part]
 
     def pose(self, center: Array, rotation: Array, pose: Array, shape: Array) -> PosedPoints:
-        """Return the points of one body; the arguments are the fields of a `BodyState`."""
-        body = (center, rotation, pose, shape)
-        arrays = tuple(np.ascontiguousarray(array, dtype=np.float64) for array in body)
+        """Return the points of one body, of which `BodyState` has the arrays."""
+        arrays = tuple(np.ascontiguousarray(array, dtype=np.float64) for array in (center, rotation, pose, shape))
         layout = (self.mean, self.basis, self.poses, self.starts, self.rows, self.share)
         return PosedPoints(*_pose(arrays, layout))
 

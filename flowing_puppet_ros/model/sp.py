@@ -15,7 +15,7 @@ import numpy as np
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.model import rotation, weights
 from flowing_puppet_ros.model.gaussian import Gaussian
-from flowing_puppet_ros.model.posing import BodyPoints
+from flowing_puppet_ros.model.posing import BodyPoints, PosedPoints
 from flowing_puppet_ros.model.tree import SP_PARENTS, PartTree
 
 POSE_WIDTH = 12  # columns of BodyState.pose; parts with fewer coefficients leave the rest 0
@@ -201,7 +201,7 @@ class StitchedPuppet:
     def vertices(self, state: BodyState) -> Array:
         """Return the vertices (..., V, 3) of the whole body; where parts share a vertex, the mean of their copies."""
         if state.center.ndim == 2:
-            return body_points(self).pose(*_arrays_of(state)).vertices
+            return pose_points(self, state).vertices
         total = np.zeros((*state.center.shape[:-2], len(self.part_of_vertex), 3))
         copies = np.zeros(len(self.part_of_vertex))
         for ids, mesh in zip(self.part_vertices, self.parts(state), strict=True):
@@ -293,6 +293,11 @@ def body_points(model: StitchedPuppet) -> BodyPoints:
     """Return the points of all parts of a model, made once."""
     means = [shape + pose for shape, pose in zip(model.mean_shape, model.mean_pose, strict=True)]
     return BodyPoints(model.part_vertices, means, model.pose_basis, model.shape_basis)
+
+
+def pose_points(model: StitchedPuppet, state: BodyState) -> PosedPoints:
+    """Return the points of all parts of one body."""
+    return body_points(model).pose(state.center, state.rotation, state.pose, state.shape)
 
 
 @lru_cache(maxsize=4)

@@ -4,17 +4,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import sum_groups
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints, find_bounds
+from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours, fit_normals
 
-MIN_VOXELS, MIN_GROWTH = 400, 1.05  # first voxels along the longest side, and the factor by which they grow at least
 MIN_NEIGHBOURS, MAX_NEIGHBOURS = 9, 24  # points by which a normal is estimated
 POINTS_PER_NEIGHBOUR = 100  # points of a cloud for each of them
 MIN_SPREAD = 1e-6  # of points across their widest plane, for one along it; they lie in that plane below it
@@ -22,7 +20,7 @@ ORIENTATION_RADIUS_M = 0.12  # neighbourhood whose mean lies inside a limb
 
 
 def downsample(points: np.ndarray, normals: np.ndarray | None, max_points: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Replace the points of each voxel by their mean, in voxels so large that at most `max_points` are left.
+    """Replace the points of each voxel by their mean, in growing voxels, until at most `max_points` are left.
 
     Args:
         points: (N, 3) in any unit.
@@ -34,47 +32,18 @@ def downsample(points: np.ndarray, normals: np.ndarray | None, max_points: int) 
     """
     if len(points) <= max_points:
         return points, normals
-    places = np.ascontiguousarray(points, dtype=np.float64)
-    low, high = find_bounds(places)
-    size = float((high - low).max()) / MIN_VOXELS
-    while (count := _count_voxels(cells := _find_cells(places, low, high, size))) > max_points:
-        size *= max(MIN_GROWTH, np.sqrt(count / max_points))
-    group = np.unique(cells, return_inverse=True)[1]
-    held = np.bincount(group)[:, None]
-    kept = sum_groups(places, group) / held
+    kept = points if normals is None else np.concatenate([points, normals], axis=1)
+    size, weight = float(np.ptp(points, axis=0).max()) / 400, np.ones(len(points))
+    while len(kept) > max_points:
+        cells = np.floor((kept[:, :3] - kept[:, :3].min(axis=0)) / size).astype(np.int64)
+        _, group = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_inverse=True)
+        total = np.bincount(group, weight)
+        kept, weight = sum_groups(kept * weight[:, None], group) / total[:, None], total
+        size *= max(1.05, np.sqrt(len(kept) / max_points))
     if normals is None:
         return kept, None
-    mean = sum_groups(normals, group) / held
-    length = np.linalg.norm(mean, axis=1, keepdims=True)
-    return kept, mean / np.where(length > 1e-9, length, 1)
-
-
-@njit(cache=True, nogil=True)
-def _find_cells(points: np.ndarray, low: np.ndarray, high: np.ndarray, size: float) -> np.ndarray:
-    """Return the number (N,) of the voxel of each point."""
-    ny, nz = int((high[1] - low[1]) / size) + 1, int((high[2] - low[2]) / size) + 1
-    cells = np.empty(len(points), np.int64)
-    for row in range(len(points)):
-        i, j = int((points[row, 0] - low[0]) / size), int((points[row, 1] - low[1]) / size)
-        cells[row] = (i * ny + j) * nz + int((points[row, 2] - low[2]) / size)
-    return cells
-
-
-@njit(cache=True, nogil=True)
-def _count_voxels(cells: np.ndarray) -> int:
-    """Count different numbers (N,), by a hash table."""
-    slots = 16
-    while slots < 2 * len(cells):
-        slots *= 2
-    table, count = np.full(slots, -1, np.int64), 0
-    for cell in cells:
-        slot = (cell * 2654435761 >> 16) & (slots - 1)
-        while table[slot] >= 0 and table[slot] != cell:
-            slot = (slot + 1) & (slots - 1)
-        if table[slot] < 0:
-            table[slot] = cell
-            count += 1
-    return count
+    length = np.linalg.norm(kept[:, 3:], axis=1, keepdims=True)
+    return np.ascontiguousarray(kept[:, :3]), kept[:, 3:] / np.where(length > 1e-9, length, 1)
 
 
 def estimate_normals(

@@ -15,7 +15,7 @@ from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.refine.joint_prior import joint_quadratic
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.posing import PosedPoints
-from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet, body_points
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet, body_points, pose_points
 
 PRIOR_RIDGE = 0.05
 """Standard deviation added to a joint's rotation (radians) and coefficients, which bounds the precision."""
@@ -38,7 +38,7 @@ class NormalEquations:
     """
 
     def __init__(self, model: StitchedPuppet) -> None:
-        self._points = body_points(model)
+        self._model, self._points = model, body_points(model)
         self.share = self._points.share
         poses, starts = self._points.poses, self._points.starts
         self.first = np.concatenate([[0], np.cumsum(6 + poses)])
@@ -73,7 +73,7 @@ class NormalEquations:
 
     def pose_points(self, state: BodyState) -> PosedPoints:
         """Return the points of a body."""
-        return self._points.pose(state.center, state.rotation, state.pose, state.shape)
+        return pose_points(self._model, state)
 
     def add_surface(self, term: VertexQuadratic, posed: PosedPoints, rotation: np.ndarray, system: System) -> None:
         """Add a quadratic of every vertex for parts with `rotation` (N, 3, 3); a zero matrix costs nothing."""

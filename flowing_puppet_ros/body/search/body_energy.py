@@ -9,7 +9,7 @@ from flowing_puppet_ros.body.search.energy import MIN_CENTRE_DISTANCE_M
 from flowing_puppet_ros.body.search.part_points import PartPoints
 from flowing_puppet_ros.body.search.schedule import four_stages
 from flowing_puppet_ros.evidence.cloud.data_term import DataCost
-from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet, body_points
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet, body_points, pose_points
 
 
 class BodyEnergy:
@@ -19,8 +19,8 @@ class BodyEnergy:
     """
 
     def __init__(self, model: StitchedPuppet, points: tuple[PartPoints, ...], stitch: float, mismatch: float) -> None:
-        self._points, self._stitch, self._mismatch = body_points(model), stitch, mismatch
-        starts, edges = self._points.starts, model.tree.edges
+        self._model, self._stitch, self._mismatch = model, stitch, mismatch
+        starts, edges = body_points(model).starts, model.tree.edges
         self._surface = np.concatenate([start + part.rows for start, part in zip(starts, points, strict=False)])
         self._normals = np.concatenate([part.normals for part in points])
         self._owner = np.repeat(np.arange(len(points)), [len(part.rows) for part in points])
@@ -37,7 +37,7 @@ class BodyEnergy:
 
     def measure(self, state: BodyState, cloud: DataCost) -> float:
         """Return the energy of a body, metres being its unit of length."""
-        world = self._points.pose(state.center, state.rotation, state.pose, state.shape).world
+        world = pose_points(self._model, state).world
         normals = (state.rotation[self._owner] @ self._normals[:, :, None])[:, None, :, 0]
         distance, mismatch = cloud.data_cost(world[self._surface][:, None], normals)
         gaps = ((world[self._pairs[0]] - world[self._pairs[1]]) ** 2).sum(axis=1)
