@@ -36,6 +36,8 @@ suppress_warnings = ["config.cache", "ref.python"]
 toc_object_entries = False
 add_module_names = False
 
+# Of ROS, but not among its wheels.
+autodoc_mock_imports = ["launch", "launch_ros"]
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 autodoc_default_options = {"members": True, "show-inheritance": True}

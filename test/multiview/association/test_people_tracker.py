@@ -107,7 +107,7 @@ def test_nobody_is_made_of_two_people() -> None:
     places = {"cam1": (0.0, 0.0), "cam2": (1.5, 0.0), "cam3": (-1.5, 1.0), "cam4": (0.5, -1.5)}
     tracker = PeopleTracker3D(NAMES)
     for k in range(5):
-        seen = {}
+        seen: dict[str, list[PersonInView]] = {}
         for name, place in places.items():
             seen |= photograph({name: CAMERAS[name]}, {"x": walker(place, 0.7, k / 5)}, 1.0, random)
         assert tracker.step(k * 10**8, CAMERAS, seen) == []
