@@ -311,7 +311,8 @@ def _join_colour(
         chosen = {"fusion.rectified": True, **settings.get("body_fitter", {})}
         fitter.component = BodyFitterComponent(_make_settings(BodyFitterSettings, "", {"": chosen}), factory)
     fitter.remapped |= {"puppets": tracker.resolve("puppets"), "puppets/camera_info": colour.info}
-    fitter.component.set_expected("puppets", True)
+    for port in ("puppets", "puppets/camera_info"):
+        fitter.component.set_expected(port, True)
 
 
 def find_info_topics(topics: Mapping[str, str]) -> list[str]:

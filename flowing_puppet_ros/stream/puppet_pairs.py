@@ -60,6 +60,11 @@ class PuppetPairs:
                 self._messages = []
             self._messages = sorted([*self._messages, (stamp, message)], key=lambda pair: pair[0])[-MAX_KEPT:]
 
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether the calibration of the puppets' camera has come."""
+        return self._info is not None
+
     def is_ready(self, stamp: int) -> bool:
         """Return whether no later message of puppets can be nearer to a cloud's stamp, nanoseconds."""
         return bool(self._messages) and self._messages[-1][0] >= stamp

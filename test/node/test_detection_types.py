@@ -24,6 +24,7 @@ from std_msgs.msg import Header, String
 
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.ids import make_public_id
 from flowing_puppet_ros.node.component_node import ComponentNode
 from flowing_puppet_ros.node.diagnostics import Diagnostics
 from flowing_puppet_ros.node.factory import RosMessageFactory
@@ -252,6 +253,6 @@ def test_the_tracker_takes_the_bodies_of_ros4hri(bench: Bench) -> None:
         bench.spin_until(partial(found.__contains__, stamp), "puppets")
     for stamp, message in expected.items():
         (puppet,), (other,) = found[stamp].puppets, message.puppets
-        assert puppet.id == other.id
+        assert puppet.id == make_public_id("/puppet_tracker", other.id)
         for joint, same in zip(puppet.joints, other.joints, strict=True):
             np.testing.assert_allclose((joint.x, joint.y), (same.x, same.y), atol=0.01)

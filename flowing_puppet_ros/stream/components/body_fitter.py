@@ -277,7 +277,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         waiting = len(self._line.waiting) - 1
         if "initial" in self._expected and initial is None and waiting < self.settings.wait:
             return False
-        puppets = "puppets" in self._expected and waiting < self.settings.fusion.wait
+        # Without a calibration no puppet can be used, however long a cloud waits for it.
+        calibrated = self._puppets.is_calibrated or "puppets/camera_info" in self._expected
+        puppets = calibrated and "puppets" in self._expected and waiting < self.settings.fusion.wait
         return not puppets or self._puppets.is_ready(stamp)
 
     def _fit_one(self, stamp: int, cloud: Any, of_depth: bool, initial: Any | None) -> Output:
