@@ -51,6 +51,7 @@ PARTIAL = RefineWeights(sigma_start=0.2, sigma_end=0.03, iterations=20)
 # Bodies that are refined to compare frames.
 ROUGH_STARTS = 4
 # Share of the particles and rounds in a search for the warm-up.
+RESTART_SHARE = 2.0  # of particles and iterations, in a search after the first
 WARM_UP_SHARE = 0.1
 # Cost of a body turned to the other heading, in costs of the body itself, from which on no search around it helps.
 MAX_TURNED_RATIO = 1.3
@@ -82,7 +83,11 @@ class FitterSettings(Settings):
         advanced=True,
     )
     restarts: int = setting(
-        1, "searches from new starts while no body is close to the cloud", low=0, high=20, advanced=True
+        1,
+        "larger searches from new starts while no body is close to the cloud and reliable",
+        low=0,
+        high=20,
+        advanced=True,
     )
     restart_distance: float = setting(
         0.02, "two-way distance below which a body is close to the cloud", unit="m", low=0.0, high=1.0, advanced=True
@@ -133,7 +138,8 @@ class BodyHypotheses:
         Cases:
             single view: the search from the pose bank, by itself; what follows is for whole clouds.
             quick: enough if the first search is close, whatever its limbs do.
-            restarts: 1 + `restarts` searches, each in both headings, until a body is close.
+            restarts: 1 + `restarts` searches, each in both headings, until a body is close and reliable; a restart has
+                more particles and iterations, since a small search has failed.
             repair: suspect limbs of each candidate are searched again before it is compared.
         """
         if isinstance(cloud, SingleViewCloud):
@@ -143,15 +149,14 @@ class BodyHypotheses:
         tries = 1 + self._settings.restarts
         tried: list[BodyCandidate] = []
         for number in range(tries):
-            candidates = self._search_both_headings(
-                cloud, grid, rng, sub_progress(progress, number / tries, (number + 0.7) / tries)
-            )
+            shown = sub_progress(progress, number / tries, (number + 0.7) / tries)
+            candidates = self._search_both_headings(cloud, grid, rng, shown, RESTART_SHARE if number else 1.0)
             if quick and self._is_close(candidates[0]):
                 return self.refine(candidates[0].state, cloud, none, steps)
             for candidate in candidates:
                 tried.append(self.repair_limbs(candidate, cloud, grid, rng))
                 best = min(tried, key=lambda candidate: candidate.cost)
-                if self._is_close(best):
+                if self._is_close(best) and best.quality.reliable:
                     return self.refine(best.state, cloud, none, steps)
         return self.refine(best.state, cloud, none, steps)
 
