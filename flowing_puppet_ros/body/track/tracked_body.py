@@ -11,9 +11,18 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.model.rotation import log
 
 VELOCITY_WINDOW_NS = 500_000_000
 """Time over which a velocity is measured: shorter ones show the noise of the fits, longer ones lag behind a turn."""
+
+
+MAX_TURN_RAD_PER_S, MAX_SPEED_M_PER_S = 10.0, 12.0
+"""Of a torso: somebody who turns on the spot takes half a second for it; a sprinter runs with 12 m/s."""
+MAX_TURN_ERROR_RAD, MAX_PLACE_ERROR_M = 1.0, 0.3
+"""By which a torso's pose may be wrong without being a jump."""
+JUMP_CONFIDENCE = 0.3
+"""Maximum confidence of a body that is where the person cannot have got since the body before."""
 
 
 class TrackStatus(IntEnum):
@@ -47,16 +56,22 @@ class TorsoMotion:
     def __init__(self) -> None:
         """Start without any."""
         self._places: deque[tuple[int, F64]] = deque()
+        self._last: BodyFit | None = None
 
     def add(self, identity: str, stamp: int, fit: BodyFit, hidden: bool = False) -> TrackedBody:
         """Take the person's body at a stamp (ns) and return it with its status and velocity.
 
         The velocity is the slope of the line that fits the places best. A stamp that is not later than the last starts
-        anew.
+        anew. After a jump that no person can make one of the two bodies is wrong: this one is not reliable, until the
+        next agrees with it.
         """
         if self._places and stamp <= self._places[-1][0]:
             self._places.clear()
-        known = bool(self._places)
+        known, before = bool(self._places), self._last
+        self._last = fit
+        if known and before is not None and _is_jump(before, fit, stamp - self._places[-1][0]):
+            self._places.clear()
+            fit = replace(fit, reliable=False, confidence=min(fit.confidence, JUMP_CONFIDENCE))
         while self._places and stamp - self._places[0][0] > VELOCITY_WINDOW_NS:
             self._places.popleft()
         self._places.append((stamp, fit.state.center[0].copy()))
@@ -70,3 +85,14 @@ class TorsoMotion:
         places = np.stack([place for _, place in self._places])
         apart = seconds - seconds.mean()
         return np.asarray(apart @ (places - places.mean(axis=0)) / (apart @ apart))
+
+
+def _is_jump(before: BodyFit, after: BodyFit, nanoseconds: int) -> bool:
+    """Return whether a torso cannot have moved or turned so far in that time."""
+    seconds = 1e-9 * nanoseconds
+    moved = np.linalg.norm(after.state.center[0] - before.state.center[0])
+    turned = np.linalg.norm(log(before.state.rotation[0].T @ after.state.rotation[0]))
+    return bool(
+        moved > MAX_PLACE_ERROR_M + MAX_SPEED_M_PER_S * seconds
+        or turned > MAX_TURN_ERROR_RAD + MAX_TURN_RAD_PER_S * seconds
+    )

@@ -10,7 +10,7 @@ import pytest
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
-from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackStatus
+from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody, TrackStatus
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -68,3 +68,17 @@ def test_a_turned_frame_turns_body_and_velocity_alike() -> None:
     joints = np.stack([-found.fit.joints[:, 1], found.fit.joints[:, 0], found.fit.joints[:, 2]], axis=1)
     np.testing.assert_allclose(turned.fit.joints, joints, atol=1e-12)
     assert turned.fit.vertices[:, 1].mean() == pytest.approx(found.fit.vertices[:, 0].mean())
+
+
+def test_a_jump_that_nobody_can_make_is_not_sure_until_the_next_body_agrees() -> None:
+    motion, fit = TorsoMotion(), body_at(np.zeros(3))
+    around = TrackedBody("b1", fit).rotate(rotation.exp(np.array([0.0, 0.0, np.pi]))).fit
+    step = 67_000_000
+    assert motion.add("b1", 0, fit).fit.reliable
+    assert motion.add("b1", step, fit).fit.reliable
+    turned = motion.add("b1", 2 * step, around)
+    assert not turned.fit.reliable
+    assert turned.fit.confidence <= 0.3
+    assert motion.add("b1", 3 * step, around).fit.reliable, "two bodies agree"
+    assert not motion.add("b1", 4 * step, body_at(np.array([2.0, 0.0, 0.0]))).fit.reliable
+    assert motion.add("b1", 6 * 10**9, body_at(np.array([8.0, 0.0, 0.0]))).fit.reliable, "time enough to walk there"
