@@ -63,6 +63,7 @@ def _listen(host: str, port: int) -> socket.socket:
         listening = socket.socket(family, socket.SOCK_STREAM)
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listening.bind((host, port))
+        listening.listen()  # before the address is shown: a browser may be faster than the server's start
     except (OSError, OverflowError) as error:
         raise InputError(f"{host}:{port} cannot be listened on ({error}); choose another --port or --host") from error
     return listening
