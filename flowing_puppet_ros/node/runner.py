@@ -38,6 +38,9 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         rclpy.try_shutdown()
         return 2
+    except KeyboardInterrupt:  # while it starts
+        rclpy.try_shutdown()
+        return 0
     # The node's own workers use the cores; threads of BLAS and OpenCV beside them would only slow them down.
     with one_blas_thread(), one_opencv_thread():
         _spin(node)
