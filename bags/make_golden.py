@@ -119,17 +119,7 @@ class GoldenBagWriter:
         """Write one image with its camera_info."""
         header = geometry.make_header(self.factory, stamp, f"{name}_optical_frame")
         matrix = self.cameras[name].matrix
-        info = self.factory.make(
-            message_types.CAMERA_INFO,
-            header=header,
-            height=SIZE_PX[1],
-            width=SIZE_PX[0],
-            distortion_model="plumb_bob",
-            d=np.zeros(5),
-            k=matrix,
-            r=np.eye(3),
-            p=np.hstack([matrix, np.zeros((3, 1))]),
-        )
+        info = geometry.make_camera_info(self.factory, header, SIZE_PX, matrix, np.zeros(5))
         data = images.encode_jpeg(rgb, 90)
         image = self.factory.make(message_types.COMPRESSED_IMAGE, header=header, format="jpeg", data=data)
         self.writer.write(f"/{name}/camera_info", stamp, info)

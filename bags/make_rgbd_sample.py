@@ -110,17 +110,8 @@ class Recipe:
 
     def _make_info(self, stamp: int, name: str) -> Any:
         camera = self.cameras[name]
-        return self.factory.make(
-            message_types.CAMERA_INFO,
-            header=self._header(stamp, name),
-            height=camera.size[1],
-            width=camera.size[0],
-            distortion_model="plumb_bob",
-            d=camera.distortion,
-            k=camera.matrix,
-            r=np.eye(3),
-            p=np.hstack([camera.matrix, np.zeros((3, 1))]),
-        )
+        header = self._header(stamp, name)
+        return geometry.make_camera_info(self.factory, header, camera.size, camera.matrix, camera.distortion)
 
     def _write_detections(self, stamp: int, people: Sequence[SeenKeypoints]) -> None:
         puppets = []

@@ -125,17 +125,7 @@ class _CameraBag:
                 f"frame {entry.frame.index} of {name} is {rgb.shape[1]}x{rgb.shape[0]}, the ones before "
                 f"{camera.size[0]}x{camera.size[1]}"
             )
-        info = self._factory.make(
-            message_types.CAMERA_INFO,
-            header=header,
-            height=camera.size[1],
-            width=camera.size[0],
-            distortion_model="plumb_bob",
-            d=camera.distortion,
-            k=camera.matrix,
-            r=np.eye(3),
-            p=np.hstack([camera.matrix, np.zeros((3, 1))]),
-        )
+        info = geometry.make_camera_info(self._factory, header, camera.size, camera.matrix, camera.distortion)
         data = images.encode_jpeg(rgb)
         image = self._factory.make(message_types.COMPRESSED_IMAGE, header=header, format="jpeg", data=data)
         self._writer.write(f"/{name}/camera_info", log_time, info)

@@ -263,7 +263,7 @@ class BodyFitter:
             quality.confidence,
             quality.reliable,
             quality.distance,
-            judge_visibility(self.model, vertices, cloud),
+            judge_visibility(self.model, vertices, cloud, quality.surface),
         )
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.body.cloud.correspondence import Cloud, geman_mcclure, measure_distances
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, SurfaceDistances, geman_mcclure, measure_distances
 from flowing_puppet_ros.body.cloud.mesh_geometry import sum_groups, vertex_normals
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -36,6 +36,7 @@ class FitQuality:
         uncovered: share of the cloud's points that are farther than 4 cm from the body.
         self_intersections: joints whose two parts intersect (centres less than 5.5 cm apart).
         distance: mean distance between body and cloud over both directions, metres.
+        surface: the distances from which all of this follows.
     """
 
     part_confidence: np.ndarray
@@ -44,6 +45,7 @@ class FitQuality:
     uncovered: float
     self_intersections: int
     distance: float
+    surface: SurfaceDistances
 
     @property
     def cost(self) -> float:
@@ -104,4 +106,5 @@ def assess_fit(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> Fit
         float((to_vertex > MAX_COVERED_DISTANCE_M).mean()),
         int(np.count_nonzero(apart < MIN_DISJOINT_DISTANCE_M)),
         distances.two_way,
+        distances,
     )

@@ -9,8 +9,7 @@ from enum import IntEnum
 import numpy as np
 
 from flowing_puppet_ros.arrays import I8
-from flowing_puppet_ros.body.cloud.correspondence import Cloud
-from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
+from flowing_puppet_ros.body.cloud.correspondence import Cloud, SurfaceDistances
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 MAX_SEEN_DISTANCE_M = 0.04  # between a vertex that was seen and the cloud
@@ -51,14 +50,17 @@ class BodyVisibility:
         return cls(state, _judge_shares(joints[0], joints[1]), _judge_shares(seen, near))
 
 
-def judge_visibility(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> BodyVisibility:
-    """Tell what a cloud says about each place on a body with `vertices` (V, 3) in metres.
+def judge_visibility(
+    model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud, surface: SurfaceDistances
+) -> BodyVisibility:
+    """Tell what a cloud says about each place on a body with `vertices` (V, 3) in metres, `surface` from the cloud.
 
     A vertex is seen if it faces the sensor, is neither hidden nor out of its view, and lies within 4 cm of the cloud;
     it is near if it lies within 10 cm.
     """
-    distance = cloud.nearest.query(vertices)[0]
-    could_see = cloud.sees(vertices, vertex_normals(vertices, model.faces))
+    could_see, distance = surface.seen[: len(vertices)], np.empty(len(vertices))
+    distance[could_see] = surface.to_cloud[: np.count_nonzero(could_see)]
+    distance[~could_see] = cloud.nearest.query(vertices[~could_see])[0]
     state = np.where(distance <= MAX_NEAR_DISTANCE_M, Visibility.NEAR, Visibility.INFERRED).astype(np.int8)
     state[could_see & (distance <= MAX_SEEN_DISTANCE_M)] = Visibility.SEEN
     return BodyVisibility.of_vertices(model, state)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame, measure_stature
 from flowing_puppet_ros.body.measurements.measure import DEFINITIONS, measure_fit
 from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
@@ -81,25 +81,29 @@ def refuse_overwriting(source: Path, options: FitOptions) -> None:
         raise InputError(f"the fit of {source} would overwrite it; choose another folder for --out")
 
 
+def fit_scan_person(person: ScanPerson, fitter: BodyFitter, options: FitOptions, progress: Progress) -> FrameFit:
+    """Fit a person of a scan, from given joints or by a search. InputError when it cannot be a person."""
+    if options.joints:
+        return fit_from_joints(person, dict(options.joints), fitter, options)
+    found = fit_in_best_frame(
+        fitter,
+        person.points,
+        person.normals,
+        units=person.units,
+        ups=person.ups,
+        sensor=person.sensor,
+        progress=progress,
+    )
+    _refuse_no_person(person, found)
+    return found
+
+
 def _fit_person(
     path: Path, person: ScanPerson, fitter: BodyFitter, options: FitOptions, started: float, shown: bool
 ) -> dict[str, Any]:
     stem = f"{path.stem}{person.suffix}"
-    if options.joints:
-        found = fit_from_joints(person, dict(options.joints), fitter, options)
-        view = "full" if person.sensor is None else "single"
-        return write_result(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
-    with tqdm(total=100, desc=stem, unit="%", file=sys.stderr, disable=not shown) as bar:
-        found = fit_in_best_frame(
-            fitter,
-            person.points,
-            person.normals,
-            units=person.units,
-            ups=person.ups,
-            sensor=person.sensor,
-            progress=_progress_on(bar),
-        )
-    refuse_no_person(person, found)
+    with tqdm(total=100, desc=stem, unit="%", file=sys.stderr, disable=not shown or bool(options.joints)) as bar:
+        found = fit_scan_person(person, fitter, options, _progress_on(bar))
     view = "full" if person.sensor is None else "single"
     return write_result(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
 
@@ -178,7 +182,7 @@ def _measure(model: StitchedPuppet, found: FrameFit) -> dict[str, float]:
     return {name: value * shrink ** DEFINITIONS[name].dimension for name, value in measured.items()}
 
 
-def refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
+def _refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
     """Raise InputError when a cloud has no person's size and, scaled to one, no person's shape."""
     guessed = found.unit.name == GUESS and len(person.units) > 1
     if guessed and not found.fit.reliable and not has_size_of_person(person.points):
@@ -214,7 +218,7 @@ def _name_axis(up: np.ndarray) -> str:
     return ("-" if up[k] < 0 else "") + "xyz"[k]
 
 
-def _progress_on(bar: tqdm) -> Callable[[float], None]:
+def _progress_on(bar: tqdm) -> Progress:
     return lambda done: bar.update(int(100 * done) - bar.n) and None
 
 

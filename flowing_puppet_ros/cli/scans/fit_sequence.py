@@ -14,11 +14,10 @@ import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.fit.shared_shape import fit_with_shape, mean_shape
-from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame
+from flowing_puppet_ros.body.fit.up_axis_search import FrameFit
 from flowing_puppet_ros.body.scans.scan import read_scan
-from flowing_puppet_ros.cli.scans.fit_file import make_fitter, refuse_no_person, refuse_overwriting, write_result
+from flowing_puppet_ros.cli.scans.fit_file import fit_scan_person, make_fitter, refuse_overwriting, write_result
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson, find_people
-from flowing_puppet_ros.cli.scans.given_joints import fit_from_joints
 from flowing_puppet_ros.errors import InputError
 
 START_CONFIDENCE = 0.3
@@ -55,7 +54,11 @@ def fit_sequence(sources: Sequence[Path], options: FitOptions, report: Callable[
         refuse_overwriting(source, options)
         started = time.perf_counter()
         person = _find_person(source, fitter, options)
-        found = _fit_first(person, fitter, options) if not seen else _fit_next(person, fitter, seen[-1].found)
+        found = (
+            fit_scan_person(person, fitter, options, lambda _: None)
+            if not seen
+            else _fit_next(person, fitter, seen[-1].found)
+        )
         seen.append(_Seen(source, person, found, time.perf_counter() - started))
     shape = mean_shape([each.found.fit for each in seen])
     for each in seen:
@@ -74,22 +77,6 @@ def _find_person(source: Path, fitter: BodyFitter, options: FitOptions) -> ScanP
     if len(people) > 1:
         raise InputError(f"{source} shows {len(people)} people and --sequence fits one; cut out the same person in all")
     return people[0]
-
-
-def _fit_first(person: ScanPerson, fitter: BodyFitter, options: FitOptions) -> FrameFit:
-    if options.joints:
-        return fit_from_joints(person, dict(options.joints), fitter, options)
-    found = fit_in_best_frame(
-        fitter,
-        person.points,
-        person.normals,
-        units=person.units,
-        ups=person.ups,
-        sensor=person.sensor,
-        progress=lambda _: None,
-    )
-    refuse_no_person(person, found)
-    return found
 
 
 def _fit_next(person: ScanPerson, fitter: BodyFitter, before: FrameFit) -> FrameFit:

@@ -16,7 +16,7 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.rotation import quaternion
-from flowing_puppet_ros.stream.messages.message_types import MessageFactory
+from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, MessageFactory
 from flowing_puppet_ros.units import NANOSECONDS
 
 
@@ -92,6 +92,23 @@ def make_transform(factory: MessageFactory, header: Any, child: str, position: A
             translation=make_vector(factory, position),
             rotation=make_quaternion(factory, rotation),
         ),
+    )
+
+
+def make_camera_info(
+    factory: MessageFactory, header: Any, size: tuple[int, int], matrix: Array, distortion: Array
+) -> Any:
+    """Return the CameraInfo of a camera of `size` (width, height) px with its `matrix` (3, 3) and `distortion` (D,)."""
+    return factory.make(
+        CAMERA_INFO,
+        header=header,
+        height=size[1],
+        width=size[0],
+        distortion_model="plumb_bob",
+        d=distortion,
+        k=matrix,
+        r=np.eye(3),
+        p=np.hstack([matrix, np.zeros((3, 1))]),
     )
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
+from flowing_puppet_ros.body.fit.quality import assess_fit
 from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility, judge_visibility
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -23,7 +24,11 @@ def facing(model: StitchedPuppet, vertices: np.ndarray) -> np.ndarray:
 
 
 def judge(model: StitchedPuppet, vertices: np.ndarray, cloud: np.ndarray) -> BodyVisibility:
-    return judge_visibility(model, vertices, Cloud.of(cloud, np.zeros_like(cloud), SENSOR))
+    return look(model, vertices, Cloud.of(cloud, np.zeros_like(cloud), SENSOR))
+
+
+def look(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> BodyVisibility:
+    return judge_visibility(model, vertices, cloud, assess_fit(model, vertices, cloud).surface)
 
 
 def test_a_body_cut_off_above_the_knees_has_inferred_feet(
@@ -59,6 +64,6 @@ def test_what_is_close_to_the_cloud_and_faces_away_is_near(
 
 
 def test_all_of_a_whole_cloud_is_seen(model: StitchedPuppet, vertices: np.ndarray) -> None:
-    found = judge_visibility(model, vertices, Cloud.of(vertices, np.zeros_like(vertices)))
+    found = look(model, vertices, Cloud.of(vertices, np.zeros_like(vertices)))
     for state in (found.vertices, found.joints, found.parts):
         assert (state == Visibility.SEEN).all()

@@ -11,9 +11,9 @@ import numpy as np
 from flowing_puppet_ros.arrays import U8
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.stream.messages.geometry import make_pose, rotation_matrix
+from flowing_puppet_ros.stream.messages.geometry import make_camera_info, make_pose, rotation_matrix
 from flowing_puppet_ros.stream.messages.images import decode_labels, make_image
-from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, SILHOUETTES, MessageFactory
+from flowing_puppet_ros.stream.messages.message_types import SILHOUETTES, MessageFactory
 
 Masks = Mapping[str, U8]
 
@@ -32,31 +32,18 @@ def make_silhouettes(
     `header` has the stamp and the common frame; `headers` (camera name -> header) are those of the images. `people`
     are the ids of all who have a set of this stamp.
     """
+    scaled = {name: cameras[name].resize(mask.shape[::-1]) for name, mask in masks.items()}
     silhouettes = [
         factory.make(
             "flowing_puppet_msgs/msg/Silhouette",
             camera=name,
-            info=_make_info(factory, headers[name], cameras[name].resize(mask.shape[::-1])),
-            pose=make_pose(factory, cameras[name].centre, cameras[name].rotation.T),
-            mask=make_image(factory, headers[name], mask, "mono8"),
+            info=make_camera_info(factory, headers[name], camera.size, camera.matrix, camera.distortion),
+            pose=make_pose(factory, camera.centre, camera.rotation.T),
+            mask=make_image(factory, headers[name], masks[name], "mono8"),
         )
-        for name, mask in masks.items()
+        for name, camera in scaled.items()
     ]
     return factory.make(SILHOUETTES, header=header, person=person, silhouettes=silhouettes, people=people)
-
-
-def _make_info(factory: MessageFactory, header: Any, camera: Camera) -> Any:
-    return factory.make(
-        CAMERA_INFO,
-        header=header,
-        height=camera.size[1],
-        width=camera.size[0],
-        distortion_model="plumb_bob",
-        d=camera.distortion,
-        k=camera.matrix,
-        r=np.eye(3),
-        p=np.hstack([camera.matrix, np.zeros((3, 1))]),
-    )
 
 
 def decode_silhouettes(message: Any) -> list[tuple[Camera, U8]]:
