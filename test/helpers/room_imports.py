@@ -251,6 +251,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "stream": {"fusion", "model", "multiview", "stream.messages"},
     "stream.components": {
         "body.fit",
+        "body.measurements",
         "body.scans",
         "body.track",
         "draw",
@@ -270,5 +271,5 @@ MAY_IMPORT: dict[str, set[str]] = {
         "stream.messages.bodies",
     },
     "stream.messages": {"body.track", "draw", "image.formats", "image.tracking", "model", "model.ds"},
-    "stream.messages.bodies": {"model", "multiview", "stream.messages"},
+    "stream.messages.bodies": {"body.track", "model", "multiview", "stream.messages"},
 }
