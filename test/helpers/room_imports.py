@@ -271,5 +271,5 @@ MAY_IMPORT: dict[str, set[str]] = {
         "stream.messages.bodies",
     },
     "stream.messages": {"body.track", "draw", "image.formats", "image.tracking", "model", "model.ds"},
-    "stream.messages.bodies": {"body.track", "model", "multiview", "stream.messages"},
+    "stream.messages.bodies": {"body.measurements", "body.track", "model", "multiview", "stream.messages"},
 }

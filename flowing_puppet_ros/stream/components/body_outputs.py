@@ -19,6 +19,7 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import Output, Port
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, to_name_component
+from flowing_puppet_ros.stream.messages.bodies.human_urdf import make_urdf
 from flowing_puppet_ros.stream.messages.bodies.measured_people import make_measurements
 from flowing_puppet_ros.stream.messages.bodies.people import (
     PlacedPerson,
@@ -26,7 +27,7 @@ from flowing_puppet_ros.stream.messages.bodies.people import (
     make_person_pose,
     make_place,
 )
-from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames, make_urdf
+from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames
 from flowing_puppet_ros.stream.messages.bodies.shapes import (
     make_deletions,
     make_mesh_marker,
@@ -227,9 +228,8 @@ class BodyOutputs:
             origins, known = self._skeleton.joint_origins(fit.state.shape), self._urdf_origins.get(identity)
             if known is None or max(np.linalg.norm(origins[name] - known[name]) for name in known) > URDF_CHANGE_M:
                 self._urdf_origins[identity] = origins
-                messages[identity]["urdf"] = self._factory.make(
-                    "std_msgs/msg/String", data=make_urdf(to_name_component(identity), origins)
-                )
+                urdf = make_urdf(to_name_component(identity), origins, self._skeleton.mass(fit.state.shape))
+                messages[identity]["urdf"] = self._factory.make("std_msgs/msg/String", data=urdf)
         return self.ros4hri.make(header, alive, messages)
 
 
