@@ -95,7 +95,7 @@ def make_pose(position: np.ndarray, rotation: np.ndarray | None = None) -> Pose:
     pose.position.x, pose.position.y, pose.position.z = map(float, position)
     if rotation is not None:
         turn = pose.orientation
-        turn.x, turn.y, turn.z, turn.w = map(float, quaternion(rotation))
+        turn.w, turn.x, turn.y, turn.z = map(float, quaternion(rotation))
     return pose
 
 
