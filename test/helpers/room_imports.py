@@ -252,6 +252,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "stream": {"fusion", "model", "multiview", "stream.messages"},
     "stream.components": {
         "body.fit",
+        "body.measurements",
         "body.scans",
         "body.track",
         "draw",
@@ -271,5 +272,5 @@ MAY_IMPORT: dict[str, set[str]] = {
         "stream.messages.bodies",
     },
     "stream.messages": {"body.track", "draw", "image.formats", "image.tracking", "model", "model.ds"},
-    "stream.messages.bodies": {"model", "multiview", "stream.messages"},
+    "stream.messages.bodies": {"body.measurements", "body.track", "model", "multiview", "stream.messages"},
 }

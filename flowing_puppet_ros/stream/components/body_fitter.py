@@ -103,7 +103,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),
     )
-    outputs: tuple[Port, ...] = BodyOutputs.ports
+    outputs: tuple[Port, ...] = BodyOutputs.always
 
     def __init__(self, settings: BodyFitterSettings, factory: MessageFactory) -> None:
         """Load the body model."""
@@ -126,7 +126,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._line = PendingQueue()
         self._initial = StampBuffer()
         self._outputs = BodyOutputs(settings.output, settings.ros4hri, factory, self._model)
-        self.outputs = (*BodyOutputs.ports, *self._outputs.ros4hri.ports)
+        self.outputs = self._outputs.ports
 
     def warm_up(self) -> None:
         """Do beforehand what the first clouds of a live stream would wait for."""

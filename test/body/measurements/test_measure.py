@@ -6,7 +6,6 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-import open3d as o3d
 import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -27,6 +26,7 @@ from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.model import rotation, weights
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
+o3d = pytest.importorskip("open3d", reason="the extra `scans`")  # cuts surfaces by itself
 PEOPLE = 20
 TOLERANCE_M = 0.01
 """Asked of lengths and girths; the volume, in cubic metres, is asked more closely by it."""
