@@ -15,6 +15,7 @@ from flowing_puppet_ros.fusion.people_fitter import FusionSettings
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, carry_puppets, place_joints
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.stream.messages.camera_info import describe_images
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_puppet_joints
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
@@ -107,7 +108,7 @@ class PuppetPairs:
         return PairedPuppets(camera, carry_puppets(people[0], people[1], share))
 
     def _make_camera(self, header: Any, puppets: Any, to_z_up: F64) -> Camera:
-        info = self._info
+        info = None if self._info is None else describe_images(self._info)
         if info is None:
             raise InputError(
                 "no puppets/camera_info came yet: puppets cannot be used with a cloud without the colour camera's "

@@ -30,7 +30,8 @@ MAY_IMPORT: dict[str, set[str]] = {
     "body.fit": {"body.cloud", "body.refine", "body.scans", "body.search", "evidence.cloud", "model"},
     "body.measurements": {"model"},
     "body.refine": {"body.cloud", "body.search", "model"},
-    "body.scans": {"body.cloud", "model"},
+    "body.scans": {"body.cloud", "body.scans.formats", "model"},
+    "body.scans.formats": {"body.cloud"},
     "body.search": {"body.cloud", "evidence.cloud", "inference", "model"},
     "body.segmentation": {"body.cloud", "body.scans"},
     "body.track": {
@@ -114,6 +115,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "body.fit",
         "body.measurements",
         "body.scans",
+        "body.scans.formats",
         "body.segmentation",
         "body.track",
         "draw",

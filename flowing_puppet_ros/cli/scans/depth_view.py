@@ -19,11 +19,11 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from flowing_puppet_ros.arrays import F64, U8
+from flowing_puppet_ros.body.scans.formats.pcd import read_pcd
 from flowing_puppet_ros.body.scans.unit import UNITS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorProjection
-from flowing_puppet_ros.extras import import_extra
 from flowing_puppet_ros.multiview.camera import Camera
 
 IMAGE_SUFFIXES = (".png", ".tif", ".tiff")
@@ -31,7 +31,6 @@ IMAGE_SUFFIXES = (".png", ".tif", ".tiff")
 
 MAX_DEPTH_M = 20.0  # beyond, no camera measures people
 MIN_DEPTHS = 200  # known ones, of an image that may show somebody
-HEADER_BYTES = 4096
 MAX_INFO_BYTES = 1_000_000
 
 
@@ -110,15 +109,11 @@ def read_depth_view(path: Path, intrinsics: str | None, unit: str) -> DepthView:
 
 def read_organised(path: Path, metres: float) -> DepthView | None:
     """Read an organised .pcd whose unit is so many metres; None for another cloud, or where no pinhole camera fits."""
-    shape = _read_shape(path)
-    if shape is None:
+    cloud = read_pcd(path)
+    shape = cloud.shape
+    if min(shape) < 2:
         return None
-    o3d = import_extra("open3d", "scans", "reading .pcd files")
-    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
-    cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
-    points = metres * np.asarray(cloud.points)
-    if len(points) != shape[0] * shape[1]:
-        return None
+    points = metres * cloud.points
     pixel = np.flatnonzero(np.isfinite(points).all(axis=1) & points.any(axis=1))
     image = RangeImage.of_organised(points[pixel], pixel, shape)
     if image is None:
@@ -126,9 +121,7 @@ def read_organised(path: Path, metres: float) -> DepthView | None:
     scale, offset, axes = image.projection.scale, image.projection.offset, image.projection.axes
     matrix = [scale[0], 0, offset[0], 0, scale[1], offset[1], 0, 0, 1]
     camera = Camera.from_info(matrix, (), shape[1], shape[0], axes, np.zeros(3))
-    rgb = None
-    if cloud.has_colors():
-        rgb = np.rint(255 * np.asarray(cloud.colors)).astype(np.uint8).reshape((*shape, 3))
+    rgb = None if cloud.rgb is None else cloud.rgb.reshape((*shape, 3))
     return DepthView(points[pixel], camera, image, rgb, "-y" if np.allclose(axes, np.eye(3)) else "z")
 
 
@@ -243,21 +236,3 @@ def _read_pixels(path: Path) -> np.ndarray:
     if pixels.ndim != 2 or pixels.dtype.kind not in "uif" or min(pixels.shape) < 16:
         raise InputError(f"{path} holds {pixels.dtype} of shape {pixels.shape}; a depth image has rows and columns")
     return np.asarray(pixels)
-
-
-def _read_shape(path: Path) -> tuple[int, int] | None:
-    """Return (height, width) of an organised .pcd; None for one whose points are in no order."""
-    try:
-        with path.open("rb") as file:
-            header = file.read(HEADER_BYTES)
-    except OSError:
-        return None
-    found: dict[bytes, int] = {}
-    for line in header.split(b"\n"):
-        words = line.split()
-        if words[:1] == [b"DATA"]:
-            break
-        if words[:1] in ([b"WIDTH"], [b"HEIGHT"]) and len(words) == 2 and words[1].isdigit():
-            found[words[0]] = int(words[1])
-    height, width = found.get(b"HEIGHT", 0), found.get(b"WIDTH", 0)
-    return (height, width) if min(height, width) > 1 else None
