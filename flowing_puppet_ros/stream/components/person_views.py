@@ -110,5 +110,4 @@ def observe_person(
         contour = np.asarray(part.contour, float).reshape(-1, 2)
         cv2.fillPoly(region, [np.rint(contour).astype(np.int32)], 1)
     observation = builder.observe(name, frame.image, frame.labels, float(puppet.scale), frame.labels * region)
-    joints, _ = decode_puppet_joints(puppet)
-    return CameraObservation(observation, joints, person.weights[name])
+    return CameraObservation(observation, person.seen[name].joints, person.weights[name])

@@ -170,7 +170,7 @@ class VisualHullComponent(Component[VisualHullSettings]):
         views = {
             name: observe_person(self._builder, name, frames[name], puppet, person) for name, puppet in puppets.items()
         }
-        return self._builder.segment(views, person.id)
+        return self._builder.segment(views, person.id, (person.joints, person.confidence))
 
     def _make_body(self, identity: str, person: MultiViewPerson) -> Any:
         names = self._matcher.joint_names
