@@ -64,8 +64,7 @@ class JointFitter:
         """Return the body that the joints describe; InputError when they describe none."""
         floor = np.where(self._is_limb, 0.0, MIN_START_CONFIDENCE)
         weight = np.where(joints.found, np.sqrt(np.maximum(joints.confidence, floor)), 0.0)
-        weight[self._is_limb & (joints.confidence < MIN_LIMB_CONFIDENCE)] = 0.0
-        certain = np.where(joints.hidden, 0.0, weight)
+        certain = np.where(joints.hidden, HIDDEN_SHARE * weight, weight)
         try:
             targets = make_joint_targets(self.model, self._name(joints, certain))
         except InputError:
@@ -106,7 +105,8 @@ class JointFitter:
             tried.append((self.fitter.hypotheses.pose_bank.cost(found, coarse), found))
         _, body = tried[tried[1][0] < MAX_SWAP_RATIO * tried[0][0]]
         none = JointTargets.none(self.model)
-        fit = self.fitter.assess(run(body, cloud, none, free, terms), cloud)
+        held = self._hold_hidden(joints, targets) if body is tried[0][1] else none
+        fit = self.fitter.assess(run(body, cloud, held, free, terms), cloud)
         if not fit.reliable:
             wide = self.fitter.assess(run(fit.state, cloud, none, strengthen_priors(WIDE, unknown), terms), cloud)
             fit = min(fit, wide, key=lambda found: found.two_way_distance)
@@ -132,6 +132,10 @@ class JointFitter:
         free = strengthen_priors(FREE, unknown)
         reached = self.fitter.assess(run(body, cloud, JointTargets.none(self.model), free, terms), cloud)
         return reached if reached.two_way_distance <= MAX_REACH_RATIO * fit.two_way_distance else fit
+
+    def _hold_hidden(self, joints: LiftedJoints, targets: JointTargets) -> JointTargets:
+        """Return the pull of the hidden joints alone, which nothing else would hold."""
+        return replace(targets, weight=np.where(joints.hidden, targets.weight, 0.0))
 
     def _swap(self, targets: JointTargets) -> JointTargets:
         other = list(find_other_sides(self.model.joint_names))
