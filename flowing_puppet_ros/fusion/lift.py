@@ -8,6 +8,7 @@ without points of the person around it has no depth: it counts across the ray on
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,7 @@ from flowing_puppet_ros.fusion.limb_depths import (
     CHAINS,
     LIMB_REACH_M,
     TRUNK_REACH_M,
+    DepthChoices,
     choose_depths,
     list_choices,
     measure_seen_share,
@@ -52,6 +54,7 @@ class LiftedJoints:
         hidden: (J,) whether the joint is probably not on the surface that is seen at its pixel.
         depth: median depth of the trunk in metres along the camera's axis, NaN without any.
         centre: (3,) metres, where the camera is.
+        choices: of the limbs' joints, the places that each may have, by its number.
     """
 
     points: F64
@@ -60,6 +63,7 @@ class LiftedJoints:
     hidden: Bools
     depth: float
     centre: F64
+    choices: Mapping[int, DepthChoices]
 
     @property
     def found(self) -> Bools:
@@ -84,7 +88,7 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
     rays, axis = cloud.camera.cast_rays(puppet.pixels), cloud.camera.rotation[2]
     points = np.full((len(offsets), 3), np.nan)
     hidden = puppet.hidden.copy()
-    choices = {}
+    choices: dict[int, DepthChoices] = {}
     for joint, values in samples.items():
         near_trunk = joint in trunk
         near = values[np.abs(values - depth) < (MAX_TRUNK_DEPTH_M if near_trunk else MAX_LIMB_DEPTH_M)]
@@ -102,7 +106,8 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
         points[joint] = choices[joint].points[choice]
         hidden[joint] |= not choices[joint].seen[choice]
     found = np.isfinite(points).all(axis=1)
-    return LiftedJoints(points, rays, np.where(found, puppet.confidence, 0.0), hidden, depth, cloud.camera.centre)
+    confidence = np.where(found, puppet.confidence, 0.0)
+    return LiftedJoints(points, rays, confidence, hidden, depth, cloud.camera.centre, choices)
 
 
 def _find_surfaces(depth: F64) -> F64:

@@ -23,6 +23,8 @@ SCALES, SCALE_DEVIATION = (0.9, 1.0, 1.1), 0.08
 """Sizes of people relative to the model's mean that are tried, and their standard deviation."""
 BONE_DEVIATION_M, BONE_DEVIATION_SHARE = 0.03, 0.1
 """Standard deviation of a bone's length: that of the joints, and a share of the length."""
+HIDDEN_SPREAD_M = 0.05
+"""Standard deviation of a hidden joint's place across its ray."""
 MAX_BONE_COST = 8.0
 GRID_M, TRUNK_REACH_M, LIMB_REACH_M = 0.08, 0.4, 0.8
 """Step of the grid of depths, and its ends from the trunk's depth for trunk and limbs."""
@@ -53,6 +55,11 @@ class DepthChoices:
     depth: F64
     cost: F64
     seen: Bools
+
+    @property
+    def spread(self) -> F64:
+        """Standard deviation (C,) of the places across the ray beyond that of seen joints, metres."""
+        return np.where(self.seen, 0.0, HIDDEN_SPREAD_M)
 
 
 def list_choices(
@@ -135,7 +142,8 @@ def _fold(
     """Return the least cost (C,) of a limb for each choice of its first joint, and the way along it."""
     cost, back = choices[names[-1]].cost, []
     for near, far in zip(names[-2::-1], names[:0:-1], strict=True):
-        step = _bone_cost(choices[near], choices[far], float(np.linalg.norm(place[near] - place[far])), scale)
+        length = scale * float(np.linalg.norm(place[near] - place[far]))
+        step = _measure_pair_cost(choices[near], choices[far], length)
         slope = (choices[near].depth[:, None] - choices[far].depth) / SLOPE_M
         table = step + 0.5 * slope**2 + cost
         back.insert(0, table.argmin(axis=1))
@@ -143,11 +151,18 @@ def _fold(
     return cost, back
 
 
-def _bone_cost(a: DepthChoices, b: DepthChoices, length: float, scale: float) -> F64:
-    """Return what the distances (A, B) between two joints cost whose bone has a `length` in metres in the mean body."""
-    apart = np.linalg.norm(a.points[:, None] - b.points, axis=2)
-    deviation = BONE_DEVIATION_M + BONE_DEVIATION_SHARE * length
-    return np.asarray(np.minimum(0.5 * ((apart - scale * length) / deviation) ** 2, MAX_BONE_COST))
+def measure_bone_cost(a: F64, b: F64, length: float, spread: F64) -> F64:
+    """Return what the distances between joints at `a` (A, 3) and `b` (B, 3) m cost for a bone of `length` m, (A, B).
+
+    `spread` (A, B) m is the standard deviation of their places on their rays' pixels.
+    """
+    apart = np.linalg.norm(a[:, None] - b, axis=2)
+    variance = (BONE_DEVIATION_M + BONE_DEVIATION_SHARE * length) ** 2 + spread**2
+    return np.asarray(np.minimum(0.5 * (apart - length) ** 2 / variance, MAX_BONE_COST))
+
+
+def _measure_pair_cost(a: DepthChoices, b: DepthChoices, length: float) -> F64:
+    return measure_bone_cost(a.points, b.points, length, np.hypot(a.spread[:, None], b.spread))
 
 
 def _choose_corners(
@@ -164,8 +179,8 @@ def _choose_corners(
     for i, name in enumerate(corners):
         total = total + own[name].reshape([-1 if k == i else 1 for k in range(len(corners))])
         for j in range(i):
-            length = float(np.linalg.norm(place[name] - place[corners[j]]))
-            table = _bone_cost(choices[corners[j]], choices[name], length, scale)
+            length = scale * float(np.linalg.norm(place[name] - place[corners[j]]))
+            table = _measure_pair_cost(choices[corners[j]], choices[name], length)
             shape = [len(own[corner]) if k in (i, j) else 1 for k, corner in enumerate(corners)]
             total = total + table.reshape(shape)
     index = np.unravel_index(int(total.argmin()), total.shape)
