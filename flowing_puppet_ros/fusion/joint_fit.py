@@ -23,6 +23,7 @@ from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.fusion.limb_search import LimbSearcher
 from flowing_puppet_ros.fusion.lift import LiftedJoints
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -31,6 +32,8 @@ PULLED = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, si
 """With joints, from far away."""
 FREE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.06, sigma_end=0.03, iterations=8)
 """Without joints, at the end."""
+CLOSE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.08, sigma_end=0.04, iterations=6)
+"""With joints, after a limb has been hung anew."""
 MAX_FIT_POINTS = 4000
 MAX_SWAP_RATIO = 0.9
 """Cost of the body with exchanged sides, in costs of the other, below which it is kept: networks are mostly right."""
@@ -57,6 +60,7 @@ class JointFitter:
         self.fitter = fitter
         self.model = fitter.model
         self._strength = strength
+        self._limbs = LimbSearcher(fitter.hypotheses, fitter.model)
         self._is_limb = np.ones(len(self.model.joint_names), dtype=bool)
         self._is_limb[trunk_rows(self.model)] = False
 
@@ -64,8 +68,7 @@ class JointFitter:
         """Return the body that the joints describe; InputError when they describe none."""
         floor = np.where(self._is_limb, 0.0, MIN_START_CONFIDENCE)
         weight = np.where(joints.found, np.sqrt(np.maximum(joints.confidence, floor)), 0.0)
-        weight[self._is_limb & (joints.confidence < MIN_LIMB_CONFIDENCE)] = 0.0
-        certain = np.where(joints.hidden, 0.0, weight)
+        certain = np.where(joints.hidden, HIDDEN_SHARE * weight, weight)
         try:
             targets = make_joint_targets(self.model, self._name(joints, certain))
         except InputError:
@@ -96,23 +99,20 @@ class JointFitter:
     def fit(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
         """Fit a body to the person's points, from `start` and with the sides exchanged, whichever is better."""
         coarse = CoarseCloud.of(cloud)
-        targets = self.make_targets(joints)
         unknown = measure_unknown_share(self.model, start, cloud)
-        pulled, free = strengthen_priors(PULLED, unknown), strengthen_priors(FREE, unknown)
+        pulled, close, free = (strengthen_priors(weights, unknown) for weights in (PULLED, CLOSE, FREE))
         terms, run = [cloud.free_space_term], self.fitter.gauss_newton.run
         tried = []
-        for body, pull in ((start, targets), (self.start(swap_lifted(self.model, joints)), self._swap(targets))):
-            found = run(body, cloud, pull, pulled, terms)
-            tried.append((self.fitter.hypotheses.pose_bank.cost(found, coarse), found))
-        _, body = tried[tried[1][0] < MAX_SWAP_RATIO * tried[0][0]]
-        none = JointTargets.none(self.model)
-        fit = self.fitter.assess(run(body, cloud, none, free, terms), cloud)
-        if not fit.reliable:
-            wide = self.fitter.assess(run(fit.state, cloud, none, strengthen_priors(WIDE, unknown), terms), cloud)
-            fit = min(fit, wide, key=lambda found: found.two_way_distance)
-        return self._reach_for_hands(
-            fit, cloud, joints if body is tried[0][1] else swap_lifted(self.model, joints), unknown
+        for body, own in ((start, joints), (None, swap_lifted(self.model, joints))):
+            targets = self.make_targets(own)
+            found = run(self.start(own) if body is None else body, cloud, targets, pulled, terms)
+            tried.append((self.fitter.hypotheses.pose_bank.cost(found, coarse), found, own, targets))
+        _, body, joints, targets = tried[tried[1][0] < MAX_SWAP_RATIO * tried[0][0]]
+        body = self._limbs.improve(
+            body, coarse, joints, lambda tried: run(tried, cloud, targets, close, terms), np.random.default_rng(0)
         )
+        held = self._hold_hidden(joints, targets)
+        return self.fitter.assess(run(body, cloud, held, free, terms), cloud)
 
     def _reach_for_hands(self, fit: BodyFit, cloud: SingleViewCloud, joints: LiftedJoints, unknown: float) -> BodyFit:
         """Return the body with arms that point at the camera where the cloud is, if that is closer.
@@ -133,6 +133,10 @@ class JointFitter:
         reached = self.fitter.assess(run(body, cloud, JointTargets.none(self.model), free, terms), cloud)
         return reached if reached.two_way_distance <= MAX_REACH_RATIO * fit.two_way_distance else fit
 
+    def _hold_hidden(self, joints: LiftedJoints, targets: JointTargets) -> JointTargets:
+        """Return the pull of the hidden joints alone, which nothing else would hold."""
+        return replace(targets, weight=np.where(joints.hidden, targets.weight, 0.0))
+
     def _swap(self, targets: JointTargets) -> JointTargets:
         other = list(find_other_sides(self.model.joint_names))
         rays = None if targets.rays is None else targets.rays[other]
@@ -148,6 +152,7 @@ def swap_lifted(model: StitchedPuppet, joints: LiftedJoints) -> LiftedJoints:
         rays=joints.rays[other],
         confidence=joints.confidence[other],
         hidden=joints.hidden[other],
+        choices={other[joint]: choices for joint, choices in joints.choices.items()},
     )
 
 

@@ -166,10 +166,10 @@ class PeopleFitter:
             return None
 
     def _list_capsules(self, claim: Claim) -> F64:
-        """Return the capsules (C, 8) of a body, and of limbs with certain joints, should the body miss them."""
+        """Return the capsules (C, 8) of a body, and of limbs with known joints, should the body miss them."""
         names, joints = self.model.joint_names, claim.joints
-        certain = joints.found & ~joints.hidden & (joints.confidence >= MIN_LIMB_CONFIDENCE)
-        seen = {name: place for name, place, sure in zip(names, joints.points, certain, strict=True) if sure}
+        usable = joints.found & (joints.confidence >= MIN_LIMB_CONFIDENCE)
+        seen = {name: place for name, place, sure in zip(names, joints.points, usable, strict=True) if sure}
         limbs = list_capsules(seen)
         limbs = limbs[np.linalg.norm(limbs[:, :3] - limbs[:, 3:6], axis=1) < MAX_LIMB_M]
         return np.concatenate([self._list_body(claim.start), limbs])

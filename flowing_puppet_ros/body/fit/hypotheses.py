@@ -125,11 +125,11 @@ class BodyHypotheses:
         self.particle_search = BodyParticleSearch(model, points, weights)
         self.energy = BodyEnergy(model, points, weights.stitch, weights.mismatch)
         self.gauss_newton = GaussNewton(model)
-        self._proposer = Proposer(model, points)
-        self.limb_search = LimbSearch(model, self.particle_search, self._proposer)
+        self.proposer = Proposer(model, points)
+        self.limb_search = LimbSearch(model, self.particle_search, self.proposer)
         self.pose_bank = PoseBank(model, points)
         self._single_view_search = SingleViewSearch(
-            model, self.pose_bank, self._proposer, self.gauss_newton, self._threads
+            model, self.pose_bank, self.proposer, self.gauss_newton, self._threads
         )
 
     def search(self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False) -> BodyState:
@@ -193,7 +193,7 @@ class BodyHypotheses:
         start = []
         for group in states_to_particles(self._model, [body]):
             copies = group.take(np.zeros(self._settings.local_particles - 1, dtype=np.int64))
-            walked = self._proposer.random_walk(copies, WalkNoise(0.02, 0.12, 0.5, 0.2), rng)
+            walked = self.proposer.random_walk(copies, WalkNoise(0.02, 0.12, 0.5, 0.2), rng)
             start.append(Particles.join([group, walked]))
         stages, iterations = local_stages(self._model.tree), self._settings.local_iterations
         return self.particle_search.optimise(
@@ -229,7 +229,7 @@ class BodyHypotheses:
         )
         bodies = sample_bodies(self._model, cloud.points.mean(axis=0), particles, rng)
         noise = WalkNoise(center=0.05, rotation=0.1, pose=0.0, shape=0.0)
-        start = [self._proposer.random_walk(group, noise, rng) for group in states_to_particles(self._model, bodies)]
+        start = [self.proposer.random_walk(group, noise, rng) for group in states_to_particles(self._model, bodies)]
         stages = four_stages(self._model.tree)
         found = self.particle_search.optimise(
             start, grid, none, stages, iterations, rng, sub_progress(progress, 0.0, 0.8), threads=self._threads

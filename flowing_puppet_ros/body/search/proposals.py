@@ -118,8 +118,39 @@ class Proposer:
             shape: (S,) intrinsic shape of the new ones.
             rng: source of all randomness.
         """
-        edge, above = part - 1, self._model.tree.parents[part]
+        edge = part - 1
         relative = rng.uniform(self._model.limit_low[edge], self._model.limit_high[edge], (len(parent), 3))
+        return self._attach(part, parent, relative, shape, rng)
+
+    def attach_likely(self, part: int, parent: Particles, shape: np.ndarray, rng: np.random.Generator) -> Particles:
+        """Attach a part like `attach_to_parent`, but with rotations drawn from the joint's Gaussian (Eq. 49)."""
+        edge = part - 1
+        joint = self._model.pairwise[edge]
+        drawn = rng.multivariate_normal(joint.mean[:3], joint.covariance[:3, :3], len(parent), method="cholesky")
+        relative = np.clip(drawn, self._model.limit_low[edge], self._model.limit_high[edge])
+        return self._attach(part, parent, relative, shape, rng)
+
+    def point_to(self, part: int, particles: Particles, joint: int, target: np.ndarray) -> Particles:
+        """Turn a part about where it joins its parent so that its `joint` lies towards `target` (P, 3) m, if finite."""
+        points, known = self._points[part], np.isfinite(target).all(axis=1)
+        weight = self._model.interfaces[part - 1].weight
+        near = np.average(points.interfaces[part - 1].to_world(particles), axis=1, weights=weight)
+        number = int(np.flatnonzero(points.joint_index == joint)[0])
+        turn = _turn_between(points.joints.to_world(particles)[:, number] - near, np.where(known[:, None], target, 0) - near)
+        turn[~known] = np.eye(3)
+        center = near + (turn @ (particles.center - near)[:, :, None])[:, :, 0]
+        return Particles(center, turn @ particles.rotation, particles.pose, particles.shape)
+
+    def find_joints(self, part: int, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
+        """Return the indices (M,) of the joints that a part determines alone, and their places (P, M, 3), metres."""
+        points = self._points[part]
+        return points.joint_index, points.joints.to_world(particles)
+
+    def _attach(
+        self, part: int, parent: Particles, relative: np.ndarray, shape: np.ndarray, rng: np.random.Generator
+    ) -> Particles:
+        """Attach a part to its parent's particles, turned by rotation vectors `relative` (P, 3) in their frames."""
+        edge, above = part - 1, self._model.tree.parents[part]
         sampled = self._deformation[part, above][1].sample(rng, np.concatenate([relative, parent.pose], axis=1))
         pose, shapes = np.clip(sampled, -MAX_DEVIATIONS, MAX_DEVIATIONS), np.tile(shape, (len(parent), 1))
         rotation = parent.rotation @ so3.exp(relative)
@@ -147,3 +178,12 @@ class Proposer:
         weight = self._model.interfaces[edge].weight
         rotation, center = so3.procrustes(local, source.interfaces[edge], weight)
         return Particles(center, rotation, pose, given.shape)
+
+
+def _turn_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the rotations (P, 3, 3) by the smallest angles that take the directions of a (P, 3) to those of b (P, 3)."""
+    a, b = (side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12) for side in (a, b))
+    axis = np.cross(a, b)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, (a * b).sum(axis=1))
+    return so3.exp(axis * (angle / np.maximum(sine, 1e-12))[:, None])

@@ -113,7 +113,7 @@ class OneSidedView:
         Returns:
             (P,) metres, and (P, K) bool, which points face the sensor. A point beside the silhouette or in front of the
             surface costs its distance, at most 15 cm; one behind the surface costs its depth, at most 5 cm, if it faces
-            the sensor, and nothing otherwise.
+            the sensor, and nothing otherwise; one outside the field costs 5 cm if it faces the sensor.
         """
         return _misfit(np.ascontiguousarray(points), np.ascontiguousarray(normals), *self._arrays())
 
@@ -198,6 +198,8 @@ def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, 
                 toward += (viewpoint[axis] - points[p, k, axis]) * normals[p, k, axis]
             facing[p, k] = toward > 0
             if is_unknown(x, y, z, field):
+                # As what is hidden costs: a limb is no more probably out of sight than behind another.
+                cost[p] += OCCLUSION_DEPTH_M if facing[p, k] else 0.0
                 continue
             found, depth, dx, dy = _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest)
             if seen[found] < 0:
