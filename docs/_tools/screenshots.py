@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 FOLDER = ROOT / "docs" / "drawn"
 RECORDING, REPORT = ROOT / "bags" / "cache" / "rgbd", ROOT / "out" / "rgbd.html"
-WINDOW = {"width": 1200, "height": 860}
+WIDE, HIGH = 1200, 860  # px, of the window
 WIDTH = 900  # px, of the pictures
 DRAWN_IN_3D = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 PATIENCE_MS = 180_000
@@ -68,7 +68,7 @@ def photograph_annotation(browser: Browser) -> bytes:
 
 def open_page(browser: Browser, address: str, ready: str) -> Page:
     """Return a page as soon as it has what the selector `ready` finds."""
-    page = browser.new_page(viewport=WINDOW)
+    page = browser.new_page(viewport={"width": WIDE, "height": HIGH})
     page.set_default_timeout(PATIENCE_MS)
     page.goto(address)
     page.wait_for_selector(ready)
