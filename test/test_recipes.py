@@ -66,7 +66,7 @@ def test_the_capsules_of_a_person_contain_them_closely(recipe: ModuleType, someb
     for i, capsule in enumerate(found):
         surface = state.center[i] + model.local_vertices(i, state.pose[i], state.shape[i]) @ state.rotation[i].T
         solids = zip(*recipe.make_shapes(capsule), strict=True)
-        assert np.any([is_inside(*each, surface) for each in solids], axis=0).all(), capsule.part
+        assert np.any([is_inside(shape, pose, surface) for shape, pose in solids], axis=0).all(), capsule.part
         assert 0.02 < capsule.radius < 0.35
         length = np.linalg.norm(capsule.end - capsule.start)
         volume += np.pi * capsule.radius**2 * (length + 4 / 3 * capsule.radius)

@@ -70,7 +70,7 @@ class BodyOutputSettings(Settings):
         2000, "maximum number of triangles of a body in body_meshes; 0: all of the model", low=0, high=100000
     )
     part_frames: bool = setting(True, "publish a TF frame <part>_<id> for every part of a body")
-    measure: bool = setting(False, "publish `measurements`, of each person once a second")
+    measure: bool = setting(False, "publish `measurements`, of each person once a second", advanced=True)
     frame_prefix: str = setting("", "in front of the names of TF frames, where robots share a tree", advanced=True)
     person: str = setting(
         "", "id of the person on `person_pose`; empty: the nearest to the frame's origin", advanced=True
