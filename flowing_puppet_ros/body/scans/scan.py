@@ -109,8 +109,10 @@ def _validate(scan: Scan, path: Path) -> Scan:
     if scan.faces is None:
         if not finite.any():
             raise InputError(f"{path} holds {len(scan.points)} points, none of which is finite; export it again")
-        normals = None if scan.normals is None else scan.normals[finite]
-        return Scan(scan.points[finite], None, normals, scan.viewpoint)
+        points, normals = scan.points[finite], None if scan.normals is None else scan.normals[finite]
+        if not np.ptp(points, axis=0).any():
+            raise InputError(f"{path} holds {len(points)} points, all in the same place; export it again")
+        return Scan(points, None, normals, scan.viewpoint)
     if scan.faces.min() < 0 or scan.faces.max() >= len(scan.points):
         raise InputError(
             f"{path} has a face that names vertex {scan.faces.max()} of {len(scan.points)}; repair the mesh"

@@ -31,7 +31,8 @@ MAX_HEIGHT_M = 2.6
 """A cloud that is no wider is a person, when nobody can be told from their surroundings in it."""
 _NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
 MAX_NEW_PEOPLE = 3
-"""New people whose bodies are fitted in a cloud of a stream; the others come with the next."""
+"""New people whose bodies are fitted in a cloud of a live stream; the others come with the next. In a recording, which
+waits, so many in a row have to be nobody."""
 MIN_DECIDING_POINTS = 60
 """Points of a person from which on they tell whether people are seen from one side."""
 ONLY_ID = "b1"
@@ -175,7 +176,7 @@ class SceneTracker:
             return self._tracker.step_one(person, seed, executor), []
         known = self._tracker.predict_bodies(cloud.stamp) if settings.track else ()
         if self._is_one_sided(cloud, remember=True):
-            found = self._find(cloud, known, MAX_NEW_PEOPLE if settings.track else None, settings.track)
+            found = self._find(cloud, known, settings.track, live=executor is not None)
             if not settings.track:
                 fits = {id(body.person): body.fit for body in found}
                 named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
@@ -213,7 +214,7 @@ class SceneTracker:
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
         """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
-        return self._find(cloud, (), None, remember=False)
+        return self._find(cloud, (), remember=False)
 
     def fit_found(self, found: Sequence[FoundBody], seed: int, progress: Progress | None = None) -> list[BodyFit]:
         """Return the bodies of people found in a scene, fitted again where that may help, without the doubtful."""
@@ -248,11 +249,20 @@ class SceneTracker:
         rows = np.flatnonzero(near)
         return rows, np.asarray(cloud.points[rows], dtype=np.float64)
 
-    def _find(self, cloud: SceneCloud, known: Sequence[F64], max_fits: int | None, remember: bool) -> list[FoundBody]:
-        """Find the people of a single view; the known ones first."""
+    def _find(self, cloud: SceneCloud, known: Sequence[F64], remember: bool, live: bool = False) -> list[FoundBody]:
+        """Find the people of a single view; the known ones first. All, or of a tracked stream the likeliest."""
         rows, points = self._in_range(cloud)
         normals = None if cloud.normals is None else cloud.normals[rows]
-        found = self._finder.find(points, normals, np.zeros(3), cloud.stamp, known, max_fits, remember)
+        found = self._finder.find(
+            points,
+            normals,
+            np.zeros(3),
+            cloud.stamp,
+            known,
+            MAX_NEW_PEOPLE if live else None,
+            MAX_NEW_PEOPLE if remember else None,
+            remember,
+        )
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]

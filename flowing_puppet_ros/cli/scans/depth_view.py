@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of depth images and organised clouds: every point with its pixel and the camera that saw it.
 
-A depth image is a 16-bit PNG or TIFF, or a two-dimensional .npy; its camera comes as `fx,fy,cx,cy` or in a file with
-the fields of a CameraInfo, as `ros2 topic echo --once` prints them or as a calibration's YAML. An organised .pcd, one
-with several rows, tells its camera itself.
+A depth image is a 16-bit PNG, TIFF or PGM, a TIFF or PFM of floats, or a two-dimensional .npy or .npz; its camera comes
+as `fx,fy,cx,cy` or in a file with the fields of a CameraInfo, as `ros2 topic echo --once` prints them or as a
+calibration's YAML. An organised .pcd, one with several rows, tells its camera itself.
 """
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,7 +27,7 @@ from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorProjection
 from flowing_puppet_ros.multiview.camera import Camera
 
-IMAGE_SUFFIXES = (".png", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr")
 """Of files that are depth images and nothing else."""
 
 MAX_DEPTH_M = 20.0  # beyond, no camera measures people
@@ -64,9 +65,9 @@ class DepthView:
 
 
 def is_depth_image(path: Path, has_camera: bool) -> bool:
-    """Return whether a file is read as a depth image: by its suffix or, for .npy, because its camera is given."""
+    """Return whether a file is read as a depth image: by its suffix or, for arrays, because its camera is given."""
     suffix = path.suffix.lower()
-    return suffix in IMAGE_SUFFIXES or (suffix == ".npy" and has_camera)
+    return suffix in IMAGE_SUFFIXES or (suffix in (".npy", ".npz") and has_camera)
 
 
 def read_depth_view(path: Path, intrinsics: str | None, unit: str) -> DepthView:
@@ -80,7 +81,7 @@ def read_depth_view(path: Path, intrinsics: str | None, unit: str) -> DepthView:
     depth = _read_pixels(path)
     height, width = depth.shape
     camera = parse_intrinsics(intrinsics, (width, height))
-    name = ("mm" if depth.dtype.kind in "ui" else "m") if unit == "auto" else unit
+    name = _guess_unit(depth) if unit == "auto" else unit
     metres = depth.astype(np.float64) * UNITS[name]
     with np.errstate(invalid="ignore"):
         known = np.isfinite(metres) & (metres > 0)
@@ -215,17 +216,27 @@ def _list_numbers(value: Any) -> list[float]:
         return []
 
 
+def _guess_unit(depth: np.ndarray) -> str:
+    """Return mm for whole numbers, and for others whose middle is no distance in metres at which people are seen."""
+    if depth.dtype.kind in "ui":
+        return "mm"
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    return "mm" if len(known) and np.median(known) > MAX_DEPTH_M else "m"
+
+
 def _read_pixels(path: Path) -> np.ndarray:
     """Return the pixels (H, W) of a depth image as they are."""
     if not path.is_file():
         raise InputError(f"{path} does not exist or is not a file; give a depth image")
-    if path.suffix.lower() == ".npy":
-        try:
-            pixels = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{path} cannot be read as an array: {error}") from error
+    if path.suffix.lower() in (".npy", ".npz"):
+        pixels = _load_array(path)
     else:
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        try:
+            pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        except cv2.error:  # not every OpenCV reads .exr
+            pixels = None
+        if pixels is None and path.suffix.lower() == ".exr":
+            raise InputError(f"{path} is not read by this OpenCV; convert it to .npy or a float .tiff, in metres")
         if pixels is None:
             raise InputError(f"{path} is not an image, or damaged; give a 16-bit depth image")
         if pixels.ndim == 3:
@@ -236,3 +247,18 @@ def _read_pixels(path: Path) -> np.ndarray:
     if pixels.ndim != 2 or pixels.dtype.kind not in "uif" or min(pixels.shape) < 16:
         raise InputError(f"{path} holds {pixels.dtype} of shape {pixels.shape}; a depth image has rows and columns")
     return np.asarray(pixels)
+
+
+def _load_array(path: Path) -> np.ndarray:
+    """Return the array of a .npy, or the one of a .npz that is called depth or has no other beside it."""
+    try:
+        with path.open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            if not isinstance(loaded, np.lib.npyio.NpzFile):
+                return np.asarray(loaded)
+            name = "depth" if "depth" in loaded.files or len(loaded.files) != 1 else loaded.files[0]
+            if name not in loaded.files:
+                raise InputError(f"{path} has the arrays {', '.join(loaded.files)}; call the depth image depth")
+            return np.asarray(loaded[name])
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} cannot be read as an array: {error}") from error
