@@ -248,7 +248,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "node.launching": set(),
     "node.live": {"bag", "doctor", "node"},
     "report": {"bag", "draw", "evaluate", "evaluate.bag", "flow", "model", "model.ds", "multiview", "stream.messages"},
-    "stream": {"fusion", "model", "multiview", "stream.messages"},
+    "stream": {"body.scans", "fusion", "model", "multiview", "stream.messages"},
     "stream.components": {
         "body.fit",
         "body.scans",

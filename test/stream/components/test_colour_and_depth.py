@@ -106,7 +106,7 @@ def test_without_a_puppet_nobody_in_view_has_a_body(model: StitchedPuppet) -> No
 
 @pytest.mark.parametrize(
     ("frame", "calibrated", "sentence"),
-    [("other", True, "/tf_static does not connect"), ("eye", False, "no puppets/camera_info came yet")],
+    [("other", True, "/tf and /tf_static do not connect 'eye' with 'other'"), ("eye", False, "no puppets/camera_info came yet")],
 )
 def test_what_cannot_be_joined_is_one_sentence_and_the_cloud_is_used_alone(
     model: StitchedPuppet, frame: str, calibrated: bool, sentence: str
