@@ -49,6 +49,11 @@ class FusionSettings(Settings):
     wait: int = setting(
         3, "clouds to wait for late puppets before one is used without them", low=0, high=50, advanced=True
     )
+    colour_only: bool = setting(
+        True,
+        "publish whom the camera sees where there is no depth: joints alone, as far away as their size says, never"
+        " reliable",
+    )
     rectified: bool = setting(
         False, "puppets are those of a rectified image, as P of puppets/camera_info says, not K and D", advanced=True
     )

@@ -20,6 +20,7 @@ from flowing_puppet_ros.body.track.scene_tracker import (
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
+from flowing_puppet_ros.fusion.coarse_place import CoarsePerson, place_others
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.fusion.tracker import FusedTracker
@@ -288,6 +289,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self.counters["clouds"] += 1
         bodies: list[TrackedBody] = []
         occluded: list[str] = []
+        self._coarse: list[CoarsePerson] = []
         try:
             scene, place, is_known = self._decode(cloud, of_depth)
             scene = replace(scene, stamp=self._advance_clock(stamp))
@@ -303,7 +305,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         except InputError as error:
             self.report.count_unusable(error)
         self.counters["bodies"] += len(bodies)
-        return self._outputs.make(cloud.header, bodies, occluded, self._subscribed)
+        self.counters["people in colour only"] += len(self._coarse)
+        coarse = [person.move(*place.back) for person in self._coarse]
+        return self._outputs.make(cloud.header, bodies, occluded, self._subscribed, coarse)
 
     def _fit_scene(
         self, scene: SceneCloud, header: Any, stamp: int, place: SensorPlace, is_known: bool
@@ -324,13 +328,18 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             self.counters["clouds without puppets"] += 1
             return step(scene, seed)
         self._puppets.drop_until(stamp)
-        self._scene.check(scene)
         seen = SeenCloud.of(scene.points, paired.camera, scene.viewpoint)
+        coarse = paired.puppets if self.settings.fusion.colour_only else []
+        if not len(scene.points):
+            self._coarse = place_others(self._model, coarse, seen)
+        self._scene.check(scene)
         if is_known:
             bodies, own = self._fused.step(seen, scene.draw_image(), paired.puppets, scene.stamp)
         else:
             bodies, own = self._fused.step_alone(seen, scene.draw_image(), paired.puppets)
         occluded = self._fused.occluded_ids
+        with_body = {body.id for body in bodies}
+        self._coarse = place_others(self._model, [each for each in coarse if each.id not in with_body], seen)
         if paired.puppets and not own.any():
             self.report.warn(
                 f"none of the {len(paired.puppets)} puppets lies on the cloud: nobody is near enough to the sensor, or "
