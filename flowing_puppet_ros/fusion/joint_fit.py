@@ -90,10 +90,15 @@ class JointFitter:
         points, rays = np.nan_to_num(joints.points), np.nan_to_num(joints.rays)
         return JointTargets(points, self._strength * weight, rays)
 
-    def make_cloud(self, points: F64, field: SensorField | None) -> SingleViewCloud:
-        """Return the person's points (N, 3) m of a sensor at the origin, and what that can know of the person."""
+    def make_cloud(
+        self, points: F64, field: SensorField | None, viewpoint: F64 | None = None
+    ) -> SingleViewCloud:
+        """Return the person's points (N, 3) m of a sensor, and what that can know of the person.
+
+        The sensor is at `viewpoint` (3,) m, or at the origin.
+        """
         points = downsample(points, None, MAX_FIT_POINTS)[0]
-        viewpoint = np.zeros(3)
+        viewpoint = np.zeros(3) if viewpoint is None else viewpoint
         return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, field=field)
 
     def fit(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:

@@ -263,10 +263,13 @@ class MultiBodyTracker:
                 matched[column] = self._start_track(middle, stamp, people[column].proven)
         return [(matched[column], person) for column, person in enumerate(people) if column in matched]
 
-    def _start_track(self, middle: F64, stamp: int, proven: bool) -> _BodyTrack:
+    def make_id(self) -> str:
+        """Return an id that nobody had before."""
         self._started += 1
-        tracker = BodyTracker(self._fitter, self._settings)
-        name = f"{self._prefix}{self._started}"
+        return f"{self._prefix}{self._started}"
+
+    def _start_track(self, middle: F64, stamp: int, proven: bool) -> _BodyTrack:
+        name, tracker = self.make_id(), BodyTracker(self._fitter, self._settings)
         self._tracks.append(_BodyTrack(name, self._started, middle, stamp, tracker, proven=proven))
         return self._tracks[-1]
 
