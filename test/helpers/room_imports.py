@@ -265,6 +265,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "model.ds",
         "multiview",
         "multiview.association",
+        "multiview.bundle",
         "stream",
         "stream.messages",
         "stream.messages.bodies",

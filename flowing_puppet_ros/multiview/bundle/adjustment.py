@@ -21,6 +21,7 @@ from flowing_puppet_ros.multiview.camera import Camera
 _MAX_INSTANTS = 60
 _SCALES_PX = (20.0, 10.0, 6.0, *[5.0] * 9)  # of the robust loss, round by round, at 1000 px focal length
 _TRIANGULATION_STEPS = 4
+_MEDIAN_STEPS = 12
 _MIN_DEPTH_M = 0.1  # of a joint in front of a camera
 _MAX_EVALUATIONS = 3  # of derivatives in a round: new weights help more than many steps
 # How far a camera is expected to be from where the former calibration has it: this keeps what the joints leave free,
@@ -108,6 +109,19 @@ def triangulate_linear(rotation: F64, translation: F64, plane: F64, weight: F64)
         depth = rotation[:, 2] @ points.T + translation[:, 2, None]
         depth = np.where(depth > _MIN_DEPTH_M, depth, _MIN_DEPTH_M)
     return np.where(enough[:, None], points, np.nan)
+
+
+def triangulate_median(rotation: F64, translation: F64, plane: F64, weight: F64, width: float) -> F64:
+    """Return the points (N, 3) as `triangulate_linear` does, at the minimum of the distances rather than their squares.
+
+    A ray that is far off does not draw the point to itself. `width` is the distance on the image plane at depth 1 below
+    which the distance is squared.
+    """
+    points = triangulate_linear(rotation, translation, plane, weight)
+    for _ in range(_MEDIAN_STEPS):
+        error = np.linalg.norm(measure_residuals(rotation, translation, plane, points), axis=2)
+        points = triangulate_linear(rotation, translation, plane, weight / np.maximum(error, width))
+    return points
 
 
 def _solve_symmetric(columns: Sequence[F64], right: F64) -> F64:
