@@ -137,8 +137,8 @@ class HullBuilder:
         """Segment the silhouettes of one person in one set.
 
         `views` maps camera names to their observations of the person called `identity` at one instant, and `joints` are
-        its joints (J, 3) m and confidences (J,), triangulated from the views if not given. Raises InputError for a camera
-        without calibration.
+        its joints (J, 3) m and confidences (J,), triangulated from the views if not given. Raises InputError for a
+        camera without calibration.
         """
         missing = sorted(set(views) - set(self.cameras))
         if missing:

@@ -51,14 +51,14 @@ class Expectation:
     lengths: F64 = field(default_factory=lambda: np.zeros(0))
 
     def penalise_places(self, points: F64) -> F64:
-        """Return the penalties (..., J) in [0, _PLACE_WEIGHT] of points (..., J, 3) far from where they are expected."""
+        """Return the penalties (..., J), up to _PLACE_WEIGHT, of points (..., J, 3) away from the expected ones."""
         distance = np.linalg.norm(points - self.joints, axis=-1)
         return _PLACE_WEIGHT * np.minimum((np.nan_to_num(distance) / self.tolerance) ** 2, 1.0)
 
     def penalise_bones(self, points: F64, placed: F64) -> F64:
-        """Return the penalties (..., J) of points (..., J, 3) whose bones to the joints `placed` (J, 3) have other lengths.
+        """Return the penalties (..., J) of points (..., J, 3) by the lengths of their bones to `placed` (J, 3).
 
-        Between 0 and _BONE_WEIGHT for each bone.
+        Up to _BONE_WEIGHT for each bone.
         """
         penalty = np.zeros(points.shape[:-1])
         for end, other in ((0, 1), (1, 0)):

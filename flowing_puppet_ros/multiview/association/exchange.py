@@ -59,7 +59,10 @@ def _compare(view: CalibratedView, expected: F64, group: I64) -> float:
     both = group.ravel()
     swapped = group[:, ::-1].ravel()
     plain, other = _exchange_arrays(view, group)
-    own, exchanged = view.measure_distances(expected), replace(view, plane=plain, weight=other).measure_distances(expected)
+    own, exchanged = (
+        view.measure_distances(expected),
+        replace(view, plane=plain, weight=other).measure_distances(expected),
+    )
     known = np.isfinite(own[both]) & np.isfinite(exchanged[both])
     costs = [np.minimum(np.nan_to_num(each[both]) / _MAX_DISTANCE_M, 1.0) ** 2 for each in (own, exchanged)]
     weight = np.sqrt(view.weight[both] * view.weight[swapped]) * known

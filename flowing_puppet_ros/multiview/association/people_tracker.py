@@ -215,7 +215,7 @@ class PeopleTracker3D:
     def _clean(
         self, track: PersonTrack3D, views: Mapping[str, CalibratedView], expected: F64, others: Sequence[F64]
     ) -> dict[str, CalibratedView]:
-        """Return a person's views with left and right as `expected` (J, 3) m, and without joints that are not its own."""
+        """Return a person's views with left and right as `expected` (J, 3) m, without joints that are not its own."""
         return {
             name: doubt_hidden_joints(doubt_joints_on_others(view, expected, others), expected, others, self._bones)
             for name, view in track.exchanged.correct(views, expected).items()

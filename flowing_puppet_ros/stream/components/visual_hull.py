@@ -151,6 +151,8 @@ class VisualHullComponent(Component[VisualHullSettings]):
         cameras = self._calibrate_cameras(complete)
         frames = self._decode_frames(complete, cameras)
         people = self._matcher.match(stamp, cameras, frames)
+        if self._matcher.problem:
+            self.report.warn(self._matcher.problem)
         if not people:
             return []
         self._person_sets += 1
