@@ -19,7 +19,7 @@ from flowing_puppet_ros.body.fit.initialisation import flip_heading, sample_bodi
 from flowing_puppet_ros.body.fit.partial_view import measure_unknown_share, strengthen_priors
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
 from flowing_puppet_ros.body.fit.quality import MAX_UNCOVERED, FitQuality, assess_fit
-from flowing_puppet_ros.body.fit.single_view_search import ROUGH, SingleViewSearch
+from flowing_puppet_ros.body.fit.single_view_search import SingleViewSearch
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.body_energy import BodyEnergy
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
@@ -48,8 +48,9 @@ MAX_REPAIRABLE_COST_M = 0.06
 MAX_COST_RATIO, MAX_COST_RATIO_IF_WRONG, MIN_WRONG_UNCOVERED = 0.98, 0.9, 0.25
 # Gauss-Newton from initial joints where the sensor sees a part of the person only.
 PARTIAL = RefineWeights(sigma_start=0.2, sigma_end=0.03, iterations=20)
-# Bodies that are refined to compare frames.
+# Bodies that are refined to compare frames, and their Gauss-Newton steps.
 ROUGH_STARTS = 4
+ROUGH = RefineWeights(sigma_start=0.2, sigma_end=0.08, iterations=8)
 # Share of the particles and rounds in a search for the warm-up.
 RESTART_SHARE = 2.0  # of particles and iterations, in a search after the first
 WARM_UP_SHARE = 0.1
