@@ -167,7 +167,8 @@ class BodyHypotheses:
     def warm_up(self, cloud: Cloud, view: SingleViewCloud) -> None:
         """Run all compiled code once, on a whole cloud and on a single view."""
         grid = CloudGrid.build(cloud.points, cloud.normals)
-        self._search_both_headings(cloud, grid, np.random.default_rng(0), lambda _: None, WARM_UP_SHARE)
+        body = self._search_unknown(cloud, grid, np.random.default_rng(0), lambda _: None, WARM_UP_SHARE)
+        self.evaluate(flip_heading(self._model, body), cloud)
         state = self.pose_bank.find_best(CoarseCloud.of(view), 1)[0]
         self.refine(state, view, JointTargets.none(self._model), 1)
 
@@ -224,7 +225,19 @@ class BodyHypotheses:
 
         `share` is the share of the settings' particles and iterations to use.
         """
-        none = JointTargets.none(self._model)
+        found = self._search_unknown(cloud, grid, rng, sub_progress(progress, 0.0, 0.8), share)
+        body = self.evaluate(found, cloud)
+        turned = flip_heading(self._model, body.state)
+        flipped = self.evaluate(turned, cloud)
+        if flipped.cost < MAX_TURNED_RATIO * body.cost:
+            near = self.search_near(turned, grid, JointTargets.none(self._model), rng, sub_progress(progress, 0.8, 1.0))
+            flipped = min(flipped, self.evaluate(near, cloud), key=lambda candidate: candidate.cost)
+        return sorted([body, flipped], key=lambda candidate: candidate.cost)
+
+    def _search_unknown(
+        self, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator, progress: Progress, share: float
+    ) -> BodyState:
+        """Search with unknown yaw; `share` is that of the settings' particles and iterations to use."""
         particles, iterations = (
             max(1, round(share * count)) for count in (self._settings.particles, self._settings.iterations)
         )
@@ -232,16 +245,9 @@ class BodyHypotheses:
         noise = WalkNoise(center=0.05, rotation=0.1, pose=0.0, shape=0.0)
         start = [self._proposer.random_walk(group, noise, rng) for group in states_to_particles(self._model, bodies)]
         stages = four_stages(self._model.tree)
-        found = self.particle_search.optimise(
-            start, grid, none, stages, iterations, rng, sub_progress(progress, 0.0, 0.8), threads=self._threads
-        )
-        body = self.evaluate(found.state, cloud)
-        turned = flip_heading(self._model, body.state)
-        flipped = self.evaluate(turned, cloud)
-        if flipped.cost < MAX_TURNED_RATIO * body.cost:
-            near = self.search_near(turned, grid, none, rng, sub_progress(progress, 0.8, 1.0))
-            flipped = min(flipped, self.evaluate(near, cloud), key=lambda candidate: candidate.cost)
-        return sorted([body, flipped], key=lambda candidate: candidate.cost)
+        return self.particle_search.optimise(
+            start, grid, JointTargets.none(self._model), stages, iterations, rng, progress, threads=self._threads
+        ).state
 
     def repair_limbs(
         self, body: BodyCandidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator

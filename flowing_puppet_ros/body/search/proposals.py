@@ -36,10 +36,7 @@ class Conditional:
     @classmethod
     def of(cls, joint: Gaussian, kept: np.ndarray, given: np.ndarray) -> Conditional:
         """Prepare p(kept | given); variables in neither are marginalised out."""
-        zero = joint.condition(kept, given, np.zeros(len(given)))
-        gain = np.stack([joint.condition(kept, given, row).mean - zero.mean for row in np.eye(len(given))], axis=1)
-        values, axes = np.linalg.eigh(zero.covariance)
-        return cls(zero.mean, gain, axes * np.sqrt(np.maximum(values, 0.0)))
+        return cls(*joint.make_conditional(kept, given))
 
     def sample(self, rng: np.random.Generator, values: np.ndarray) -> np.ndarray:
         """Draw one sample (n, kept) for every row of `values` (n, given)."""
