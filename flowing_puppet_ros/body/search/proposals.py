@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.body.search.energy import ScoredParticles
-from flowing_puppet_ros.body.search.part_points import PartPoints
+from flowing_puppet_ros.body.search.part_points import PartPoints, PointSet
 from flowing_puppet_ros.body.search.particles import Particles
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.gaussian import Gaussian
@@ -36,10 +36,7 @@ class Conditional:
     @classmethod
     def of(cls, joint: Gaussian, kept: np.ndarray, given: np.ndarray) -> Conditional:
         """Prepare p(kept | given); variables in neither are marginalised out."""
-        zero = joint.condition(kept, given, np.zeros(len(given)))
-        gain = np.stack([joint.condition(kept, given, row).mean - zero.mean for row in np.eye(len(given))], axis=1)
-        values, axes = np.linalg.eigh(zero.covariance)
-        return cls(zero.mean, gain, axes * np.sqrt(np.maximum(values, 0.0)))
+        return cls(*joint.make_conditional(kept, given))
 
     def sample(self, rng: np.random.Generator, values: np.ndarray) -> np.ndarray:
         """Draw one sample (n, kept) for every row of `values` (n, given)."""
@@ -55,6 +52,8 @@ class Proposer:
         self._points = points
         self._neighbours = [np.array(model.tree.neighbours(part)) for part in range(len(model.tree))]
         self._deformation: dict[tuple[int, int], tuple[Conditional, Conditional]] = {}
+        # The weighted mean of an edge's interface points, as each of its two parts moves it.
+        self._middles: dict[tuple[int, int], PointSet] = {}
         for edge, (parent, child) in enumerate(model.tree.edges):
             relative = np.arange(3)
             of_parent = 3 + np.arange(model.pose_count(parent))
@@ -63,6 +62,8 @@ class Proposer:
                 (child, of_child, parent, of_parent),
                 (parent, of_parent, child, of_child),
             ):
+                weight = model.interfaces[edge].weight[None] / model.interfaces[edge].weight.sum()
+                self._middles[part, edge] = points[part].interfaces[edge].blend(weight, np.zeros((1, 3)))
                 self._deformation[part, other] = (
                     Conditional.of(model.pairwise[edge], kept, given),
                     Conditional.of(model.pairwise[edge], kept, np.concatenate([relative, given])),
@@ -154,10 +155,9 @@ class Proposer:
         sampled = self._deformation[part, above][1].sample(rng, np.concatenate([relative, parent.pose], axis=1))
         pose, shapes = np.clip(sampled, -MAX_DEVIATIONS, MAX_DEVIATIONS), np.tile(shape, (len(parent), 1))
         rotation = parent.rotation @ so3.exp(relative)
-        weight = self._model.interfaces[edge].weight
-        target = np.average(self._points[above].interfaces[edge].to_world(parent), axis=1, weights=weight)
-        own = np.average(self._points[part].interfaces[edge].deform(pose, shapes), axis=1, weights=weight)
-        return Particles(target - (rotation @ own[:, :, None])[:, :, 0], rotation, pose, shapes)
+        target = self._middles[above, edge].to_world(parent)[:, 0]
+        own = self._middles[part, edge].deform(pose, shapes)
+        return Particles(target - (rotation @ own.transpose(0, 2, 1))[:, :, 0], rotation, pose, shapes)
 
     def _stitch_to_neighbour(
         self, part: int, other: int, source: ScoredParticles, rng: np.random.Generator
