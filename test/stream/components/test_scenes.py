@@ -265,7 +265,7 @@ def test_clouds_that_cannot_show_people_are_one_sentence(person: np.ndarray) -> 
         (1, millimetres, "beyond the segmentation.max_range of 30 m; check the unit"),
         (2, person[:0], "no finite"),
     ):
-        made = dict(component.handle("points", make_cloud(FACTORY, make_header(FACTORY, stamp, "map"), points)))
+        made = dict(component.handle("points", make_cloud(FACTORY, make_header(FACTORY, stamp, "lidar"), points)))
         assert made["bodies"].bodies == []
         (warning,) = component.report.drain_warnings()
         assert sentence in warning
