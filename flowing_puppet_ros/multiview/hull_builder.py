@@ -131,11 +131,14 @@ class HullBuilder:
         """Return another person of a frame from which camera `name` has learned; see `SilhouetteEstimator.observe`."""
         return self._get_estimator(name).observe(image, labels, scale, person)
 
-    def segment(self, views: Mapping[str, CameraObservation], identity: str = "") -> MultiViewPerson:
-        """Segment the silhouettes of one person in one set and triangulate its joints.
+    def segment(
+        self, views: Mapping[str, CameraObservation], identity: str = "", joints: tuple[F64, F64] | None = None
+    ) -> MultiViewPerson:
+        """Segment the silhouettes of one person in one set.
 
-        `views` maps camera names to their observations of the person called `identity` at one instant. Raises
-        InputError for a camera without calibration.
+        `views` maps camera names to their observations of the person called `identity` at one instant, and `joints` are
+        its joints (J, 3) m and confidences (J,), triangulated from the views if not given. Raises InputError for a
+        camera without calibration.
         """
         missing = sorted(set(views) - set(self.cameras))
         if missing:
@@ -148,7 +151,7 @@ class HullBuilder:
         if usable < MIN_VIEWS:
             reasons = "; ".join(f"{name}: {each.problem}" for name, each in silhouettes.items() if each.problem)
             problem = f"a person needs {MIN_VIEWS} usable silhouettes, got {usable} ({reasons})"
-        return MultiViewPerson(*self._triangulate(views), silhouettes, problem)
+        return MultiViewPerson(*(joints or self._triangulate(views)), silhouettes, problem)
 
     def carve(self, person: MultiViewPerson) -> Hull:
         """Carve the hull of a person; cameras with an unusable mask are left out."""

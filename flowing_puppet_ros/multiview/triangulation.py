@@ -4,18 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.settings import Settings, setting
 
 _GAUSS_NEWTON_STEPS = 8  # from the best proposal of two views
+# What is known beforehand decides between proposals that views support alike; 1 is a view with full confidence.
+_PLACE_WEIGHT = 0.8  # of the place where a joint is expected
+_BONE_WEIGHT, _BONE_LOG = 0.6, 0.2  # of each bone of a joint, and the relative error from which it has another length
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,42 @@ class TriangulationSettings(Settings):
     min_angle: float = setting(
         4.0, "minimum angle between two rays that place a joint", unit="degrees", low=0.1, high=60.0, advanced=True
     )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expectation:
+    """What is known of a person before the views are asked; it decides where they contradict one another.
+
+    Attributes:
+        joints: (J, 3) m where the joints are expected, NaN where unknown.
+        tolerance: (J,) m by which they may have moved meanwhile.
+        bones: (B, 2) places of the joints at the ends of each bone.
+        lengths: (B,) m of the bones, NaN where unknown.
+    """
+
+    joints: F64
+    tolerance: F64
+    bones: I64 = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    lengths: F64 = field(default_factory=lambda: np.zeros(0))
+
+    def penalise_places(self, points: F64) -> F64:
+        """Return the penalties (..., J), up to _PLACE_WEIGHT, of points (..., J, 3) away from the expected ones."""
+        distance = np.linalg.norm(points - self.joints, axis=-1)
+        return _PLACE_WEIGHT * np.minimum((np.nan_to_num(distance) / self.tolerance) ** 2, 1.0)
+
+    def penalise_bones(self, points: F64, placed: F64) -> F64:
+        """Return the penalties (..., J) of points (..., J, 3) by the lengths of their bones to `placed` (J, 3).
+
+        Up to _BONE_WEIGHT for each bone.
+        """
+        penalty = np.zeros(points.shape[:-1])
+        for end, other in ((0, 1), (1, 0)):
+            near, far = self.bones[:, end], self.bones[:, other]
+            length = np.linalg.norm(points[..., near, :] - placed[far], axis=-1)
+            error = np.log(np.maximum(length, 1e-3) / self.lengths)
+            each = _BONE_WEIGHT * np.minimum((np.nan_to_num(error) / _BONE_LOG) ** 2, 1.0)
+            np.add.at(penalty, (..., near), each)
+        return penalty
 
 
 def triangulate(
@@ -62,16 +101,28 @@ def triangulate(
 
 
 def triangulate_plane(
-    cameras: Sequence[Camera], plane: F64, weights: F64, settings: TriangulationSettings
+    cameras: Sequence[Camera],
+    plane: F64,
+    weights: F64,
+    settings: TriangulationSettings,
+    expected: Expectation | None = None,
 ) -> tuple[F64, F64]:
-    """Triangulate as `triangulate` does, from points (C, J, 2) on the undistorted image planes; NaN where unseen."""
+    """Triangulate as `triangulate` does, from points (C, J, 2) on the undistorted image planes; NaN where unseen.
+
+    With what is `expected` of the person, a joint on which as many views agree elsewhere is placed where it may be. One
+    that is neither where it was expected nor has bones of the right lengths has less confidence.
+    """
     known = np.isfinite(plane).all(axis=-1) & (weights >= settings.min_confidence) & (weights > 0)
     weights = np.where(known, weights, 0.0)
     plane = np.where(known[..., None], plane, 0.0)
 
     proposals = _propose_from_pairs(cameras, plane, known, settings)
     cost = np.stack([_robust_cost(cameras, plane, weights, p, settings.max_ray_distance) for p in proposals])
-    best = proposals[cost.argmin(axis=0), np.arange(plane.shape[1])]
+    if expected is not None:
+        cost = cost + expected.penalise_places(proposals)
+    best = _choose(proposals, cost)
+    if expected is not None:
+        best = _choose(proposals, cost + expected.penalise_bones(proposals, best))
     for _ in range(_GAUSS_NEWTON_STEPS):
         best = _gauss_newton_step(cameras, plane, weights, best, settings.max_ray_distance)
 
@@ -81,7 +132,16 @@ def triangulate_plane(
     count = agrees.sum(axis=0)
     placed = count >= 2
     result = np.where(placed[:, None], best, np.nan)
-    return result, np.where(placed, agreeing * agreeing / np.maximum(count * total, 1e-12), 0.0)
+    confidence = np.where(placed, agreeing * agreeing / np.maximum(count * total, 1e-12), 0.0)
+    if expected is not None:
+        penalty = expected.penalise_places(result) + expected.penalise_bones(result, result)
+        confidence = confidence * np.maximum(1 - penalty, 0.0)
+    return result, confidence
+
+
+def _choose(proposals: F64, cost: F64) -> F64:
+    """Return the cheapest of the proposals (P, J, 3) for each joint by its cost (P, J)."""
+    return np.asarray(proposals[cost.argmin(axis=0), np.arange(proposals.shape[1])])
 
 
 def _check_inputs(cameras: int, points: ArrayLike, confidence: ArrayLike) -> tuple[F64, F64]:

@@ -54,6 +54,7 @@ from flowing_puppet_ros.report.bag_pictures import (
     read_body_meshes,
     read_messages,
 )
+from flowing_puppet_ros.report.people_in_space import SpaceData, gather_space
 from flowing_puppet_ros.report.scene_3d import SceneFrame, count_affordable_frames, make_scene_data
 from flowing_puppet_ros.stream.messages.images import decode_image
 
@@ -108,6 +109,7 @@ class ReportData:
     bodies: BodiesData | None = None
     body_shots: list[BodyShot] = field(default_factory=list)
     scene: Mapping[str, Any] | None = None
+    space: SpaceData | None = None
 
     def seconds(self, stamp: int) -> float:
         """Return the seconds from the first stamp to `stamp` (ns)."""
@@ -135,6 +137,7 @@ def gather_data(input_bag: Path, output_bag: Path, summary: Mapping[str, Any] | 
             _add_track(data, shown, given)
             if not data.strip:
                 _add_overlays(data, shown, made)
+        data.space = gather_space(recording, given, made)
         if recording.bodies:
             data.bodies = _make_bodies_data(recording)
             _add_bodies(data, recording, given, made)

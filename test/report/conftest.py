@@ -69,6 +69,7 @@ class Content:
     images: bool = True
     bystander: bool = False
     overlays: bool = False
+    space: bool = False
 
 
 @pytest.fixture
@@ -163,6 +164,8 @@ def _outputs(content: Content) -> list[tuple[str, str, int, Any]]:
                 data = encode_jpeg(np.full((64, 48, 3), 40 * frame, np.uint8), 95)
                 image = FACTORY.make(kind, header=make_header(FACTORY, stamp, name), format="jpeg", data=data)
                 messages.append((f"/{name}/overlay/compressed", kind, stamp, image))
+        if content.space:
+            messages.append(_silhouettes(make_header(FACTORY, stamp, "world"), stamp, frame))
         if content.bodies and frame % 2 == 0:
             header = make_header(FACTORY, stamp, "world")
             messages += _body(header, stamp, frame)
@@ -170,6 +173,22 @@ def _outputs(content: Content) -> list[tuple[str, str, int, Any]]:
         corners = [FACTORY.make("shape_msgs/msg/MeshTriangle", vertex_indices=np.array(t)) for t in TRIANGLES]
         messages.insert(0, ("/body_topology", mesh, START, FACTORY.make(mesh, triangles=corners)))
     return messages
+
+
+def _silhouettes(header: Any, stamp: int, frame: int) -> tuple[str, str, int, Any]:
+    """The person in space as it is, but for the left wrist, which is 50 cm too high."""
+    joints = [
+        FACTORY.make(
+            "flowing_puppet_msgs/msg/BodyJoint",
+            name=name,
+            position=make_point(FACTORY, point + np.array([0, 0, 0.5 * (name == "left_wrist")])),
+            confidence=0.9,
+        )
+        for name, point in joints_at(frame).items()
+    ]
+    person = FACTORY.make("flowing_puppet_msgs/msg/Body", id="b1", joints=joints)
+    kind = "flowing_puppet_msgs/msg/SilhouetteSet"
+    return "/silhouettes", kind, stamp, FACTORY.make(kind, header=header, person=person)
 
 
 def _body(header: Any, stamp: int, frame: int) -> list[tuple[str, str, int, Any]]:

@@ -253,3 +253,20 @@ def test_boxes_hold_their_points_and_stay_in_the_image(points: list[list[float]]
     part = box.crop(np.zeros(shape))
     assert part.shape[1] / part.shape[0] == pytest.approx(0.75, abs=0.02) or 100 in part.shape or 120 in part.shape
     assert ImageBox.around(np.full((2, 2), np.nan), shape, 0.1) == ImageBox(0, 0, 100, 120)
+
+
+def test_people_in_space_are_shown_in_all_cameras_and_compared_with_their_puppets(replay: Replay) -> None:
+    data = gather_data(*replay(space=True))
+    html = build_report_page(data)
+    assert data.space is not None and data.space.ids == ["b1"]
+    assert [sorted(pictures) for _, pictures in data.space.moments] == [["front", "side"]] * 3
+    for each in data.space.reprojection.values():  # puppets are 3 px beside the truth, and one wrist is 50 cm off
+        assert len(each.pixels) == 5 * 12 and each.agrees.sum() == 5 * 11
+        assert each.mean_of_agreeing == pytest.approx(3.0, abs=0.01)
+        assert each.pixels[~each.agrees].min() > 20
+    assert "People in all cameras" in Page(html).text and "Heights of the joints of b1" in html
+
+
+def test_without_people_in_space_there_is_no_section(replay: Replay) -> None:
+    data = gather_data(*replay())
+    assert data.space is None and "People in all cameras" not in build_report_page(data)

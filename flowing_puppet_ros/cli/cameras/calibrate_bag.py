@@ -25,7 +25,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.networks.choice import SOURCE_HELP, SOURCES, load_networks
 from flowing_puppet_ros.image.video.clip import DetectedFrame
 from flowing_puppet_ros.multiview.bundle.adjustment import Freedom
-from flowing_puppet_ros.multiview.bundle.calibrate import Agreement, RefinedRig, Scale, refine_rig
+from flowing_puppet_ros.multiview.bundle.calibrate import AGREE_M, Agreement, RefinedRig, Scale, refine_rig
 from flowing_puppet_ros.multiview.rig.files import FORMS, write_rig
 from flowing_puppet_ros.multiview.rig.rig import CameraRig
 from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
@@ -121,6 +121,8 @@ def _round(agreement: Agreement) -> dict[str, Any]:
     return {
         "mean": round(agreement.all_mean, 2),
         "median": round(agreement.all_median, 2),
+        "mean_where_they_agree": round(agreement.agreeing_mean, 2),
+        "share_that_agrees": round(agreement.agreeing_share, 4),
         "mean_by_camera": {name: round(value, 2) for name, value in agreement.mean.items()},
         "median_by_camera": {name: round(value, 2) for name, value in agreement.median.items()},
     }
@@ -136,6 +138,11 @@ def _text(summary: dict[str, Any]) -> str:
     lines.append(
         f"all: mean {before['mean']:.1f} -> {after['mean']:.1f} px, "
         f"median {before['median']:.1f} -> {after['median']:.1f} px"
+    )
+    lines.append(
+        f"joints on which cameras agree within {100 * AGREE_M:.0f} cm: {100 * before['share_that_agrees']:.0f} % -> "
+        f"{100 * after['share_that_agrees']:.0f} %, their mean {before['mean_where_they_agree']:.1f} -> "
+        f"{after['mean_where_they_agree']:.1f} px"
     )
     heights = ", ".join(f"{person} {height:.2f} m" for person, height in summary["person_heights_m"].items())
     return "\n".join([*lines, f"people: {heights or 'none measured'}", f"calibration: {summary['output']}"])

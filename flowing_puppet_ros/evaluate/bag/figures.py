@@ -15,6 +15,11 @@ from flowing_puppet_ros.evaluate.bag.recording import (
     read_recording,
     triangulate_detections,
 )
+from flowing_puppet_ros.evaluate.bag.reprojection import (
+    measure_reprojection,
+    read_people_in_space,
+    summarise_reprojection,
+)
 from flowing_puppet_ros.evaluate.bag.timing import measure_timing
 from flowing_puppet_ros.evaluate.bag.truth import (
     PeopleByStamp,
@@ -69,6 +74,7 @@ def measure_bag(input_bag: Bag, output_bag: Bag, truth: PeopleByStamp | None) ->
         figures["people found, %"] = 100 * len(frames) / len(pairs)
         figures |= _measure_surface(pairs, found, reference) | _measure_swaps(pairs)
     figures |= _measure_bodies(recording, found) | _measure_puppets(recording)
+    figures |= summarise_reprojection(measure_reprojection(recording, read_people_in_space(output_bag)))
     start = recording.start
     seconds = np.array([(stamp - start) * 1e-9 for stamp, _, body in pairs if body is not None])
     return BagFigures(figures | measure_timing(input_bag, output_bag), errors, seconds)

@@ -17,7 +17,7 @@ from flowing_puppet_ros.multiview.association.view import (
     measure_mismatch,
     measure_ray_mismatch,
 )
-from flowing_puppet_ros.multiview.triangulation import TriangulationSettings, triangulate_plane
+from flowing_puppet_ros.multiview.triangulation import Expectation, TriangulationSettings, triangulate_plane
 
 type Key = tuple[str, int]
 """A person in an image: the camera's name and the number in the camera's list."""
@@ -33,11 +33,13 @@ class ViewCluster:
     mismatch: float
 
 
-def triangulate_views(views: Sequence[CalibratedView], settings: TriangulationSettings) -> tuple[F64, F64]:
+def triangulate_views(
+    views: Sequence[CalibratedView], settings: TriangulationSettings, expected: Expectation | None = None
+) -> tuple[F64, F64]:
     """Return the joints (J, 3) m and confidences (J,) of the views' person; NaN and 0 where they do not agree."""
     plane = np.stack([view.plane for view in views])
     weights = np.stack([view.weight for view in views])
-    return triangulate_plane([view.camera for view in views], plane, weights, settings)
+    return triangulate_plane([view.camera for view in views], plane, weights, settings, expected)
 
 
 def drop_disagreeing(

@@ -22,6 +22,7 @@ from flowing_puppet_ros.multiview.association.clusters import (
     find_clusters,
     triangulate_views,
 )
+from flowing_puppet_ros.multiview.association.exchange import ExchangedLimbs
 from flowing_puppet_ros.multiview.association.identity import choose_returning
 from flowing_puppet_ros.multiview.association.settings import AssociationSettings
 from flowing_puppet_ros.multiview.association.track_3d import PersonTrack3D, find_bones
@@ -32,7 +33,7 @@ from flowing_puppet_ros.multiview.association.view import (
     calibrate_views,
     measure_mismatch,
 )
-from flowing_puppet_ros.multiview.association.weights import doubt_joints_on_others
+from flowing_puppet_ros.multiview.association.weights import doubt_hidden_joints, doubt_joints_on_others
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
 
@@ -51,6 +52,7 @@ class PersonInSpace:
         confidence: (J,) in [0, 1], 0 where fewer than two views agree.
         views: camera -> number of the person in the camera's list.
         weights: camera -> (J,) confidence of the joints in that view, 0 where they are not this person's.
+        seen: camera -> the person in that view, with left and right as in space.
     """
 
     id: str
@@ -58,6 +60,7 @@ class PersonInSpace:
     confidence: F64
     views: dict[str, int]
     weights: dict[str, F64]
+    seen: dict[str, PersonInView]
 
 
 class PeopleTracker3D:
@@ -160,6 +163,7 @@ class PeopleTracker3D:
             return None
         self._count += 1
         track = PersonTrack3D(f"b{self._count}", cluster.joints.copy(), stamp, bones=self._bones)
+        track.exchanged = ExchangedLimbs(self.names)
         self._tracks.append(track)
         return track
 
@@ -189,16 +193,13 @@ class PeopleTracker3D:
         found: Mapping[str, tuple[PersonTrack3D, dict[str, int]]],
     ) -> list[PersonInSpace]:
         """Triangulate everybody without the joints that lie on others, and remember them."""
-        expected = {
-            identity: np.where(np.isfinite(track.predict(stamp)), track.predict(stamp), np.nan)
-            for identity, (track, _) in found.items()
-        }
+        expected = {identity: track.expect(stamp) for identity, (track, _) in found.items()}
         result = []
         for identity, (track, chosen) in found.items():
             own = {name: views[name][k] for name, k in chosen.items()}
-            others = [joints for other, joints in expected.items() if other != identity]
-            cleaned = {name: doubt_joints_on_others(view, expected[identity], others) for name, view in own.items()}
-            joints, confidence = triangulate_views(list(cleaned.values()), self.triangulation)
+            others = [each.joints for other, each in expected.items() if other != identity]
+            cleaned = self._clean(track, own, expected[identity].joints, others)
+            joints, confidence = triangulate_views(list(cleaned.values()), self.triangulation, expected[identity])
             track.update(stamp, joints)
             track.members = {name: view.person.id for name, view in own.items()}
             for name, view in own.items():
@@ -207,8 +208,18 @@ class PeopleTracker3D:
                 if view.person.colours is not None:
                     track.colours[name] = view.person.colours
             weights = {name: view.weight for name, view in cleaned.items()}
-            result.append(PersonInSpace(identity, joints, confidence, chosen, weights))
+            seen = {name: view.person for name, view in cleaned.items()}
+            result.append(PersonInSpace(identity, joints, confidence, chosen, weights, seen))
         return sorted(result, key=lambda person: int(person.id[1:]))
+
+    def _clean(
+        self, track: PersonTrack3D, views: Mapping[str, CalibratedView], expected: F64, others: Sequence[F64]
+    ) -> dict[str, CalibratedView]:
+        """Return a person's views with left and right as `expected` (J, 3) m, without joints that are not its own."""
+        return {
+            name: doubt_hidden_joints(doubt_joints_on_others(view, expected, others), expected, others, self._bones)
+            for name, view in track.exchanged.correct(views, expected).items()
+        }
 
 
 def _pairs(names: list[str]) -> list[tuple[str, str]]:

@@ -10,11 +10,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.multiview.association.exchange import ExchangedLimbs
+from flowing_puppet_ros.multiview.triangulation import Expectation
 
 _VELOCITY_SHARE = 0.3  # of the newest displacement in the smoothed velocity
 _MAX_SPEED_M_S = 4.0
 _MAX_EXTRAPOLATION_S = 0.5
+_JOINT_NOISE_M, _JOINT_SPEED_M_S = 0.08, 2.0  # of a joint about where its body has carried it
 _SIZES = 101  # in the running median of sizes
+_MIN_SIZES = 10  # of a bone, before its length is known
 _BONES = (
     *(("shoulder", "elbow"), ("elbow", "wrist"), ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle")),
     *(("shoulder", "shoulder"), ("hip", "hip")),
@@ -34,6 +38,7 @@ class PersonTrack3D:
         votes: (camera, id in it) -> sets in which they were this person.
         colours: camera -> histogram of the torso.
         bones: pairs of joints whose distance does not change.
+        exchanged: in which cameras left and right are exchanged.
     """
 
     id: str
@@ -44,7 +49,13 @@ class PersonTrack3D:
     votes: dict[tuple[str, str], int] = field(default_factory=dict)
     colours: dict[str, F64] = field(default_factory=dict)
     bones: Sequence[tuple[int, int]] = ()
+    exchanged: ExchangedLimbs = field(default_factory=lambda: ExchangedLimbs(()))
     _sizes: deque[F64] = field(default_factory=lambda: deque(maxlen=_SIZES))
+    _placed: F64 = field(init=False)  # (J,) ns, when each joint was last placed
+
+    def __post_init__(self) -> None:
+        """Take the joints as placed now."""
+        self._placed = np.full(len(self.joints), float(self.stamp))
 
     @property
     def centre(self) -> F64:
@@ -55,6 +66,17 @@ class PersonTrack3D:
         """Return the joints (J, 3) m expected at a stamp, ns."""
         seconds = min(max(0.0, (stamp - self.stamp) * 1e-9), _MAX_EXTRAPOLATION_S)
         return self.joints + self.velocity * seconds
+
+    def expect(self, stamp: int) -> Expectation:
+        """Return the joints expected at a stamp, ns, and the lengths of the bones as far as they are known."""
+        lengths = np.full(len(self.bones), np.nan)
+        if self._sizes:
+            sizes = np.stack(self._sizes)
+            known = np.isfinite(sizes).sum(axis=0) >= _MIN_SIZES
+            lengths[known] = np.nanmedian(sizes[:, known], axis=0)
+        seconds = np.maximum(0.0, (stamp - self._placed) * 1e-9)
+        tolerance = _JOINT_NOISE_M + _JOINT_SPEED_M_S * seconds
+        return Expectation(self.predict(stamp), tolerance, np.array(self.bones, np.int64).reshape(-1, 2), lengths)
 
     def update(self, stamp: int, joints: F64) -> None:
         """Take joints (J, 3) m, NaN where unknown: those keep moving with the body."""
@@ -70,6 +92,7 @@ class PersonTrack3D:
         else:
             self.velocity = np.zeros(3)
         self.joints = np.where(known[:, None], joints, self.predict(stamp))
+        self._placed[known] = stamp
         self.stamp = stamp
         self._sizes.append(measure_sizes(joints, self.bones))
 
@@ -77,6 +100,7 @@ class PersonTrack3D:
         """Start again somewhere else, as the same person."""
         self.joints, self.stamp, self.velocity = joints.copy(), stamp, np.zeros(3)
         self.members = {}
+        self._placed[:] = stamp
 
     def compare_size(self, joints: F64) -> float:
         """Return the median relative difference of joint distances to a person with joints (J, 3) m; NaN if unknown."""

@@ -21,12 +21,14 @@ from flowing_puppet_ros.multiview.camera import Camera
 _MAX_INSTANTS = 60
 _SCALES_PX = (20.0, 10.0, 6.0, *[5.0] * 9)  # of the robust loss, round by round, at 1000 px focal length
 _TRIANGULATION_STEPS = 4
+_MEDIAN_STEPS = 12
 _MIN_DEPTH_M = 0.1  # of a joint in front of a camera
 _MAX_EVALUATIONS = 3  # of derivatives in a round: new weights help more than many steps
 # How far a camera is expected to be from where the former calibration has it: this keeps what the joints leave free,
 # and is robust, so that a camera that was pushed is not held back.
 _TURN, _MOVE_M, _CLOCK_PERIODS, _FOCAL, _CENTRE = np.radians(0.3), 0.02, 100.0, 0.003, 0.003
 _PRIOR_JOINTS = 10.0  # joints that weigh as much as the expectation
+_TURN_AND_MOVE = slice(0, 6)  # among the unknowns of a camera
 _CLOCK_STEP = 0.25  # periods over which the velocity of joints is measured
 
 
@@ -107,6 +109,19 @@ def triangulate_linear(rotation: F64, translation: F64, plane: F64, weight: F64)
         depth = rotation[:, 2] @ points.T + translation[:, 2, None]
         depth = np.where(depth > _MIN_DEPTH_M, depth, _MIN_DEPTH_M)
     return np.where(enough[:, None], points, np.nan)
+
+
+def triangulate_median(rotation: F64, translation: F64, plane: F64, weight: F64, width: float) -> F64:
+    """Return the points (N, 3) as `triangulate_linear` does, at the minimum of the distances rather than their squares.
+
+    A ray that is far off does not draw the point to itself. `width` is the distance on the image plane at depth 1 below
+    which the distance is squared.
+    """
+    points = triangulate_linear(rotation, translation, plane, weight)
+    for _ in range(_MEDIAN_STEPS):
+        error = np.linalg.norm(measure_residuals(rotation, translation, plane, points), axis=2)
+        points = triangulate_linear(rotation, translation, plane, weight / np.maximum(error, width))
+    return points
 
 
 def _solve_symmetric(columns: Sequence[F64], right: F64) -> F64:
@@ -218,8 +233,7 @@ def _adjust_round(
     sigma = np.array([_TURN] * 3 + [_MOVE_M] * 3 + [_CLOCK_PERIODS, _FOCAL, _CENTRE, _CENTRE])
     root = np.sqrt(weight)[..., None] * (focal / focal.mean())[:, None, None] / width
     deviation = state.subtract(expected, period) / sigma
-    # Of turn and move of each camera together; a camera that is far from where it was expected is free.
-    trust = np.sqrt(_PRIOR_JOINTS) / (1 + (deviation[:, :6] ** 2).mean(axis=1, keepdims=True)) ** 2
+    trust = _find_trust(deviation)
 
     def unpack(values: F64) -> F64:
         step = np.zeros((cameras, freedom.per_camera))
@@ -238,6 +252,17 @@ def _adjust_round(
     start, units = np.zeros(int(free.sum())), np.broadcast_to(np.minimum(sigma, 1.0), free.shape)[free]
     found = least_squares(residuals, start, x_scale=units, diff_step=1e-4, max_nfev=_MAX_EVALUATIONS)
     return state.move(unpack(found.x), period)
+
+
+def _find_trust(deviation: F64) -> F64:
+    """Return the trust (C, 10) in what is expected of each camera, by its `deviation` (C, 10) from that.
+
+    What is far from expected is free, each axis of turn and move by itself: a camera that was turned to the side still
+    stands where it stood and is as level as it was, which a person on one spot hardly tells.
+    """
+    trust = np.ones_like(deviation)
+    trust[:, _TURN_AND_MOVE] = 1 / (1 + deviation[:, _TURN_AND_MOVE] ** 2) ** 2
+    return np.sqrt(_PRIOR_JOINTS) * trust
 
 
 def _reweight(state: _State, plane: F64, confidence: F64, width: float) -> F64:

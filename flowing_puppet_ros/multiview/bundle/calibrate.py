@@ -19,6 +19,7 @@ from flowing_puppet_ros.multiview.bundle.adjustment import (
     choose_instants,
     measure_residuals,
     triangulate_linear,
+    triangulate_median,
 )
 from flowing_puppet_ros.multiview.bundle.clocks import find_coarse_offsets
 from flowing_puppet_ros.multiview.bundle.gauge import match_baselines, place_as_before, scale_to
@@ -30,6 +31,9 @@ from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
 _ASSOCIATION = AssociationSettings(max_epipolar_distance=0.35, max_joint_distance=0.6, max_view_error=0.35)
 _TRIANGULATION = TriangulationSettings(max_ray_distance=0.3)
 _MIN_OBSERVATIONS = 60  # joints of a camera at all instants
+_ROBUST_PX = 3.0  # below which a distance counts squared where joints are placed
+AGREE_M = TriangulationSettings().max_ray_distance
+"""Distance of a joint from its place in space, at its depth, within which a camera agrees."""
 _NEAR_PERIODS = 1.5  # between clocks that lead to the same result
 _PASSES = 2  # the second associates people by the cameras of the first
 
@@ -45,12 +49,23 @@ class Scale:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Agreement:
-    """Distances of joints from their projections by camera, px, mean and median over all of them."""
+    """Distances of joints from their projections, px.
+
+    Attributes:
+        mean: over all joints of a camera, by camera.
+        median: likewise.
+        all_mean: over all joints of all cameras.
+        all_median: likewise.
+        agreeing_mean: over the joints within 6 cm of their place in space, at its depth.
+        agreeing_share: of all joints, those.
+    """
 
     mean: dict[str, float]
     median: dict[str, float]
     all_mean: float
     all_median: float
+    agreeing_mean: float
+    agreeing_share: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,18 +190,23 @@ def _poses(cameras: Mapping[str, Camera]) -> tuple[F64, F64]:
 
 
 def measure_agreement(cameras: Mapping[str, Camera], offsets: Mapping[str, float], tracks: PeopleTracks) -> Agreement:
-    """Measure how far joints are from the projections of their least-squares place in space, px."""
+    """Measure how far joints are from the projections of their robust place in space, px."""
     instants = choose_instants(tracks, list(cameras))
     plane, weight = instants.observe(np.array([offsets.get(name, 0.0) for name in cameras]))
-    poses = _poses(cameras)
-    points = triangulate_linear(*poses, plane, weight)
+    rotation, translation = _poses(cameras)
     focal = np.array([camera.focal for camera in cameras.values()])
-    error = np.linalg.norm(measure_residuals(*poses, plane, points), axis=2) * focal[:, None]
+    points = triangulate_median(rotation, translation, plane, weight, _ROBUST_PX / float(focal.mean()))
+    distance = np.linalg.norm(measure_residuals(rotation, translation, plane, points), axis=2)
+    depth = np.einsum("ck,nk->cn", rotation[:, 2], points) + translation[:, 2, None]
     used = (weight > 0) & np.isfinite(points).all(axis=1)
+    error, agrees = distance * focal[:, None], used & (np.nan_to_num(distance * depth) < AGREE_M)
     by_camera = {name: error[k][used[k]] for k, name in enumerate(cameras) if used[k].any()}
+    some = used.any()
     return Agreement(
         {name: float(each.mean()) for name, each in by_camera.items()},
         {name: float(np.median(each)) for name, each in by_camera.items()},
-        float(error[used].mean()) if used.any() else float("nan"),
-        float(np.median(error[used])) if used.any() else float("nan"),
+        float(error[used].mean()) if some else float("nan"),
+        float(np.median(error[used])) if some else float("nan"),
+        float(error[agrees].mean()) if agrees.any() else float("nan"),
+        float(agrees.sum() / used.sum()) if some else float("nan"),
     )

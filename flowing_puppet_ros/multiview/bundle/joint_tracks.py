@@ -103,8 +103,8 @@ def associate_tracks(
             if len(group) and abs(stamps[name][index] - time) <= max(period, 0.02):
                 times[name], people[name] = group[index]
         for person in tracker.step(round(time * 1e9), cameras, people):
-            for name, k in person.views.items():
-                entry = times[name], people[name][k], person.weights[name]
+            for name, view in person.seen.items():
+                entry = times[name], view, person.weights[name]
                 collected.setdefault(person.id, {}).setdefault(name, []).append(entry)
     tracks = {
         person: {name: _make_track(cameras[name], entries, chosen) for name, entries in by_camera.items()}

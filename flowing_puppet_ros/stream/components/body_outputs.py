@@ -15,6 +15,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.body.measurements.measure import measure_fit
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody, TrackStatus
+from flowing_puppet_ros.fusion.coarse_place import CoarsePerson
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import Output, Port
@@ -47,7 +48,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
     TRANSFORMS,
     MessageFactory,
 )
-from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_body
+from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_body, make_coarse_body
 
 URDF_CHANGE_M = 0.02
 """Metres by which a joint must move in its parent link before a person's URDF is published again."""
@@ -109,19 +110,28 @@ class BodyOutputs:
         self._topology_sent = False
 
     def make(
-        self, header: Any, bodies: Sequence[TrackedBody], hidden: Collection[str] = (), subscribed: Collection[str] = ()
+        self,
+        header: Any,
+        bodies: Sequence[TrackedBody],
+        hidden: Collection[str] = (),
+        subscribed: Collection[str] = (),
+        coarse: Sequence[CoarsePerson] = (),
     ) -> Output:
         """Return everything to publish for the `bodies` in one cloud, whose stamp and frame are those of `header`.
 
         `hidden` are the ids of people who are occluded: they have no body in this cloud but are not lost yet.
-        `subscribed` are the lazy outputs that have subscribers.
+        `subscribed` are the lazy outputs that have subscribers. `coarse` are people of whom only joints are known.
         """
         factory = self._factory
         fits = [(body.id, body.fit) for body in bodies]
         alive = sorted({body.id for body in bodies} | set(hidden), key=id_sort_key)
-        outputs: Output = [
-            ("bodies", make_bodies(factory, header, [make_body(factory, self._model, body) for body in bodies]))
-        ]
+        messages = {body.id: make_body(factory, self._model, body) for body in bodies}
+        for person in coarse:
+            messages[person.id] = make_coarse_body(
+                factory, self._model.joint_names, person.id, person.joints, person.confidence
+            )
+        ordered = [messages[identity] for identity in sorted(messages, key=id_sort_key)] if coarse else [*messages.values()]
+        outputs: Output = [("bodies", make_bodies(factory, header, ordered))]
         if fits and not self._topology_sent:
             self._topology_sent = True
             outputs.append(("body_topology", make_topology(factory, self._model)))

@@ -16,6 +16,7 @@ from flowing_puppet_ros.image.tracking.appearance import TORSO_CORNERS, torso_ap
 from flowing_puppet_ros.multiview.association.people_tracker import PeopleTracker3D, PersonInSpace
 from flowing_puppet_ros.multiview.association.settings import AssociationSettings
 from flowing_puppet_ros.multiview.association.view import PersonInView
+from flowing_puppet_ros.multiview.bundle.size_check import SizeCheck
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.hull_builder import CameraObservation, HullBuilder
 from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
@@ -42,6 +43,9 @@ class PersonMatcher:
         self._settings = settings
         self._triangulation = triangulation
         self._tracker: PeopleTracker3D | None = None
+        self._size: SizeCheck | None = None
+        self.problem = ""
+        """What was found wrong with the calibration in the last set, in one sentence; empty if nothing."""
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -57,12 +61,14 @@ class PersonMatcher:
         self, stamp: int, cameras: Mapping[str, Camera], frames: Mapping[str, CameraFrame]
     ) -> list[tuple[PersonInSpace, dict[str, Any]]]:
         """Return the people whom two or more cameras see at `stamp` (ns), each with its puppets by camera."""
+        self.problem = ""
         kinds = Counter(_list_names(puppet) for frame in frames.values() for puppet in frame.puppets)
         if not kinds:
             return []
         names = kinds.most_common(1)[0][0]
         if self._tracker is None or (self._tracker.names != names and self._tracker.names not in kinds):
             self._tracker = PeopleTracker3D(names, self._settings, self._triangulation)
+            self._size = SizeCheck(names)
         wanted = self._tracker.names
         usable = {
             name: [puppet for puppet in frame.puppets if _list_names(puppet) == wanted]
@@ -70,6 +76,8 @@ class PersonMatcher:
         }
         people = {name: _decode_people(wanted, frames[name].image, group) for name, group in usable.items()}
         found = self._tracker.step(stamp, cameras, people)
+        assert self._size is not None
+        self.problem = self._size.add(cameras, people, [person.joints for person in found])
         return [(person, {name: usable[name][k] for name, k in person.views.items()}) for person in found]
 
 
@@ -110,5 +118,4 @@ def observe_person(
         contour = np.asarray(part.contour, float).reshape(-1, 2)
         cv2.fillPoly(region, [np.rint(contour).astype(np.int32)], 1)
     observation = builder.observe(name, frame.image, frame.labels, float(puppet.scale), frame.labels * region)
-    joints, _ = decode_puppet_joints(puppet)
-    return CameraObservation(observation, joints, person.weights[name])
+    return CameraObservation(observation, person.seen[name].joints, person.weights[name])

@@ -25,6 +25,7 @@ from flowing_puppet_ros.stream.components.person_views import (
     observe_person,
 )
 from flowing_puppet_ros.stream.messages.bodies.silhouettes import make_silhouettes
+from flowing_puppet_ros.stream.messages.camera_info import describe_images
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image, decode_labels
@@ -150,6 +151,8 @@ class VisualHullComponent(Component[VisualHullSettings]):
         cameras = self._calibrate_cameras(complete)
         frames = self._decode_frames(complete, cameras)
         people = self._matcher.match(stamp, cameras, frames)
+        if self._matcher.problem:
+            self.report.warn(self._matcher.problem)
         if not people:
             return []
         self._person_sets += 1
@@ -169,7 +172,7 @@ class VisualHullComponent(Component[VisualHullSettings]):
         views = {
             name: observe_person(self._builder, name, frames[name], puppet, person) for name, puppet in puppets.items()
         }
-        return self._builder.segment(views, person.id)
+        return self._builder.segment(views, person.id, (person.joints, person.confidence))
 
     def _make_body(self, identity: str, person: MultiViewPerson) -> Any:
         names = self._matcher.joint_names
@@ -195,6 +198,7 @@ class VisualHullComponent(Component[VisualHullSettings]):
         info = self._infos.get(name)
         if info is None:
             raise InputError(f"no camera_info came yet on {name}/camera_info")
+        info = describe_images(info)
         frame = info.header.frame_id
         if first:
             # Looked up for every set: /tf_static may come after the first images.
