@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes live over loopback DDS, with timed results: images of a drawn person, clouds of a walking body, and colour
-and depth of two people through both nodes."""
+"""The nodes live over loopback DDS, timed: images of a drawn person, clouds of a body, RGB-D of two people."""
 
 from __future__ import annotations
 

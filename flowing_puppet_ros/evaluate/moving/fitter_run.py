@@ -143,7 +143,7 @@ def _make_puppet(identity: str, seen: SeenKeypoints) -> Any:
     places |= {"neck": shoulders, "belly": hips + BELLY_SHARE * (shoulders - hips)}
     certain |= {"neck": min(certain["left_shoulder"], certain["right_shoulder"]), "belly": certain["left_hip"]}
     joints = [
-        FACTORY.make("flowing_puppet_msgs/msg/PuppetJoint", name=name, x=x, y=y, confidence=certain[name])  # fmt: skip
+        FACTORY.make("flowing_puppet_msgs/msg/PuppetJoint", name=name, x=x, y=y, confidence=certain[name])
         for name, (x, y) in places.items()
         if np.isfinite(x)
     ]

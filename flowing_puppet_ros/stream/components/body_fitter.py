@@ -70,8 +70,8 @@ class BodyFitterSettings(SceneSettings):
     )
     fixed_frame: str = setting(
         "",
-        "frame with z up that stands still (map, odom), in which people are tracked while the sensor moves or is tilted;"
-        " empty: the cloud's, as `up` says",
+        "frame with z up that stands still (map, odom), in which people are tracked where the sensor moves or is"
+        " tilted; empty: the cloud's, as `up` says",
     )
     sensor_frame: str = setting(
         "",

@@ -76,8 +76,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Fit the people of every frame, print the figures and return the exit status."""
     if arguments.robot is not None:
-        rows = _see_from_robot(arguments)
-        print(format_json({"robot": rows}) if arguments.json else format_table(rows))
+        ways = _see_from_robot(arguments)
+        print(format_json({"robot": ways}) if arguments.json else format_table(ways))
         return 0
     if arguments.mocap is None:
         raise InputError("drawn people stand and walk as motion capture does; give --mocap expmap_20hz.npz")
@@ -132,8 +132,8 @@ def _see_from_robot(arguments: argparse.Namespace) -> list[dict[str, Any]]:
     if not 1 <= arguments.robot <= 60 or arguments.people_seed < 0:
         raise InputError("--robot is between 1 and 60 s and --people-seed at least 0")
     view = RobotView(BodySource(), arguments.people_seed, arguments.robot)
-    ways = tqdm(SENSINGS.items(), file=sys.stderr, disable=arguments.json)
-    return [run_fitter(view, sensing).summarise(name) for name, sensing in ways]
+    ways = tqdm(list(SENSINGS), file=sys.stderr, disable=arguments.json)
+    return [run_fitter(view, SENSINGS[name]).summarise(name) for name in ways]
 
 
 def _make_method(name: str, fitter: BodyFitter) -> RgbdMethod:
