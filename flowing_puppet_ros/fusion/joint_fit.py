@@ -86,9 +86,7 @@ class JointFitter:
         points, rays = np.nan_to_num(joints.points), np.nan_to_num(joints.rays)
         return JointTargets(points, self._strength * weight, rays)
 
-    def make_cloud(
-        self, points: F64, field: SensorField | None, viewpoint: F64 | None = None
-    ) -> SingleViewCloud:
+    def make_cloud(self, points: F64, field: SensorField | None, viewpoint: F64 | None = None) -> SingleViewCloud:
         """Return the person's points (N, 3) m of a sensor, and what that can know of the person.
 
         The sensor is at `viewpoint` (3,) m, or at the origin.

@@ -355,4 +355,6 @@ class SceneTracker:
             single = is_single_view(people[0].points - cloud.viewpoint)
             if remember:
                 self._single_view = single
-        return cloud.with_fields([replace(person, viewpoint=cloud.viewpoint) for person in people]) if single else people
+        return (
+            cloud.with_fields([replace(person, viewpoint=cloud.viewpoint) for person in people]) if single else people
+        )
