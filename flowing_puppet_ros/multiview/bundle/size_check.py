@@ -54,8 +54,8 @@ class SizeCheck:
             factor, seen = find_size(cameras, self._names, self._instants[:: max(1, _SETS // _INSTANTS)])
             if seen.share < MIN_AGREEMENT:
                 return (
-                    "the cameras agree on nobody although several show people: check with flowing-puppet import whether "
-                    "the calibration is that of these cameras, and whether their clocks agree"
+                    "the cameras agree on nobody although several show people: check with flowing-puppet import "
+                    "whether the calibration is that of these cameras, and whether their clocks agree"
                 )
             tall = measure_height(self._names, seen.joints) / factor
         self._joints, self._instants = [], []
