@@ -4,7 +4,7 @@
 # make demo-rgbd  the same with colour and depth of drawn people, compared with the truth
 # make bench  speed as ratios, and live nodes     make lint   linter and type checker alone
 # make docs   the documentation site, into out/site
-# make coverage, release-check, figures, config, changelog, lock, test-noble: see CONTRIBUTING.md
+# make coverage, release-check, figures, screenshots, config, changelog, lock, test-noble, install-size: see CONTRIBUTING.md
 
 SHELL := /bin/bash
 PYTHON := .venv/bin/python
@@ -20,7 +20,7 @@ PYTEST = $(CLEAN_ENV) -u PYTHONDONTWRITEBYTECODE $(PYTHON) -m pytest --numproces
 # What runs with the versions of Ubuntu 24.04, which a ROS 2 Jazzy there has: nodes and all that they are made of.
 NOBLE_TESTS := test/model test/inference test/flow test/evidence test/image test/body test/stream test/multiview test/bag test/node
 
-.PHONY: venv venv-noble test-noble demo demo-rgbd sample-bag check test coverage lint bench docs figures config changelog lock release-check clean
+.PHONY: venv venv-noble test-noble demo demo-rgbd sample-bag check test coverage lint bench docs figures screenshots config changelog lock release-check install-size clean
 
 venv:
 	@python=$$(sh scripts/find_python.sh) && $(CLEAN_ENV) "$$python" -I scripts/make_venv.py
@@ -68,8 +68,14 @@ docs: venv
 figures: venv
 	@$(PYTHON) docs/_tools/figures.py
 
+screenshots: demo-rgbd
+	@$(PYTHON) docs/_tools/screenshots.py
+
 release-check: venv
-	@$(PYTHON) scripts/release_check.py
+	@$(PYTHON) scripts/release_check.py $(if $(TAGGED),--tagged)
+
+install-size: venv
+	@$(PYTHON) scripts/install_size.py
 
 bench: venv
 	@$(CLEAN_ENV) .venv/bin/flowing-puppet bench

@@ -23,6 +23,11 @@ def files(pattern: str) -> list[str]:
     return sorted(str(path.relative_to(HERE)) for path in HERE.glob(pattern))
 
 
+def find_in_manifest(pattern: str) -> str:
+    """Return what package.xml says, so that addresses stand in one place."""
+    return str(re.findall(pattern, (HERE / "package.xml").read_text())[0])
+
+
 setup(
     name=NAME,
     version=re.findall(r'__version__ = "(.+)"', (HERE / NAME / "__init__.py").read_text())[0],
@@ -30,9 +35,9 @@ setup(
     long_description="See README.md.",
     license="Apache-2.0",
     license_files=["LICENSE"],
-    url=re.findall(r'<url type="repository">(.+)</url>', (HERE / "package.xml").read_text())[0],
-    maintainer="flowing_puppet_ros maintainers",
-    maintainer_email="maintainers@users.noreply.github.com",
+    url=find_in_manifest(r'<url type="repository">(.+)</url>'),
+    maintainer=find_in_manifest(r"<maintainer .+>(.+)</maintainer>"),
+    maintainer_email=find_in_manifest(r'<maintainer email="(.+)">'),
     packages=find_packages(include=[NAME, f"{NAME}.*"]),
     package_data={
         NAME: [

@@ -17,7 +17,7 @@ EXTRAS = {
     "neural": "the keypoint networks",
     "report": "the plots of `evaluate`",
     "rerun": "recordings for Rerun",
-    "scans": "`.stl` and `.pcd` files, scans of synthetic people",
+    "scans": "scans and depth images of synthetic people",
     "video": "H.264, H.265 and other video in bags",
 }
 """The extras, each with what needs it; `requirements/<extra>.txt` lists its packages."""

@@ -48,6 +48,10 @@ def nested(kind: type[Settings], **changed: Any) -> Any:
     return field(default=kind(**changed))
 
 
+_METAVARS = {int: "N", float: "X"}
+"""What stands for the value of a flag in its help."""
+
+
 @dataclass(frozen=True, slots=True)
 class SettingInfo:
     """What a front end needs to offer one setting."""
@@ -171,7 +175,8 @@ class Settings:
             if info.type is bool:
                 parser.add_argument(flag, action=argparse.BooleanOptionalAction, **shown)
             else:
-                parser.add_argument(flag, type=info.type, **shown)
+                metavar = "|".join(map(str, info.choices)) or _METAVARS.get(info.type, "TEXT")
+                parser.add_argument(flag, type=info.type, metavar=metavar, **shown)
 
     @classmethod
     def from_arguments(cls, arguments: argparse.Namespace) -> Self:

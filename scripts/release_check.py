@@ -85,12 +85,14 @@ def check_licences(root: Path) -> Iterator[str]:
             yield f"{path.relative_to(root)} has no line {SPDX}"
 
 
-def check_tree(root: Path) -> Iterator[str]:
-    """Check that nothing is uncommitted and that the version's tag is free."""
+def check_tree(root: Path, tagged: bool = False) -> Iterator[str]:
+    """Check that nothing is uncommitted and that the version's tag is free or, if `tagged`, on this commit."""
     if run_git(root, "status", "--porcelain"):
         yield "there are changes that are not committed"
     tag = f"v{read_version(root)}"
-    if run_git(root, "tag", "--list", tag):
+    if tagged and tag not in run_git(root, "tag", "--points-at", "HEAD").split():
+        yield f"this commit has not the tag {tag} of its version"
+    if not tagged and run_git(root, "tag", "--list", tag):
         yield f"the tag {tag} is taken; raise the version"
 
 
@@ -129,10 +131,14 @@ def main(given: list[str]) -> int:
     """Print every finding; return how many there are."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="neither build packages nor read git's state")
-    quick = parser.parse_args(given).quick
+    parser.add_argument(
+        "--tagged", action="store_true", help="the version's tag is set, as where a release is published"
+    )
+    options = parser.parse_args(given)
+    quick = options.quick
     findings = [*check_versions(ROOT), *check_changelog(ROOT, released=not quick), *check_licences(ROOT)]
     if not quick:
-        findings += [*check_manifests(ROOT), *check_tree(ROOT), *check_packages(ROOT)]
+        findings += [*check_manifests(ROOT), *check_tree(ROOT, options.tagged), *check_packages(ROOT)]
     for finding in findings:
         print(f"release check: {finding}", file=sys.stderr)
     if not findings:

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line's manners: help for every verb, exit statuses, one sentence for bad input."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from shown_commands import check  # type: ignore[import-not-found]
 
 from flowing_puppet_ros import __version__
-from flowing_puppet_ros.cli import VERBS, main
+from flowing_puppet_ros.cli import EXAMPLES, VERBS, main
 
 MISSING = {
     "fit": ["missing.ply", "--out", "out"],
@@ -30,7 +32,18 @@ def test_every_verb_has_help(verb: str, capsys: pytest.CaptureFixture[str]) -> N
     with pytest.raises(SystemExit) as done:
         main([verb, "--help"])
     assert done.value.code == 0
-    assert f"usage: flowing-puppet {verb}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"usage: flowing-puppet {verb}" in said
+    assert all(f"\n  flowing-puppet {example}\n" in said for example in EXAMPLES[verb])
+    placeholder = re.search(r"--\S+ [A-Z_]+\.[A-Z_.]+", said)
+    assert placeholder is None, f"{placeholder} names an attribute, not a value"
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_examples_of_every_verb_are_commands(verb: str) -> None:
+    for example in EXAMPLES[verb]:
+        assert example.split()[0] == verb
+        check(["flowing-puppet", *example.split()])
 
 
 @pytest.mark.parametrize("arguments", [[], ["dance"], ["replay", "--no-such-flag"], ["fit", "--seed", "one"]])

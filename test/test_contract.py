@@ -48,7 +48,6 @@ OPTIONAL = {
     "report.rerun_file": "rerun",
     "bag.foreign.video": "video",
     "evaluate.output": "report",
-    "body.scans.scan": "scans",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
 MAX_FILES = 10

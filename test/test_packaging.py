@@ -11,6 +11,7 @@ from catkin_pkg.changelog import Changelog, populate_changelog_from_rst
 from catkin_pkg.package import parse_package
 
 from flowing_puppet_ros.extras import EXTRAS
+from scripts.install_size import RECORDINGS, find_closure, measure, read_requirements
 from scripts.write_changelog import PACKAGES, make_changelog
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -101,3 +102,34 @@ def test_installed_files_have_licence_and_read_me() -> None:
         assert f'"{name}"' in setup and (ROOT / name).is_file()
     cmake = (ROOT / "msg_defs" / "CMakeLists.txt").read_text()
     assert "install(FILES LICENSE CHANGELOG.rst DESTINATION share/${PROJECT_NAME})" in cmake
+
+
+def test_the_requirements_of_nodes_bring_only_what_computes() -> None:
+    """Nothing for pages, plots, scans or learning, and nothing for recordings."""
+    brought = find_closure(read_requirements("runtime") - RECORDINGS)
+    assert brought == {
+        "llvmlite", "numba", "numpy", "opencv-python-headless", "ruamel-yaml", "scipy", "threadpoolctl", "tqdm",
+    }  # fmt: skip
+    extras = {name for extra in EXTRAS if extra != "rerun" for name in read_requirements(extra)}
+    assert not find_closure(read_requirements("runtime")) & extras
+
+
+def test_a_size_is_that_of_a_distributions_files(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    for name, text in (("a_b/x.py", "1234"), ("a_b/x.pyc", "12345678"), ("a_b-1.2.dist-info/METADATA", "Name: a.b\n")):
+        (site / name).parent.mkdir(parents=True, exist_ok=True)
+        (site / name).write_text(text)
+    (site / "a_b-1.2.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: a-b\nVersion: 1.2\n")
+    listed = ("a_b/x.py,,", "a_b/x.pyc,,", "a_b/gone.py,,")
+    (site / "a_b-1.2.dist-info" / "RECORD").write_text("\n".join(listed) + "\n")
+    monkeypatch.syspath_prepend(str(site))
+    assert (measure("a-b").version, measure("a-b").bytes) == ("1.2", 4)
+
+
+def test_one_manifest_has_the_addresses_and_everything_else_repeats_them() -> None:
+    own, messages = (parse_package(folder) for folder in PACKAGES.values())
+    assert own.maintainers[0].email == messages.maintainers[0].email
+    assert [url.url for url in own.urls] == [url.url for url in messages.urls]
+    repository = next(url.url for url in own.urls if url.type == "repository")
+    for page in (ROOT / "README.md", ROOT / "docs" / "howto" / "install.md"):
+        assert re.findall(r"^git clone (\S+) ", page.read_text(), flags=re.MULTILINE) == [repository]

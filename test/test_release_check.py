@@ -97,6 +97,15 @@ def test_a_taken_tag_and_uncommitted_changes_are_named(tree: Path) -> None:
     assert len(list(check_tree(tree))) == 2
 
 
+def test_where_a_release_is_published_the_tag_must_be_on_the_commit(tree: Path) -> None:
+    tag = f"v{release_check.read_version(tree)}"
+    subprocess.run(["git", "tag", tag], cwd=tree, check=True)
+    assert not list(check_tree(tree, tagged=True))
+    who = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
+    subprocess.run(["git", *who, "commit", "-q", "--allow-empty", "-m", "later"], cwd=tree, check=True)
+    assert list(check_tree(tree, tagged=True)) == [f"this commit has not the tag {tag} of its version"]
+
+
 @pytest.mark.slow
 def test_packages_that_lack_a_file_are_named(tmp_path: Path) -> None:
     package = tmp_path / release_check.NAME

@@ -39,7 +39,7 @@ API = {
     "report": "Reports",
 }
 # Settings with which a component has all of its topics.
-EVERYTHING = {"cameras": "CAMERA,other", "ros4hri.publish": True}
+EVERYTHING = {"cameras": "CAMERA,other", "ros4hri.publish": True, "output.measure": True}
 QOS = {
     "sensor": "sensor data: best effort, keep last 5",
     "reliable": "reliable, keep last 10",
@@ -77,7 +77,10 @@ def node_tables() -> Iterator[tuple[str, str]]:
     for name, component in COMPONENTS.items():
         inputs, outputs = ports(component)
         always = getattr(component, "outputs", outputs)
-        rows = [port_row(port) for port in inputs], [port_row(port, port not in always, True) for port in outputs]
+        rows = (
+            [port_row(port) for port in inputs],
+            [port_row(port, request_of(port) if port not in always else "", True) for port in outputs],
+        )
         for kind, lines in zip(("inputs", "outputs"), rows, strict=True):
             yield f"nodes/{name}-{kind}.md", table(["topic", "type", "QoS", ""], lines)
         yield f"nodes/{name}-parameters.md", parameter_table(component.settings_type, node_settings(name))
@@ -93,8 +96,13 @@ def ports(component: type[Component]) -> tuple[tuple[Port, ...], tuple[Port, ...
     return tuple(port for port in made.inputs if not port.name.startswith("other/")), made.outputs
 
 
-def port_row(port: Port, humans: bool = False, output: bool = False) -> list[str]:
-    """Return one row of a table of topics; `humans` marks those that are published only on request."""
+def request_of(port: Port) -> str:
+    """Return the parameter with which an output is published that is not always."""
+    return "output.measure:=true" if port.name == "measurements" else "ros4hri.publish:=true"
+
+
+def port_row(port: Port, request: str = "", output: bool = False) -> list[str]:
+    """Return one row of a table of topics; `request` is the parameter without which one is not published."""
     package, _, message = port.type.split("/")
     notes = []
     if port.transport:
@@ -107,8 +115,8 @@ def port_row(port: Port, humans: bool = False, output: bool = False) -> list[str
         notes.append("made only while subscribed to")
     if port.optional and output:
         notes.append(f"where `{package}` is installed, and in bags")
-    if humans:
-        notes.append("with `ros4hri.publish:=true`")
+    if request:
+        notes.append(f"with `{request}`")
     if port.per_person:
         notes.append("one topic per person")
     linked = package == "flowing_puppet_msgs"

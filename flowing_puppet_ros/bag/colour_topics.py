@@ -52,7 +52,7 @@ def choose_colour(
         source: topic of the depth images or clouds.
         frame: their frame; empty when it is not known.
         cameras: those of the recording.
-        frames: the static transforms. Data and camera have the same frame, or these connect them.
+        frames: the transforms. Data and camera have the same frame, or these connect them.
     """
     calibrated = [camera for camera in cameras if camera.info]
     if not calibrated:
@@ -62,8 +62,8 @@ def choose_colour(
     if not connected:
         listed = ", ".join(f"{camera.image} (frame {camera.frame!r})" for camera in calibrated)
         return None, (
-            f"{source} is used without colour: /tf_static does not connect its frame {frame!r} with that of {listed}; "
-            "record the transform"
+            f"{source} is used without colour: /tf and /tf_static do not connect its frame {frame!r} with that of "
+            f"{listed}; record the transform"
         )
     best = max(
         connected, key=lambda camera: (camera.frame == frame, count_common(camera.image, source), -len(camera.image))
@@ -73,6 +73,6 @@ def choose_colour(
 
 def _is_connected(frame: str, other: str, frames: FrameTree) -> bool:
     try:
-        return frame == other or frames.lookup_pose(frame, other) is not None
+        return frame == other or frames.is_connected(frame, other)
     except InputError:  # a loop
         return False

@@ -11,6 +11,7 @@ from typing import Any
 from flowing_puppet_ros.bag.reader import RecordingLike
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.component import base_topic, is_compressed_depth_topic
+from flowing_puppet_ros.stream.messages.camera_info import describe_images
 from flowing_puppet_ros.stream.messages.compressed_depth import decode_compressed_depth, source_encoding
 from flowing_puppet_ros.stream.messages.images import is_depth_encoding
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, IMAGE
@@ -132,12 +133,12 @@ def find_info(topic: str, frame: str, size: tuple[int, int], infos: Mapping[str,
     is taken too if no other fits better, whatever its size.
     """
     beside = f"{topic.rpartition('/')[0]}/camera_info"
-    if beside in infos and _info_size(infos[beside]) in (size, (0, 0)):
+    if beside in infos and _info_size(infos[beside], size) in (size, (0, 0)):
         return beside
     fitting = [
         name
         for name, info in infos.items()
-        if _info_size(info) == size and info.header.frame_id.lstrip("/") == frame.lstrip("/") != ""
+        if _info_size(info, size) == size and info.header.frame_id.lstrip("/") == frame.lstrip("/") != ""
     ]
     return max(fitting, key=lambda name: (count_common(name, topic), name), default=beside if beside in infos else "")
 
@@ -163,8 +164,10 @@ def _choose_info(topic: str, sample: ImageSample, infos: Mapping[str, Any]) -> t
     )
 
 
-def _info_size(info: Any) -> tuple[int, int]:
-    return int(info.width), int(info.height)
+def _info_size(info: Any, size: tuple[int, int]) -> tuple[int, int]:
+    """Return width and height of the images of a CameraInfo, which are `size` if it does not say."""
+    described = describe_images(info, size)
+    return int(described.width), int(described.height)
 
 
 def count_common(first: str, second: str) -> int:

@@ -112,6 +112,7 @@ def build_graph(
     settings: Mapping[str, Mapping[str, Any]],
     factory: MessageFactory,
     cloud_frames: Mapping[str, str] | None = None,
+    moving: FrameTree | None = None,
 ) -> Graph:
     """Make the components that the topics (name -> type) of a recording can feed.
 
@@ -121,6 +122,7 @@ def build_graph(
     - One body fitter for every topic of clouds or depth images (`samples`: image topic -> its first image;
       `cloud_frames`: cloud topic -> its frame), joined with the puppets of a colour camera that looks there too.
 
+    `moving` connects frames that move against each other too, as a camera on a head and a LiDAR do.
     `settings` is component name -> setting -> value. Outputs of these components in the recording are not used but
     made again. InputError lists the topics if nothing can be used.
     """
@@ -143,7 +145,7 @@ def build_graph(
     colours = find_colour_topics(list(trackers), samples, infos)
     for source in sources:
         topic = source.image if isinstance(source, DepthTopic) else source
-        colour, note = choose_colour(topic, _find_frame(topic, samples, cloud_frames or {}), colours, frames)
+        colour, note = choose_colour(topic, _find_frame(topic, samples, cloud_frames or {}), colours, moving or frames)
         graph.notes += [note] if note else []
         fitter = _make_scene_fitter(source, topics, settings, factory)
         if colour is not None:
@@ -269,7 +271,9 @@ def _make_hull_and_fitter(
     hull = VisualHullComponent(chosen, factory)
     remapped = {f"{camera.name}/image": camera.image for camera in cameras}
     fitter = BodyFitterComponent(_make_settings(BodyFitterSettings, "body_fitter", settings), factory)
-    remapped_inputs = {port.name: "" for port in fitter.inputs} | {"silhouettes": "/silhouettes"}
+    published = {port.name for port in fitter.outputs}
+    remapped_inputs = {port.name: "" for port in fitter.inputs if port.name not in published}
+    remapped_inputs["silhouettes"] = "/silhouettes"
     return [Instance("visual_hull", hull, "", remapped), Instance("body_fitter", fitter, "", remapped_inputs)]
 
 

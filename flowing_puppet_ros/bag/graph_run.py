@@ -17,7 +17,7 @@ from flowing_puppet_ros.bag.graph import Graph, Instance
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.stream.component import Output
 from flowing_puppet_ros.stream.messages.images import compress_image
-from flowing_puppet_ros.stream.messages.message_types import MessageFactory
+from flowing_puppet_ros.stream.messages.message_types import TRANSFORMS, MessageFactory
 from flowing_puppet_ros.stream.pipeline import Pipeline, Task
 
 type Place = tuple[int, int, tuple[int, ...], int]
@@ -79,7 +79,11 @@ class GraphRun:
         self._routes, self._pipeline, self._writer, self._factory = routes, pipeline, writer, factory
         self._sources: dict[Instance, set[Instance]] = {instance: set() for instance in graph.instances}
         for instance in graph.instances:
-            ports = [replace(port, name=instance.resolve(port.name)) for port in instance.component.outputs]
+            ports = [
+                replace(port, name=instance.resolve(port.name))
+                for port in instance.component.outputs
+                if port.type != TRANSFORMS
+            ]
             for topic, receivers in routes.items():
                 if any(port.covers(topic) for port in ports):
                     for receiver, _ in receivers:
@@ -128,6 +132,8 @@ class GraphRun:
                 continue
             here = (root, distance + 1, (*way, receiver_number, number))
             progress.made.append(((*here, -1), instance, name, message))
+            if instance.component.find_output(name).type == TRANSFORMS:  # where people are moves no sensor
+                continue
             for index, (receiver, port) in enumerate(self._routes.get(instance.resolve(name), ())):
                 progress.waiting[receiver].append(((*here, index), Call(receiver, port, message)))
 

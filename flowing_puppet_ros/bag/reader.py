@@ -21,7 +21,8 @@ from flowing_puppet_ros.bag.storage.paths import is_bag as is_bag  # for those w
 from flowing_puppet_ros.bag.storage.stored_file import StoredFile
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore, typestore_with
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
+from flowing_puppet_ros.stream.messages.detections import find_body_id, skeleton_topic
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, IDS_LIST
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -188,3 +189,13 @@ def open_bag(path: Path | str, salvage: bool = False) -> Bag:
     if path.name == METADATA:
         path = path.parent
     return Bag(path, find_recording(path) if path.is_dir() else RecordingFiles([path]), salvage)
+
+
+def rename_topics(topics: Mapping[str, str], topic_map: Mapping[str, str]) -> dict[str, str]:
+    """Return old topic -> new topic; with a list of bodies, their skeletons move beside its new name."""
+    found = {name: topic_map.get(name, name) for name in topics}
+    for listing, new in topic_map.items():
+        if topics.get(listing) == IDS_LIST:
+            bodies = {name: find_body_id(listing, name) for name in topics if name not in topic_map}
+            found |= {name: skeleton_topic(new, identity) for name, identity in bodies.items() if identity}
+    return found

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +18,22 @@ from tqdm import tqdm
 
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.bag.depth_topics import read_samples
-from flowing_puppet_ros.bag.foreign.static_frames import find_static_transforms
+from flowing_puppet_ros.bag.foreign.static_frames import find_static_transforms, is_of_people
 from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Graph, Instance, build_graph, find_info_topics
 from flowing_puppet_ros.bag.graph_run import Call, GraphRun, Step
-from flowing_puppet_ros.bag.reader import Record, RecordingLike, open_bag
+from flowing_puppet_ros.bag.reader import Record, RecordingLike, open_bag, rename_topics
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.unused import count_used, explain_unused
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.component import COMPRESSED
 from flowing_puppet_ros.stream.components.registry import COMPONENTS
-from flowing_puppet_ros.stream.messages.detections import find_body_id, name_body, skeleton_topic
+from flowing_puppet_ros.stream.messages.detections import name_body
 from flowing_puppet_ros.stream.messages.geometry import FrameTree
 from flowing_puppet_ros.stream.messages.images import SharedImages
 from flowing_puppet_ros.stream.messages.message_types import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
-    IDS_LIST,
     POINT_CLOUD,
     PUPPETS,
     TRANSFORMS,
@@ -47,6 +47,8 @@ METADATA_NAME = "flowing_puppet_ros"
 """Name of the output bag's metadata whose "replay" is JSON of the version, settings and counters of the replay."""
 MAX_STEPS_PER_TOPIC = 4
 """Messages of the recording that are worked on or wait for it at a time, per topic: the bound of a replay's memory."""
+MAX_FIRST_TRANSFORMS = 2000
+"""Messages of a recording from whose transforms it is decided which sensors belong together."""
 _COPIED_TYPES = (CAMERA_INFO, PUPPETS, TRANSFORMS)
 """Types of input topics that are copied to the output bag, so that a viewer needs no other bag."""
 
@@ -122,7 +124,7 @@ class _Replay:
     def __init__(self, bag: RecordingLike, options: ReplayOptions) -> None:
         self._bag = bag
         self._options = options
-        self._new_name = _rename_topics(bag.topics, options.topic_map)
+        self._new_name = rename_topics(bag.topics, options.topic_map)
         self._factory = BagMessageFactory()
         self.warnings: list[str] = list(bag.notes)
         self._stuck = StuckStamps()
@@ -146,6 +148,7 @@ class _Replay:
             self._collect_settings(),
             self._factory,
             self._read_cloud_frames(topics),
+            self._connect_frames(topics),
         )
         self.warnings += self._graph.notes
         self._recorded = {self._new_name[name]: detail for name, detail in bag.details.items()}
@@ -153,10 +156,12 @@ class _Replay:
             {name: detail.type for name, detail in self._recorded.items() if detail.count}
         )
         self._outputs = self._graph.find_outputs()
+        # What others say on /tf is read and copied, between what the fitters publish there.
+        self._replaced = {topic for topic, port in self._outputs.items() if port.type != TRANSFORMS}
         cameras = [name for name in self._recorded if len(self._find_pictures(name)) > 1]
         self._shared = SharedImages(MAX_STEPS_PER_TOPIC * len(cameras))
         copied = {self._new_name[name] for name, kind in bag.topics.items() if kind in _COPIED_TYPES}
-        self._copied = (copied | {self._new_name[record.topic] for record in self._static}) - set(self._outputs)
+        self._copied = (copied | {self._new_name[record.topic] for record in self._static}) - self._replaced
         for instance in self._graph.instances:
             for port in instance.component.outputs:
                 if port.lazy:
@@ -221,6 +226,15 @@ class _Replay:
                 frames.add(record.message)
         return frames
 
+    def _connect_frames(self, topics: Mapping[str, str]) -> FrameTree:
+        """Return the frames of the static transforms, and those of the first ones that move."""
+        frames = self._build_frame_tree()
+        names = self._find_recorded_topics(topics, lambda name: topics[name] == TRANSFORMS)
+        for message in islice(self._read_usable(names), MAX_FIRST_TRANSFORMS):
+            with suppress(InputError):
+                frames.add(message, moving=True)
+        return frames
+
     def _read_first_infos(self, topics: Mapping[str, str]) -> dict[str, Any]:
         """Return the first readable message of every camera_info topic."""
         names = self._find_recorded_topics(topics, set(find_info_topics(topics)).__contains__)
@@ -282,7 +296,7 @@ class _Replay:
     def _is_needed(self, topic: str) -> bool:
         return (
             topic != STATIC_TRANSFORMS
-            and topic not in self._outputs
+            and topic not in self._replaced
             and (topic in self._routes or topic in self._copied)
         )
 
@@ -316,6 +330,8 @@ class _Replay:
         except InputError as error:
             step.warnings.append(str(error))
             return step
+        if topic in self._outputs and is_of_people(message):
+            return Step(log_time)
         if any(self._needs_time(instance, port) for instance, port in routes):
             step.warnings += self._stuck.advance(topic, record.log_time, message)
         pictures = self._find_pictures(topic)
@@ -368,16 +384,6 @@ class _Replay:
             **({} if count_used(instances) else {"unused": explain_unused(self._graph, self._recorded, self.warnings)}),
             **self.describe(),
         }
-
-
-def _rename_topics(topics: Mapping[str, str], topic_map: Mapping[str, str]) -> dict[str, str]:
-    """Return old topic -> new topic; with a list of bodies, their skeletons move beside its new name."""
-    found = {name: topic_map.get(name, name) for name in topics}
-    for listing, new in topic_map.items():
-        if topics.get(listing) == IDS_LIST:
-            bodies = {name: find_body_id(listing, name) for name in topics if name not in topic_map}
-            found |= {name: skeleton_topic(new, identity) for name, identity in bodies.items() if identity}
-    return found
 
 
 def pace(records: Iterator[Record], rate: float) -> Iterator[Record]:

@@ -36,12 +36,46 @@ VERBS = {
 }
 
 
+EXAMPLES = {
+    "fit": ("fit scan.ply --out fits --measure", "fit room.pcd --scene --view single --out fits"),
+    "correspond": ("correspond fits/a.npz fits/b.npz --scan-a a.ply --scan-b b.ply --out pairs.npz",),
+    "pose": ("pose photos --out poses.json",),
+    "track": (
+        "track video.mp4 --out tracks.json --overlay film.mp4",
+        "track frames --init openpose_folder --out t.json",
+    ),
+    "replay": (
+        "replay walk.mcap --out out.mcap --report out.html",
+        "replay walk --out out.mcap --topic-map /camera/color/image_raw:=/camera/image",
+    ),
+    "report": ("report out.mcap --input walk.mcap --out out.html",),
+    "doctor": ("doctor walk.mcap", "doctor live", "doctor"),
+    "import": ("import session --calibration session/Calib.toml --out session.mcap",),
+    "calibrate": ("calibrate session.mcap --out refined.toml --person-height 1.80",),
+    "export": ("export fits/scan.npz --to glb --out exchange", "export out.mcap --to bvh --out exchange"),
+    "networks": ("networks", "networks --install"),
+    "annotate": ("annotate photos",),
+    "learn": ("learn likelihood --help",),
+    "sample": ("sample sp --count 4 --seed 1 --out samples",),
+    "evaluate": ("evaluate joints tracks.json --truth keypoints.json",),
+    "bench": ("bench fits",),
+}
+"""Commands that the help of each verb ends with."""
+
+
 _INPUT_ARGUMENTS = ("inputs", "input", "images")
 """Names of the arguments of verbs that are inputs."""
 VERB_PACKAGES = ("doctor", "evaluate", "export", "sample")
 """Verbs in folders of their own."""
 _MODULES = {"import": "cameras.import_folder", "calibrate": "cameras.calibrate_bag"}
 """Verbs whose module is elsewhere."""
+
+
+class _HelpFormatter(argparse.HelpFormatter):
+    """Keep the lines of the examples as they are; all else is filled."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        return text if text.startswith("examples:") else super()._fill_text(text, width, indent)
 
 
 def import_verb(verb: str) -> ModuleType:
@@ -74,7 +108,13 @@ def make_verb_parser(verb: str, arguments: list[str]) -> tuple[ModuleType, argpa
     if arguments and arguments[0] in subverbs:
         name, arguments = f"{verb} {arguments[0]}", arguments[1:]
         module = import_module(subverbs[name.split()[1]])
-    parser = argparse.ArgumentParser(prog=f"flowing-puppet {name}", description=module.__doc__)
+    lines = ["examples:", *(f"  flowing-puppet {example}" for example in EXAMPLES[verb])] if name == verb else []
+    parser = argparse.ArgumentParser(
+        prog=f"flowing-puppet {name}",
+        description=module.__doc__,
+        epilog="\n".join(lines),
+        formatter_class=_HelpFormatter,
+    )
     module.add_arguments(parser)
     return module, parser, arguments
 

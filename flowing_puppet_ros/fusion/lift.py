@@ -8,12 +8,21 @@ without points of the person around it has no depth: it counts across the ray on
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.fusion.limb_depths import (
+    CHAINS,
+    LIMB_REACH_M,
+    TRUNK_REACH_M,
+    DepthChoices,
+    choose_depths,
+    list_choices,
+    measure_seen_share,
+)
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, trunk_rows
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -26,21 +35,12 @@ BEHIND_SURFACE_M = {
 RADIUS_M, MIN_RADIUS_PX = 0.04, 2.5
 """Around a joint, within which the person's points give its depth."""
 MIN_POINTS = 3
-PATH_POINTS, PATH_RADIUS_M = 5, 0.02
-"""Points around a place on a limb whose median depth is the surface there, and how far they may be."""
-BONES = {
-    "face": "neck", "belly": "neck", "shoulder": "neck", "hip": "belly", "elbow": "shoulder", "wrist": "elbow",
-    "hand": "wrist", "knee": "hip", "ankle": "knee", "foot": "ankle",
-}  # fmt: skip
-"""The joint from which a limb leads to each joint."""
-BONE_STEPS = 8  # between the joints of a limb, at which the surface is looked up
-MAX_JUMP_M = 0.09
-"""From one step to the next, beyond which the surface along a limb is not that of one limb."""
+SURFACE_GAP_M, MIN_SURFACE_SHARE, MAX_SURFACES = 0.08, 0.15, 3
+"""Between the depths of two surfaces, share of a surface in the points around a joint, and how many there may be."""
+CHOSEN = {name for chain in CHAINS for name in chain}
+"""Joints whose depth is chosen among several."""
 MAX_TRUNK_DEPTH_M, MAX_LIMB_DEPTH_M = 0.45, 0.8
 """From the trunk's depth, within which the joints of trunk and limbs are."""
-
-
-_MIDDLE, _ARM = ("neck", "belly"), ("elbow", "wrist", "hand")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,6 +54,7 @@ class LiftedJoints:
         hidden: (J,) whether the joint is probably not on the surface that is seen at its pixel.
         depth: median depth of the trunk in metres along the camera's axis, NaN without any.
         centre: (3,) metres, where the camera is.
+        choices: of the limbs' joints, the places that each may have, by its number.
     """
 
     points: F64
@@ -62,6 +63,7 @@ class LiftedJoints:
     hidden: Bools
     depth: float
     centre: F64
+    choices: Mapping[int, DepthChoices]
 
     @property
     def found(self) -> Bools:
@@ -83,52 +85,38 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
     samples = _collect_samples(puppet, cloud, rows)
     trunk = trunk_rows(model)
     depth = _find_trunk_depth(puppet, samples, trunk)
-    surface = np.full(len(offsets), np.nan)
+    rays, axis = cloud.camera.cast_rays(puppet.pixels), cloud.camera.rotation[2]
+    points = np.full((len(offsets), 3), np.nan)
+    hidden = puppet.hidden.copy()
+    choices: dict[int, DepthChoices] = {}
     for joint, values in samples.items():
-        limit = MAX_TRUNK_DEPTH_M if joint in trunk else MAX_LIMB_DEPTH_M
-        near = values[np.abs(values - depth) < limit]
-        if len(near) >= MIN_POINTS:
-            surface[joint] = np.median(near)
-    rays = cloud.camera.cast_rays(puppet.pixels)
-    axis = cloud.camera.rotation[2]
-    along = surface / (rays @ axis) + offsets
-    points = cloud.camera.centre + rays * along[:, None]
+        near_trunk = joint in trunk
+        near = values[np.abs(values - depth) < (MAX_TRUNK_DEPTH_M if near_trunk else MAX_LIMB_DEPTH_M)]
+        if len(near) < MIN_POINTS:
+            continue
+        if _kind(model.joint_names[joint]) not in CHOSEN:
+            points[joint] = cloud.camera.centre + rays[joint] * (np.median(near) / (rays[joint] @ axis) + offsets[joint])
+            continue
+        choices[joint] = list_choices(
+            rays[joint], axis, cloud.camera.centre, _find_surfaces(near), offsets[joint], depth,
+            TRUNK_REACH_M if near_trunk else LIMB_REACH_M,
+            measure_seen_share(puppet.confidence[joint], bool(puppet.hidden[joint])),
+        )  # fmt: skip
+    for joint, choice in choose_depths(model, choices).items():
+        points[joint] = choices[joint].points[choice]
+        hidden[joint] |= not choices[joint].seen[choice]
     found = np.isfinite(points).all(axis=1)
-    hidden = puppet.hidden | _find_broken(model, puppet, cloud, rows, surface)
-    return LiftedJoints(points, rays, np.where(found, puppet.confidence, 0.0), hidden, depth, cloud.camera.centre)
+    confidence = np.where(found, puppet.confidence, 0.0)
+    return LiftedJoints(points, rays, confidence, hidden, depth, cloud.camera.centre, choices)
 
 
-def _find_broken(
-    model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray, surface: F64
-) -> Bools:
-    """Return the joints (J,) on the way to which the surface along the limb breaks off.
-
-    Along a limb that is seen the surface goes on. Where it falls back, the pixel has missed the limb, and what is seen
-    there is a neighbour or a wall. Where it jumps forward, something else stands before the limb, unless it is an arm:
-    a hand that points at the camera is much nearer than the elbow beside it.
-    """
-    broken = np.zeros(len(model.joint_names), dtype=bool)
-    if not len(rows):
-        return broken
-    tree = cKDTree(cloud.pixels[rows])
-    depth = cloud.depth[rows]
-    share = np.linspace(0, 1, BONE_STEPS + 1)[:, None]
-    for joint, name in enumerate(model.joint_names):
-        kind = _kind(name)
-        above = BONES.get(kind, "")
-        if not above or not np.isfinite(surface[joint]):
-            continue
-        start = model.joint_names.index(above if above in _MIDDLE else name.replace(kind, above))
-        if not (puppet.known[start] and np.isfinite(surface[start])):
-            continue
-        path = puppet.pixels[start] + share * (puppet.pixels[joint] - puppet.pixels[start])
-        radius = PATH_RADIUS_M * cloud.camera.focal / surface[joint] + MIN_RADIUS_PX
-        near, index = tree.query(path, k=PATH_POINTS, distance_upper_bound=radius)
-        found = np.isfinite(near).all(axis=1)
-        along = np.median(depth[index[found]], axis=1)
-        jumps = np.diff(along)
-        broken[joint] = bool((jumps > MAX_JUMP_M).any() or (kind not in _ARM and (jumps < -MAX_JUMP_M).any()))
-    return broken
+def _find_surfaces(depth: F64) -> F64:
+    """Return the depths (K,) of the surfaces to which depths (N,) belong, the one with the most points first."""
+    ordered = np.sort(depth)
+    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > SURFACE_GAP_M) + 1)
+    size = np.array([len(group) for group in groups])
+    chosen = [k for k in np.argsort(-size, kind="stable") if size[k] >= max(MIN_POINTS, MIN_SURFACE_SHARE * size.sum())]
+    return np.array([np.median(groups[k]) for k in chosen[:MAX_SURFACES]] or [np.median(ordered)])
 
 
 def _collect_samples(puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray) -> dict[int, F64]:

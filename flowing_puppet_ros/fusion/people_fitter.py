@@ -49,6 +49,11 @@ class FusionSettings(Settings):
     wait: int = setting(
         3, "clouds to wait for late puppets before one is used without them", low=0, high=50, advanced=True
     )
+    colour_only: bool = setting(
+        True,
+        "publish whom the camera sees where there is no depth: joints alone, as far away as their size says, never"
+        " reliable",
+    )
     rectified: bool = setting(
         False, "puppets are those of a rectified image, as P of puppets/camera_info says, not K and D", advanced=True
     )
@@ -166,10 +171,10 @@ class PeopleFitter:
             return None
 
     def _list_capsules(self, claim: Claim) -> F64:
-        """Return the capsules (C, 8) of a body, and of limbs with certain joints, should the body miss them."""
+        """Return the capsules (C, 8) of a body, and of limbs with known joints, should the body miss them."""
         names, joints = self.model.joint_names, claim.joints
-        certain = joints.found & ~joints.hidden & (joints.confidence >= MIN_LIMB_CONFIDENCE)
-        seen = {name: place for name, place, sure in zip(names, joints.points, certain, strict=True) if sure}
+        usable = joints.found & (joints.confidence >= MIN_LIMB_CONFIDENCE)
+        seen = {name: place for name, place, sure in zip(names, joints.points, usable, strict=True) if sure}
         limbs = list_capsules(seen)
         limbs = limbs[np.linalg.norm(limbs[:, :3] - limbs[:, 3:6], axis=1) < MAX_LIMB_M]
         return np.concatenate([self._list_body(claim.start), limbs])
@@ -182,7 +187,7 @@ class PeopleFitter:
     def fit_claim(self, claim: Claim, person: PersonCloud) -> BodyFit | None:
         """Return the body of a puppet's own points, from its joints; None where there is none."""
         try:
-            cloud = self.joint_fitter.make_cloud(person.points, person.field)
+            cloud = self.joint_fitter.make_cloud(person.points, person.field, person.viewpoint)
             return self.joint_fitter.fit(cloud, self.joint_fitter.start(claim.joints), claim.joints)
         except InputError:
             return None
@@ -216,9 +221,9 @@ class PeopleFitter:
 
 
 def make_person(cloud: SeenCloud, image: RangeImage | None, own: Bools, floor: Bools, stamp: int) -> PersonCloud:
-    """Return a person's `own` (N,) points with what the sensor at the origin can know of the person.
+    """Return a person's `own` (N,) points with what the sensor can know of the person.
 
     The floor (N,) hides nobody: who stood below it would be hidden by it, and longer legs would cost nothing.
     """
     field = None if image is None else image.make_field(own | floor)
-    return PersonCloud(cloud.points[own], None, stamp, np.zeros(3), np.flatnonzero(own), field=field)
+    return PersonCloud(cloud.points[own], None, stamp, cloud.viewpoint, np.flatnonzero(own), field=field)

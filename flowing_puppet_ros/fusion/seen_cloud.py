@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,11 +21,12 @@ class SeenCloud:
     """A cloud and its pixels.
 
     Attributes:
-        points: (N, 3) metres, z up; the sensor is at the origin.
+        points: (N, 3) metres, z up.
         pixels: (N, 2) in the camera's image, NaN for points that it does not see.
         depth: (N,) metres along the camera's axis.
         camera: projects points of this frame.
         in_view: (N,) whether each lies in the camera's field of view, hidden by others or not.
+        viewpoint: (3,) metres, where the sensor is.
     """
 
     points: F64
@@ -33,18 +34,23 @@ class SeenCloud:
     depth: F64
     camera: Camera
     in_view: Bools
+    viewpoint: F64 = field(default_factory=lambda: np.zeros(3))
 
     @classmethod
-    def of(cls, points: F64, camera: Camera) -> SeenCloud:
-        """Project a cloud `points` (N, 3) m of a sensor at the origin; what others hide from the camera is unseen."""
+    def of(cls, points: F64, camera: Camera, viewpoint: F64 | None = None) -> SeenCloud:
+        """Project a cloud `points` (N, 3) m; what others hide from the camera is unseen.
+
+        The sensor is at `viewpoint` (3,) m, or at the origin.
+        """
+        viewpoint = np.zeros(3) if viewpoint is None else viewpoint
         pixels, depth = camera.project(points)
         width, height = camera.size
         with np.errstate(invalid="ignore"):
             inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < width - 0.5) & (pixels[:, 1] < height - 0.5)
         seen = inside.copy()
-        if np.linalg.norm(camera.centre) > MAX_SAME_PLACE_M:
+        if np.linalg.norm(camera.centre - viewpoint) > MAX_SAME_PLACE_M:
             seen[inside] = _find_unhidden(pixels[inside], depth[inside])
-        return cls(points, np.where(seen[:, None], pixels, np.nan), depth, camera, inside)
+        return cls(points, np.where(seen[:, None], pixels, np.nan), depth, camera, inside, viewpoint)
 
     @property
     def seen(self) -> Bools:

@@ -126,6 +126,21 @@ class FusedTracker:
         self._drop_lost(stamp)
         return sorted(found, key=lambda body: (len(body.id), body.id)), own
 
+    def step_alone(
+        self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints]
+    ) -> tuple[list[TrackedBody], Bools]:
+        """Return the bodies in a cloud that nothing joins to those before, and which points (N,) are in view.
+
+        No track is used or changed. Puppets without an id have a new one.
+        """
+        named = [puppet if puppet.id else replace(puppet, id=self._make_id()) for puppet in puppets]
+        bodies = [TrackedBody(identity, fit) for identity, fit in self._people.fit_people(cloud, named, image)]
+        return sorted(bodies, key=lambda body: (len(body.id), body.id)), cloud.in_view
+
+    def _make_id(self) -> str:
+        self._named += 1
+        return self._publish_id(f"p{self._named}")
+
     def _share_out(
         self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints], stamp: int
     ) -> tuple[list[_TrackJob], Bools]:
@@ -203,8 +218,7 @@ class FusedTracker:
                 names[number] = identity
         for number, puppet in enumerate(nameless):
             if number not in names:
-                self._named += 1
-                names[number] = self._publish_id(f"p{self._named}")
+                names[number] = self._make_id()
             named.append(replace(puppet, id=names[number]))
         return named
 

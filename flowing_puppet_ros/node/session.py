@@ -39,7 +39,7 @@ from flowing_puppet_ros.stream.component import Component, Output, Port
 from flowing_puppet_ros.stream.messages.detections import BodySkeleton
 from flowing_puppet_ros.stream.messages.geometry import header_ns
 from flowing_puppet_ros.stream.messages.images import compress_image
-from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, TRANSFORMS
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 from flowing_puppet_ros.units import NANOSECONDS
 
@@ -297,7 +297,7 @@ class Session[C: Component[Any]]:
         if port.alternatives and hasattr(message, "ids"):
             self._bodies[port.name].follow(topic, message.ids)
         task = partial(self._handle, port.name, topic, message)
-        if port.qos == "latched":  # sent once, and each says something of its own
+        if port.qos == "latched" or port.type == TRANSFORMS:  # each says something of its own
             self.worker.call(task)
         else:
             self.worker.put(port.name, task)

@@ -15,6 +15,7 @@ from flowing_puppet_ros.fusion.people_fitter import FusionSettings
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, carry_puppets, place_joints
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.stream.messages.camera_info import describe_images
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_puppet_joints
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
@@ -36,11 +37,11 @@ class PairedPuppets:
 class PuppetPairs:
     """Keeps what came of a colour camera until the clouds that it belongs to are there."""
 
-    def __init__(self, model: StitchedPuppet, settings: FusionSettings) -> None:
-        """Read joints for the body `model`."""
+    def __init__(self, model: StitchedPuppet, settings: FusionSettings, frames: FrameTree | None = None) -> None:
+        """Read joints for the body `model`; `frames` take what comes on /tf and /tf_static."""
         self._model = model
         self._settings = settings
-        self._frames = FrameTree()
+        self._frames = frames or FrameTree()
         self._info: Any = None
         self.reset()
 
@@ -49,9 +50,9 @@ class PuppetPairs:
         self._messages: list[tuple[int, Any]] = []
 
     def add(self, port: str, message: Any) -> None:
-        """Take a message of `puppets`, `puppets/camera_info` or /tf_static; InputError when it cannot be used."""
-        if port == "/tf_static":
-            self._frames.add(message)
+        """Take a message of `puppets`, `puppets/camera_info`, /tf_static or /tf; InputError when it cannot be used."""
+        if port in ("/tf_static", "/tf"):
+            self._frames.add(message, moving=port == "/tf")
         elif port == "puppets/camera_info":
             self._info = message
         else:
@@ -65,16 +66,23 @@ class PuppetPairs:
         """Whether the calibration of the puppets' camera has come."""
         return self._info is not None
 
-    def is_ready(self, stamp: int) -> bool:
-        """Return whether no later message of puppets can be nearer to a cloud's stamp, nanoseconds."""
-        return bool(self._messages) and self._messages[-1][0] >= stamp
+    def is_ready(self, frame: str, stamp: int) -> bool:
+        """Return whether no later message of puppets or transforms can change what `find` tells of a cloud.
+
+        `frame` and `stamp`, nanoseconds, are the cloud's.
+        """
+        if not self._messages or self._messages[-1][0] < stamp:
+            return False
+        eye = "" if self._info is None else self._info.header.frame_id.lstrip("/")
+        connected = eye not in ("", frame.lstrip("/")) and self._frames.is_connected(frame, eye)
+        return not connected or not self._frames.is_awaited(frame, eye, stamp)
 
     def drop_until(self, stamp: int) -> None:
         """Drop the puppets that no cloud after this stamp can need: all but the last before it."""
         before = sum(each <= stamp for each, _ in self._messages)
         self._messages = self._messages[max(before - 1, 0) :]
 
-    def find(self, header: Any, stamp: int, to_z_up: F64) -> PairedPuppets:
+    def find(self, header: Any, stamp: int, rotation: F64, translation: F64) -> PairedPuppets:
         """Return the puppets at the time of a cloud.
 
         Between two images the joints move evenly; beyond the last one they stay where they are.
@@ -82,7 +90,8 @@ class PuppetPairs:
         Args:
             header: of the cloud.
             stamp: of the cloud in nanoseconds.
-            to_z_up: (3, 3), from the cloud's frame to the one with z up in which the camera is returned.
+            rotation: (3, 3), and `translation` (3,) m, from the frame in which the camera is returned to the cloud's.
+            translation: see `rotation`.
 
         Raises:
             InputError: in one sentence, when there are no puppets or nothing says how camera and cloud belong together.
@@ -99,15 +108,15 @@ class PuppetPairs:
             )
         usable = [pair for pair, gap in zip((*before, *after), gaps, strict=True) if gap <= self._settings.max_lag]
         nearest = min(usable, key=lambda pair: (abs(stamp - pair[0]), pair[0]))[1]
-        camera = self._make_camera(header, nearest, to_z_up)
+        camera = self._make_camera(header, stamp, nearest, (rotation, translation))
         people = [self._decode(message, camera) for _, message in usable]
         if len(usable) == 1 or usable[0][0] == usable[-1][0]:
             return PairedPuppets(camera, people[0])
         share = (stamp - usable[0][0]) / (usable[1][0] - usable[0][0])
         return PairedPuppets(camera, carry_puppets(people[0], people[1], share))
 
-    def _make_camera(self, header: Any, puppets: Any, to_z_up: F64) -> Camera:
-        info = self._info
+    def _make_camera(self, header: Any, stamp: int, puppets: Any, to_cloud: tuple[F64, F64]) -> Camera:
+        info = None if self._info is None else describe_images(self._info)
         if info is None:
             raise InputError(
                 "no puppets/camera_info came yet: puppets cannot be used with a cloud without the colour camera's "
@@ -121,14 +130,12 @@ class PuppetPairs:
                 "belongs to them"
             )
         frame = frame or seen_in
-        pose = (np.zeros(3), np.eye(3)) if frame == cloud else self._frames.lookup_pose(cloud, frame)
+        pose = (np.zeros(3), np.eye(3)) if frame == cloud else self._frames.lookup_pose(cloud, frame, stamp)
         if pose is None:
             raise InputError(
-                f"/tf_static does not connect the cloud's frame {cloud!r} with the colour camera's {frame!r}: puppets "
-                "cannot be used with the cloud; publish the transform"
+                f"{self._frames.describe_missing(cloud, frame, stamp)}: puppets cannot be used with the cloud"
             )
-        translation, rotation = pose
-        rotation = rotation @ to_z_up.T
+        rotation, translation = pose[1] @ to_cloud[0], pose[1] @ to_cloud[1] + pose[0]
         if self._settings.rectified:
             matrix = np.asarray(info.p, float).reshape(3, 4)[:, :3].ravel()
             return Camera.from_info(matrix, [], info.width, info.height, rotation, translation)

@@ -82,7 +82,7 @@ def test_static_transforms_count_wherever_they_were_recorded(golden: Any, tmp_pa
 def test_fixed_frames_on_tf_are_static(golden: Any, tmp_path: Path) -> None:
     """As `tf` of ROS 1 publishes them: again and again on /tf, beside frames that move."""
     moving = FACTORY.make("geometry_msgs/msg/TransformStamped", child_frame_id="wheel")
-    moving.header.frame_id = "cam1_optical_frame"
+    moving.header.frame_id, moving.transform.rotation.w = "cam1_optical_frame", 1.0
     topics = [f"/cam{k}/{name}" for k in (1, 2) for name in ("image/compressed", "detections", "camera_info")]
     with open_bag(golden.source) as bag, BagWriter(tmp_path / "in.mcap") as writer:
         (static,) = bag.messages(["/tf_static"])

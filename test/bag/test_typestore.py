@@ -40,6 +40,26 @@ def test_unknown_fields_are_refused() -> None:
         FACTORY.make("std_msgs/msg/Header", colour="red")
 
 
+HRI_MSGS = {
+    "IdsList": "std_msgs/Header header\nstring[] ids",
+    "NormalizedPointOfInterest2D": "float32 x\nfloat32 y\nfloat32 c",
+    "NormalizedRegionOfInterest2D": "std_msgs/Header header" + "".join(
+        f"\nfloat32 {name}" for name in ("xmin", "ymin", "xmax", "ymax", "c")
+    ),
+    "Skeleton2D": "std_msgs/Header header\nNormalizedPointOfInterest2D[18] skeleton",
+}  # fmt: skip
+"""The fields of the ROS 2 versions of hri_msgs. A type's hash is made of them, not of constants and comments."""
+
+
+def test_the_stand_in_for_hri_msgs_has_its_hashes() -> None:
+    assert {path.stem for path in definition_files("hri_msgs")} == set(HRI_MSGS)
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in HRI_MSGS.items():
+        store.register(get_types_from_msg(text, f"hri_msgs/msg/{name}"))
+    for name in HRI_MSGS:
+        assert typestore().hash_rihs01(f"hri_msgs/msg/{name}") == store.hash_rihs01(f"hri_msgs/msg/{name}")
+
+
 def test_messages_of_others_are_those_that_they_publish() -> None:
     """The hashes are those of ROS 2 Jazzy's packages: foxglove_msgs 3.4.3 and vision_msgs 4.1.1."""
     assert typestore().hash_rihs01("foxglove_msgs/msg/ImageAnnotations") == (

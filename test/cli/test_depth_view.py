@@ -34,11 +34,18 @@ def plane_depth() -> np.ndarray:
     return depth
 
 
-@pytest.mark.parametrize(("suffix", "unit"), [(".png", "auto"), (".tif", "mm"), (".npy", "auto")])
+@pytest.mark.parametrize(
+    ("suffix", "unit"),
+    [(".png", "auto"), (".tif", "mm"), (".pgm", "mm"), (".pfm", "auto"), (".npy", "auto"), (".npz", "auto")],
+)
 def test_pixels_become_the_places_that_they_show(tmp_path: Path, suffix: str, unit: str) -> None:
     path = tmp_path / f"depth{suffix}"
     if suffix == ".npy":
         np.save(path, plane_depth().astype(np.float32))
+    elif suffix == ".npz":  # millimetres with a fraction
+        np.savez(path, depth=1000 * plane_depth(), confidence=np.zeros(3))
+    elif suffix == ".pfm":
+        cv2.imwrite(str(path), plane_depth().astype(np.float32))
     else:
         cv2.imwrite(str(path), np.rint(1000 * plane_depth()).astype(np.uint16))
     view = read_depth_view(path, ",".join(map(str, K)), unit)
@@ -47,7 +54,7 @@ def test_pixels_become_the_places_that_they_show(tmp_path: Path, suffix: str, un
     first = view.points[0]  # pixel (5, 0)
     assert first[:2] / first[2] == pytest.approx([(5 - K[2]) / K[0], -K[3] / K[1]])
     assert view.image.bounds.tolist()[:2] == [4.5, -0.5]
-    assert ("taken as mm" in view.note) == (suffix == ".png")
+    assert ("taken as mm" in view.note) == (suffix in (".png", ".npz"))
 
 
 @pytest.mark.parametrize(
@@ -107,7 +114,13 @@ def test_what_is_no_depth_is_refused(tmp_path: Path) -> None:
     refuse("grey.png", np.full((120, 160), 80, np.uint8), "8 bits a pixel")
     refuse("cloud.npy", np.zeros((120, 3), np.float32), "has rows and columns")
     refuse("nan.npy", np.full((120, 160), np.nan, np.float32), "a depth at 0 of")
-    refuse("mm.npy", np.full((120, 160), 2500.0, np.float32), "about 2.5e[+]03 m if they are in m")
+    refuse("um.npy", np.full((120, 160), 2.5e6, np.float32), "about 2.5e[+]03 m if they are in mm")
+    (tmp_path / "a.exr").write_bytes(b"no image")
+    with pytest.raises(InputError, match=r"convert it to .npy or a float .tiff"):
+        read_depth_view(tmp_path / "a.exr", "300,300,80,60", "auto")
+    np.savez(tmp_path / "two.npz", a=np.ones((120, 160)), b=np.ones((120, 160)))
+    with pytest.raises(InputError, match="has the arrays a, b; call the depth image depth"):
+        read_depth_view(tmp_path / "two.npz", "300,300,80,60", "auto")
     (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n")
     with pytest.raises(InputError, match="not an image"):
         read_depth_view(tmp_path / "broken.png", "300,300,80,60", "auto")

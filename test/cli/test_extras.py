@@ -37,7 +37,6 @@ def run(packages: str, *arguments: str, folder: Path) -> subprocess.CompletedPro
 def folder(tmp_path: Path) -> Path:
     """Return a folder with inputs for every verb."""
     np.save(tmp_path / "cloud.npy", np.random.default_rng(0).normal(size=(500, 3)))
-    (tmp_path / "scan.stl").write_text("solid a\nendsolid a\n")
     (tmp_path / "network.tflite").write_bytes(b"TFL3" * 10)
     (tmp_path / "image.png").write_bytes(b"no image")
     frames = [{"index": 0, "puppets": [{"id": "a1", "joints": [[1.0, 2.0, 1.0]]}]}]
@@ -55,7 +54,6 @@ def folder(tmp_path: Path) -> Path:
         ("learn", "learn needs sklearn", ["learn", "ds"]),
         ("learn", "the Anny body needs body_models", ["evaluate", "bodies", "--kind", "whole", "--count", "1"]),
         ("rerun", "--rerun needs rerun", ["replay", str(GOLDEN), "--out", "o.mcap", "--rerun", "o.rrd"]),
-        ("scans", ".stl of scan.stl needs open3d", ["fit", "scan.stl", "--out", "o"]),
     ],
 )  # fmt: skip
 def test_what_is_missing_is_one_sentence(extra: str, said: str, arguments: list[str], folder: Path) -> None:

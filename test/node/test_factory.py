@@ -49,6 +49,7 @@ def test_an_unknown_field_is_refused() -> None:
 @pytest.mark.parametrize(
     "name",
     ["flowing_puppet_msgs/msg/BodyArray", "flowing_puppet_msgs/msg/PuppetArray", "hri_msgs/msg/Skeleton2D",
+     "flowing_puppet_msgs/msg/BodyMeasurements", "flowing_puppet_msgs/msg/BodyMeasurementsArray",
      "tf2_msgs/msg/TFMessage", "visualization_msgs/msg/MarkerArray", "sensor_msgs/msg/PointCloud2"],
 )  # fmt: skip
 def test_live_and_bag_messages_have_the_same_fields(name: str) -> None:

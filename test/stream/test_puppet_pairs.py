@@ -65,23 +65,23 @@ def neck_at(found: Any, model: StitchedPuppet) -> float:
 )  # 1 s: the first image; then evenly to the second at 1.1 s, and no further
 def test_joints_are_where_they_are_at_the_time_of_the_cloud(model: StitchedPuppet, at: float, x: float) -> None:
     made = pairs(model, puppets(SECOND, 100), puppets(SECOND + SECOND // 10, 140))
-    found = made.find(header(round(at * SECOND)), round(at * SECOND), np.eye(3))
+    found = made.find(header(round(at * SECOND)), round(at * SECOND), np.eye(3), np.zeros(3))
     assert neck_at(found, model) == pytest.approx(x, abs=1e-3)
 
 
 def test_a_cloud_waits_for_puppets_that_are_not_older(model: StitchedPuppet) -> None:
     made = pairs(model, puppets(SECOND, 100))
-    assert made.is_ready(SECOND)
-    assert not made.is_ready(SECOND + 1)
+    assert made.is_ready("eye", SECOND)
+    assert not made.is_ready("eye", SECOND + 1)
     made.drop_until(2 * SECOND)
-    assert made.is_ready(SECOND)  # the last ones are kept
+    assert made.is_ready("eye", SECOND)  # the last ones are kept
 
 
 def test_late_and_disordered_puppets_are_sorted_and_a_jump_back_is_a_new_recording(model: StitchedPuppet) -> None:
     made = pairs(model, puppets(SECOND + 100, 140), puppets(SECOND, 100))
-    assert neck_at(made.find(header(SECOND), SECOND, np.eye(3)), model) == pytest.approx(110)
+    assert neck_at(made.find(header(SECOND), SECOND, np.eye(3), np.zeros(3)), model) == pytest.approx(110)
     made.add("puppets", puppets(SECOND - 100 * SECOND // 10, 50))
-    assert not made.is_ready(SECOND)
+    assert not made.is_ready("eye", SECOND)
 
 
 def test_the_camera_stands_where_tf_puts_it_in_the_frame_with_z_up(model: StitchedPuppet) -> None:
@@ -89,28 +89,28 @@ def test_the_camera_stands_where_tf_puts_it_in_the_frame_with_z_up(model: Stitch
     turn = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # of the optical frame in that of the LiDAR
     transform = make_transform(FACTORY, make_header(FACTORY, 0, "lidar"), "eye", np.array([0.1, 0.2, -0.3]), turn)
     made.add("/tf_static", FACTORY.make(TRANSFORMS, transforms=[transform]))
-    camera = made.find(header(SECOND, "lidar"), SECOND, np.eye(3)).camera
+    camera = made.find(header(SECOND, "lidar"), SECOND, np.eye(3), np.zeros(3)).camera
     np.testing.assert_allclose(camera.centre, [0.1, 0.2, -0.3], atol=1e-9)
     # 2 m ahead of the camera and 0.4 m to its left.
     np.testing.assert_allclose(camera.project([2.1, 0.6, -0.3])[0], [320 - 500 * 0.2, 240], atol=1e-6)
     upside_down = np.diag([1.0, -1.0, -1.0])
-    camera = made.find(header(SECOND, "lidar"), SECOND, upside_down).camera
+    camera = made.find(header(SECOND, "lidar"), SECOND, upside_down, np.zeros(3)).camera
     np.testing.assert_allclose(camera.project(upside_down @ [2.1, 0.6, -0.3])[0], [220, 240], atol=1e-6)
 
 
 def test_puppets_of_rectified_images_take_the_projection_matrix(model: StitchedPuppet) -> None:
-    camera = pairs(model, puppets(SECOND, 100), rectified=True).find(header(SECOND), SECOND, np.eye(3)).camera
+    camera = pairs(model, puppets(SECOND, 100), rectified=True).find(header(SECOND), SECOND, np.eye(3), np.zeros(3)).camera
     np.testing.assert_allclose(camera.project([0.5, 0.25, 1.0])[0], [500, 300])
 
 
 @pytest.mark.parametrize(("depth", "hidden"), [(0, True), (7, False)])
 def test_what_lies_behind_the_puppets_own_torso_is_hidden(model: StitchedPuppet, depth: int, hidden: bool) -> None:
-    found = pairs(model, puppets(SECOND, 100, wrist_depth=depth)).find(header(SECOND), SECOND, np.eye(3))
+    found = pairs(model, puppets(SECOND, 100, wrist_depth=depth)).find(header(SECOND), SECOND, np.eye(3), np.zeros(3))
     assert bool(found.puppets[0].hidden[model.joint_names.index("left_wrist")]) == hidden
 
 
 def test_ids_begin_with_a_letter(model: StitchedPuppet) -> None:
-    found = pairs(model, puppets(SECOND, 100, identity="17")).find(header(SECOND), SECOND, np.eye(3))
+    found = pairs(model, puppets(SECOND, 100, identity="17")).find(header(SECOND), SECOND, np.eye(3), np.zeros(3))
     assert [puppet.id for puppet in found.puppets] == ["p17"]
 
 
@@ -120,7 +120,7 @@ def test_ids_begin_with_a_letter(model: StitchedPuppet) -> None:
         ({"info": None}, "no puppets/camera_info came yet"),
         ({"puppets": None}, "no puppets came for the clouds yet"),
         ({"at": 3 * SECOND}, "2.00 s from it, beyond the fusion.max_lag of 0.35 s"),
-        ({"frame": "lidar"}, "/tf_static does not connect the cloud's frame 'lidar' with the colour camera's 'eye'"),
+        ({"frame": "lidar"}, "/tf and /tf_static do not connect 'lidar' with 'eye'; publish or record the transform"),
         ({"info": info("other_eye")}, "the puppets are of the camera 'eye', puppets/camera_info is of 'other_eye'"),
         ({"info": info(size=(100, 80))}, "outside of the 100x80 image of puppets/camera_info"),
     ],
@@ -133,4 +133,4 @@ def test_what_cannot_be_paired_is_one_sentence(model: StitchedPuppet, changed: d
         made.add("puppets", puppets(SECOND, 100))
     stamp = changed.get("at", SECOND)
     with pytest.raises(InputError, match=sentence.replace("(", r"\(")):
-        made.find(header(stamp, changed.get("frame", "eye")), stamp, np.eye(3))
+        made.find(header(stamp, changed.get("frame", "eye")), stamp, np.eye(3), np.zeros(3))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Transforms that never change on topics that are not latched: `tf` of ROS 1 and Foxglove repeat them on /tf."""
+"""Frames of recordings: those that never move, which ROS 1 and Foxglove repeat on /tf, and those of people."""
 
 from __future__ import annotations
 
@@ -34,3 +34,13 @@ def _differ(one: Any, other: Any) -> bool:
 def _values(item: Any) -> Any:
     t, q = item.transform.translation, item.transform.rotation
     return np.array([t.x, t.y, t.z, q.x, q.y, q.z, q.w])
+
+
+def is_of_people(message: Any) -> bool:
+    """Return whether a TFMessage tells where bodies are (REP-155), as a body fitter publishes them.
+
+    Its frames are `body_<id>`, after the fitter's `output.frame_prefix`, or hang on such a frame of the same message.
+    """
+    bodies = {item.child_frame_id for item in message.transforms if "body_" in item.child_frame_id}
+    own = [item.child_frame_id in bodies or item.header.frame_id in bodies for item in message.transforms]
+    return bool(own) and all(own)

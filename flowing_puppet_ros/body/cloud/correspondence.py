@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,14 @@ class VertexQuadratic:
 
     matrix: np.ndarray
     vector: np.ndarray
+
+    @classmethod
+    def sum(cls, terms: Sequence[VertexQuadratic]) -> VertexQuadratic:
+        """Return the sum of one or more quadratics of the same vertices."""
+        total = terms[0]
+        for term in terms[1:]:
+            total = cls(total.matrix + term.matrix, total.vector + term.vector)
+        return total
 
 
 class TwoWayCorrespondence:

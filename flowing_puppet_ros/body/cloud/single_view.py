@@ -6,12 +6,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic, geman_mcclure
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours
-from flowing_puppet_ros.evidence.cloud.one_sided import OneSidedView
+from flowing_puppet_ros.evidence.cloud.one_sided import OneSidedView, compare_point
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 
 MAX_VIEW_POINTS = 4000
@@ -74,8 +75,7 @@ class SingleViewCloud(Cloud):
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return which vertices (V,) face the sensor, are in its field and not hidden by what it saw."""
-        facing = ((self.view.viewpoint - vertices) * normals).sum(axis=1) > 0
-        return np.asarray(facing & ~self.view.find_hidden(vertices))
+        return self.view.find_seen(vertices, normals)
 
     def free_space_term(self, vertices: np.ndarray, sigma: float) -> VertexQuadratic:
         """Return the quadratic that pulls vertices (V, 3) out of the space that the sensor saw to be free.
@@ -84,16 +84,42 @@ class SingleViewCloud(Cloud):
         back to it, both with the `geman_mcclure` weight of width `sigma` in metres. The total weight is 1, as in each
         direction of `attract`.
         """
-        beside, behind = self.view.compare(vertices)
-        ray = vertices - self.view.viewpoint
-        ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        across = beside - (beside * ray).sum(axis=1, keepdims=True) * ray
-        inside = ~beside.any(axis=1)
-        depth = np.where(inside, np.minimum(behind + self.depth_tolerance, 0.0), 0.0)
-        weight = geman_mcclure((across**2).sum(axis=1), sigma**2) * ~inside / len(vertices)
-        weight_along = geman_mcclure(depth**2, sigma**2) * (depth < 0) / len(vertices)
-        outer = ray[:, :, None] * ray[:, None, :]
-        return VertexQuadratic(
-            weight[:, None, None] * (np.eye(3) - outer) + weight_along[:, None, None] * outer,
-            weight[:, None] * across + (weight_along * depth)[:, None] * ray,
-        )
+        return VertexQuadratic(*_pull_to_seen(vertices, self.view.arrays, self.depth_tolerance, sigma**2))
+
+
+@njit(cache=True, nogil=True)
+def _pull_to_seen(vertices, view, tolerance, squared_width):  # type: ignore[no-untyped-def]
+    """Return the matrices (V, 3, 3) and vectors (V, 3) that pull vertices out of free space."""
+    viewpoint, axes = view[0], view[1]
+    matrix, vector = np.zeros((len(vertices), 3, 3)), np.zeros_like(vertices)
+    ray, across = np.empty(3), np.empty(3)
+    for k in range(len(vertices)):
+        dx, dy, behind = compare_point(vertices[k, 0], vertices[k, 1], vertices[k, 2], view)
+        aside = dx != 0 or dy != 0
+        depth = behind + tolerance
+        if not aside and depth >= 0:
+            continue
+        for i in range(3):
+            ray[i] = vertices[k, i] - viewpoint[i]
+        ray /= np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+        if aside:
+            along, squared = 0.0, 0.0
+            for i in range(3):
+                across[i] = dx * axes[0, i] + dy * axes[1, i]
+                along += across[i] * ray[i]
+            for i in range(3):
+                across[i] -= along * ray[i]
+                squared += across[i] ** 2
+            weight = geman_mcclure(squared, squared_width) / len(vertices)
+            for i in range(3):
+                vector[k, i] = weight * across[i]
+                for j in range(3):
+                    matrix[k, i, j] = -weight * ray[i] * ray[j]
+                matrix[k, i, i] += weight
+        else:
+            weight = geman_mcclure(depth**2, squared_width) / len(vertices)
+            for i in range(3):
+                vector[k, i] = weight * depth * ray[i]
+                for j in range(3):
+                    matrix[k, i, j] = weight * ray[i] * ray[j]
+    return matrix, vector

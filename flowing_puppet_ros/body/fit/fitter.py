@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
@@ -81,7 +81,9 @@ class BodyFitter:
 
     def warm_up(self) -> None:
         """Load compiled code and make the pose bank, which takes long; done once for a model in a process."""
-        _warm_up(self.model)
+        if self.model not in _WARM:
+            _warm_up(self)
+            _WARM.append(self.model)
 
     def fit(
         self,
@@ -294,13 +296,15 @@ def check_cloud(points: np.ndarray, normals: np.ndarray | None) -> tuple[np.ndar
     return points, normals
 
 
-@lru_cache(maxsize=3)
-def _warm_up(model: StitchedPuppet) -> None:
-    """Run every step of a fit once on a body of the model; the cache keeps it from running twice."""
-    fitter = BodyFitter(model, FitterSettings())
+# The last models whose fits ran once; equal only to themselves.
+_WARM: deque[StitchedPuppet] = deque(maxlen=3)
+
+
+def _warm_up(fitter: BodyFitter) -> None:
+    """Run every step of a fit once on a body of the fitter's model."""
     with one_blas_thread():
-        state = model.rest_state()
-        cloud = fitter.prepare_cloud(model.vertices(state), None, None)
+        state = fitter.model.rest_state()
+        cloud = fitter.prepare_cloud(fitter.model.vertices(state), None, None)
         viewpoint = cloud.points.mean(axis=0) + WARM_UP_VIEWPOINT_M
         fitter.hypotheses.warm_up(cloud, SingleViewCloud.seen_from(cloud.points, cloud.normals, viewpoint))
         fitter.assess(state, cloud)

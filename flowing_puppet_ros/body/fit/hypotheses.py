@@ -19,7 +19,7 @@ from flowing_puppet_ros.body.fit.initialisation import flip_heading, sample_bodi
 from flowing_puppet_ros.body.fit.partial_view import measure_unknown_share, strengthen_priors
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
 from flowing_puppet_ros.body.fit.quality import MAX_UNCOVERED, FitQuality, assess_fit
-from flowing_puppet_ros.body.fit.single_view_search import ROUGH, SingleViewSearch
+from flowing_puppet_ros.body.fit.single_view_search import SingleViewSearch
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.body_energy import BodyEnergy
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
@@ -48,8 +48,9 @@ MAX_REPAIRABLE_COST_M = 0.06
 MAX_COST_RATIO, MAX_COST_RATIO_IF_WRONG, MIN_WRONG_UNCOVERED = 0.98, 0.9, 0.25
 # Gauss-Newton from initial joints where the sensor sees a part of the person only.
 PARTIAL = RefineWeights(sigma_start=0.2, sigma_end=0.03, iterations=20)
-# Bodies that are refined to compare frames.
+# Bodies that are refined to compare frames, and their Gauss-Newton steps.
 ROUGH_STARTS = 4
+ROUGH = RefineWeights(sigma_start=0.2, sigma_end=0.08, iterations=8)
 # Share of the particles and rounds in a search for the warm-up.
 RESTART_SHARE = 2.0  # of particles and iterations, in a search after the first
 WARM_UP_SHARE = 0.1
@@ -125,11 +126,11 @@ class BodyHypotheses:
         self.particle_search = BodyParticleSearch(model, points, weights)
         self.energy = BodyEnergy(model, points, weights.stitch, weights.mismatch)
         self.gauss_newton = GaussNewton(model)
-        self._proposer = Proposer(model, points)
-        self.limb_search = LimbSearch(model, self.particle_search, self._proposer)
+        self.proposer = Proposer(model, points)
+        self.limb_search = LimbSearch(model, self.particle_search, self.proposer)
         self.pose_bank = PoseBank(model, points)
         self._single_view_search = SingleViewSearch(
-            model, self.pose_bank, self._proposer, self.gauss_newton, self._threads
+            model, self.pose_bank, self.proposer, self.gauss_newton, self._threads
         )
 
     def search(self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False) -> BodyState:
@@ -166,7 +167,8 @@ class BodyHypotheses:
     def warm_up(self, cloud: Cloud, view: SingleViewCloud) -> None:
         """Run all compiled code once, on a whole cloud and on a single view."""
         grid = CloudGrid.build(cloud.points, cloud.normals)
-        self._search_both_headings(cloud, grid, np.random.default_rng(0), lambda _: None, WARM_UP_SHARE)
+        body = self._search_unknown(cloud, grid, np.random.default_rng(0), lambda _: None, WARM_UP_SHARE)
+        self.evaluate(flip_heading(self._model, body), cloud)
         state = self.pose_bank.find_best(CoarseCloud.of(view), 1)[0]
         self.refine(state, view, JointTargets.none(self._model), 1)
 
@@ -193,7 +195,7 @@ class BodyHypotheses:
         start = []
         for group in states_to_particles(self._model, [body]):
             copies = group.take(np.zeros(self._settings.local_particles - 1, dtype=np.int64))
-            walked = self._proposer.random_walk(copies, WalkNoise(0.02, 0.12, 0.5, 0.2), rng)
+            walked = self.proposer.random_walk(copies, WalkNoise(0.02, 0.12, 0.5, 0.2), rng)
             start.append(Particles.join([group, walked]))
         stages, iterations = local_stages(self._model.tree), self._settings.local_iterations
         return self.particle_search.optimise(
@@ -223,24 +225,29 @@ class BodyHypotheses:
 
         `share` is the share of the settings' particles and iterations to use.
         """
-        none = JointTargets.none(self._model)
+        found = self._search_unknown(cloud, grid, rng, sub_progress(progress, 0.0, 0.8), share)
+        body = self.evaluate(found, cloud)
+        turned = flip_heading(self._model, body.state)
+        flipped = self.evaluate(turned, cloud)
+        if flipped.cost < MAX_TURNED_RATIO * body.cost:
+            near = self.search_near(turned, grid, JointTargets.none(self._model), rng, sub_progress(progress, 0.8, 1.0))
+            flipped = min(flipped, self.evaluate(near, cloud), key=lambda candidate: candidate.cost)
+        return sorted([body, flipped], key=lambda candidate: candidate.cost)
+
+    def _search_unknown(
+        self, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator, progress: Progress, share: float
+    ) -> BodyState:
+        """Search with unknown yaw; `share` is that of the settings' particles and iterations to use."""
         particles, iterations = (
             max(1, round(share * count)) for count in (self._settings.particles, self._settings.iterations)
         )
         bodies = sample_bodies(self._model, cloud.points.mean(axis=0), particles, rng)
         noise = WalkNoise(center=0.05, rotation=0.1, pose=0.0, shape=0.0)
-        start = [self._proposer.random_walk(group, noise, rng) for group in states_to_particles(self._model, bodies)]
+        start = [self.proposer.random_walk(group, noise, rng) for group in states_to_particles(self._model, bodies)]
         stages = four_stages(self._model.tree)
-        found = self.particle_search.optimise(
-            start, grid, none, stages, iterations, rng, sub_progress(progress, 0.0, 0.8), threads=self._threads
-        )
-        body = self.evaluate(found.state, cloud)
-        turned = flip_heading(self._model, body.state)
-        flipped = self.evaluate(turned, cloud)
-        if flipped.cost < MAX_TURNED_RATIO * body.cost:
-            near = self.search_near(turned, grid, none, rng, sub_progress(progress, 0.8, 1.0))
-            flipped = min(flipped, self.evaluate(near, cloud), key=lambda candidate: candidate.cost)
-        return sorted([body, flipped], key=lambda candidate: candidate.cost)
+        return self.particle_search.optimise(
+            start, grid, JointTargets.none(self._model), stages, iterations, rng, progress, threads=self._threads
+        ).state
 
     def repair_limbs(
         self, body: BodyCandidate, cloud: Cloud, grid: CloudGrid, rng: np.random.Generator

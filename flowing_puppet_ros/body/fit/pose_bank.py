@@ -22,8 +22,11 @@ POSES, YAWS = 200, 16
 """The bank has every pose in every yaw."""
 TARGETS = 250
 """Points of the cloud that the body must cover."""
+ROUGH_SHARE, ROUGH_TARGETS, FINE_POSES = 0.33, 80, 12
+"""Share of the surface points and number of the targets by which all bodies are judged, and the best poses of each yaw
+that are judged by all."""
 COARSE_POSES, COARSE_TARGETS = 40, 100
-"""The same by which frames are compared."""
+"""Poses and targets by which frames are compared."""
 SURFACE_POINTS = {
     "torso": 56, "head": 20, "shoulder": 14, "upper_arm": 18, "lower_arm": 16, "hand": 10,
     "upper_leg": 26, "lower_leg": 22, "foot": 12,
@@ -76,6 +79,10 @@ class PoseBank:
         self._model = model
         sizes = [SURFACE_POINTS[name.removeprefix("left_").removeprefix("right_")] for name in model.tree.names]
         self._share = np.array(sizes) / sum(sizes)
+        starts = np.cumsum([0, *sizes[:-1]])
+        self._rough_columns = np.concatenate(
+            [start + np.arange(round(ROUGH_SHARE * size)) for start, size in zip(starts, sizes, strict=True)]
+        )
         self._surface = [_take_first(part.surface, size) for part, size in zip(points, sizes, strict=True)]
         self._normals = [part.normals[:size] for part, size in zip(points, sizes, strict=True)]
         precisions = [
@@ -84,23 +91,29 @@ class PoseBank:
         self._joints = [(pair.mean[:3], precision) for pair, precision in zip(model.pairwise, precisions, strict=True)]
 
     def find_best(self, coarse: CoarseCloud, count: int) -> list[BodyState]:
-        """Return the best body of each of the `count` best yaws, moved to the cloud."""
-        bodies = self._move_to_cloud(make_bank(self._model), coarse)
-        cost = self.coverage_cost(bodies, coarse, range(len(bodies))).cost.reshape(YAWS, POSES)
+        """Return the best body of each of the `count` best yaws, moved to the cloud.
+
+        All are judged by few points first, and the best of each yaw by all points.
+        """
+        rough = replace(coarse, targets=coarse.targets[:ROUGH_TARGETS])
+        costs, _ = self._judge_bank(rough, POSES, self._rough_columns)
+        poses = np.argsort(costs, axis=1, kind="stable")[:, :FINE_POSES]
+        rows = (np.arange(YAWS)[:, None] * POSES + poses).reshape(-1)
+        bodies = self._move_to_cloud([group.take(rows) for group in make_bank(self._model)], coarse)
+        cost = self.coverage_cost(bodies, coarse, range(len(bodies))).cost.reshape(YAWS, FINE_POSES)
         yaws = np.argsort(cost.min(axis=1), kind="stable")[:count]
-        rows = [yaw * POSES + int(cost[yaw].argmin()) for yaw in yaws]
-        return [particles_to_state(self._model, bodies, np.full(len(bodies), row)) for row in rows]
+        best = [yaw * FINE_POSES + int(cost[yaw].argmin()) for yaw in yaws]
+        return [particles_to_state(self._model, bodies, np.full(len(bodies), row)) for row in best]
 
     def find_roughly(self, cloud: Cloud, count: int) -> list[BodyState]:
         """Return the best body of each of the `count` best yaws of a small bank, moved to the cloud."""
-        costs, shift = self._judge_small_bank(cloud)
-        costs = costs.reshape(YAWS, COARSE_POSES)
+        costs, shift = self._judge_bank(CoarseCloud.of(cloud, COARSE_TARGETS), COARSE_POSES)
         states = []
         for yaw in np.argsort(costs.min(axis=1), kind="stable")[:count]:
             pose = int(costs[yaw].argmin())
             groups = [group.take(np.array([yaw * POSES + pose])) for group in make_bank(self._model)]
             body = particles_to_state(self._model, groups, np.zeros(len(groups), dtype=np.int64))
-            states.append(replace(body, center=body.center + shift[yaw * COARSE_POSES + pose]))
+            states.append(replace(body, center=body.center + shift[yaw, pose]))
         return states
 
     def coarse_cost(self, cloud: Cloud) -> float:
@@ -108,22 +121,32 @@ class PoseBank:
 
         It tells a cloud with the head up from the same cloud upside down.
         """
-        return float(self._judge_small_bank(cloud)[0].min())
+        return float(self._judge_bank(CoarseCloud.of(cloud, COARSE_TARGETS), COARSE_POSES)[0].min())
 
-    def _judge_small_bank(self, cloud: Cloud) -> tuple[np.ndarray, np.ndarray]:
-        """Return the costs (P,) m of the bodies of the small bank, and the steps (P, 3) m that move them to a cloud."""
-        coarse = CoarseCloud.of(cloud, COARSE_TARGETS)
-        points, normals, prior = self._small_bank
-        shift = self._shift_to_cloud(points, normals, coarse)
-        points = points + shift[:, None]
-        misfit, able = _measure_misfit(points, normals, coarse)
-        return distances(coarse.targets, points, able).mean(axis=1) + misfit + prior, shift
+    def _judge_bank(
+        self, coarse: CoarseCloud, poses: int, columns: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Judge the first `poses` of the bank in every yaw, by all of their points or by some `columns` of them.
+
+        Returns:
+            Costs (YAWS, poses) m, and the steps (YAWS, poses, 3) m that move the bodies to the cloud.
+        """
+        points, normals, prior = self._bank_surface
+        every = np.arange(points.shape[1]) if columns is None else columns
+        points, normals, prior = points[:poses, every], normals[:poses, every], prior[:poses]
+        costs, shifts = np.empty((YAWS, poses)), np.empty((YAWS, poses, 3))
+        for yaw, turn in enumerate(_list_yaws()):
+            turned, facing = points @ turn.T, normals @ turn.T
+            shifts[yaw] = self._shift_to_cloud(turned, facing, coarse)
+            turned += shifts[yaw][:, None]
+            misfit, able = _measure_misfit(turned, facing, coarse)
+            costs[yaw] = distances(coarse.targets, turned, able).mean(axis=1) + misfit + prior
+        return costs, shifts
 
     @cached_property
-    def _small_bank(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Surface points and normals (P, K, 3) and joint priors (P,) of the bodies by which frames are compared."""
-        rows = np.flatnonzero(np.arange(YAWS * POSES) % POSES < COARSE_POSES)
-        bodies = [group.take(rows) for group in make_bank(self._model)]
+    def _bank_surface(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Surface points and normals (POSES, K, 3) and joint priors (POSES,) of the bank's bodies in the first yaw."""
+        bodies = [group.take(np.arange(POSES)) for group in make_bank(self._model)]
         return *self._pose_surface(bodies, range(len(bodies))), self._joint_prior(bodies, range(len(bodies)))
 
     def cost(self, body: BodyState, coarse: CoarseCloud) -> float:
@@ -196,8 +219,12 @@ def make_bank(model: StitchedPuppet) -> list[Particles]:
         )
         for part in range(len(model.tree))
     ]
-    yaws = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
-    return [Particles.join([_rotate(group, yaw) for yaw in yaws]) for group in bank]
+    return [Particles.join([_rotate(group, yaw) for yaw in _list_yaws()]) for group in bank]
+
+
+def _list_yaws() -> np.ndarray:
+    """Return the rotations (YAWS, 3, 3) about the upright axis."""
+    return so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
 
 
 def _measure_misfit(points: np.ndarray, normals: np.ndarray, coarse: CoarseCloud) -> tuple[np.ndarray, np.ndarray]:

@@ -5,11 +5,15 @@ The thesis's data term asks every part by itself whether it lies on the cloud. A
 half of every part must not lie on it, and parts behind others have no cloud at all. Here hypotheses are scored as whole
 bodies by three questions. Is all of the cloud covered? Is anything in space that the sensor saw to be free? Are the
 joints in likely poses? Only the last one places what the sensor did not see.
+
+Most time goes into bodies that lose. So every round asks fewer of them, and the first steps match only a quarter of the
+points each.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
@@ -23,17 +27,19 @@ from flowing_puppet_ros.body.search.proposals import Proposer
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import parallel_map
 
-STARTS, KEPT_STARTS = 32, 8  # bodies of the bank that are refined, and those of them that are searched further
-LIMB_SAMPLES, MAX_LIMB_ROUNDS = 600, 3  # poses sampled for each limb in a round, and rounds over all limbs
+STARTS, KEPT_STARTS = 16, 12  # bodies of the bank that are refined, and those of them that are refined further
+KEPT, FINISHED = (8, 4, 2), 2  # bodies whose limbs are sampled again in each round, and those that are finished
+LIMB_SAMPLES = 600  # poses sampled for each limb in a round
 # Parts of an arm and of a leg from the trunk outwards, without the side.
 LIMB_CHAINS = (("shoulder", "upper_arm", "lower_arm", "hand"), ("upper_leg", "lower_leg", "foot"))
 MAX_COST_INCREASE_M = 0.003
 """Cost by which a sampled limb may exceed the present one and still be refined."""
 MIN_DENSE_POINTS = 2000
 """Points below which a cloud is a LiDAR's: a few hundred points with centimetres of noise."""
-# Refinement of the bank's bodies, and of a sampled limb.
-ROUGH = RefineWeights(sigma_start=0.2, sigma_end=0.08, iterations=8)
-CLOSE = RefineWeights(sigma_start=0.06, sigma_end=0.04, iterations=5)
+# Two refinements of the bank's bodies, and that of a sampled limb.
+FIRST = RefineWeights(sigma_start=0.2, sigma_end=0.13, iterations=4, alternate=4)
+SECOND = RefineWeights(sigma_start=0.12, sigma_end=0.08, iterations=4, alternate=4)
+CLOSE = RefineWeights(sigma_start=0.06, sigma_end=0.04, iterations=5, alternate=2)
 
 
 class SingleViewSearch:
@@ -65,42 +71,47 @@ class SingleViewSearch:
             progress: called with the fraction done, 0 to 1.
         """
         coarse = CoarseCloud.of(cloud)
-        starts = self._find_starts(cloud, coarse)
-        progress(0.2)
+        found = [(body, True) for body in self._find_starts(cloud, coarse)]
+        progress(0.3)
 
-        def improve(start: tuple[BodyState, np.random.Generator]) -> tuple[float, BodyState]:
-            body = self._improve_limbs(start[0], cloud, coarse, start[1])
-            body = self._refine(body, cloud, _final_weights(cloud, steps))
-            return self._bank.cost(body, coarse), body
+        def improve(start: tuple[tuple[BodyState, bool], np.random.Generator]) -> tuple[BodyState, bool]:
+            (body, changed), own = start
+            return self._improve_limbs(body, cloud, coarse, own) if changed else (body, False)
 
-        found = parallel_map(improve, list(zip(starts, rng.spawn(len(starts)), strict=True)), self._threads)
+        for number, kept in enumerate(KEPT):
+            pairs = zip(found[:kept], rng.spawn(kept), strict=False)
+            found = sorted(
+                parallel_map(improve, list(pairs), self._threads), key=lambda pair: self._bank.cost(pair[0], coarse)
+            )
+            progress(0.3 + 0.5 * (number + 1) / len(KEPT))
+        weights = _final_weights(cloud, steps)
+        bodies = parallel_map(lambda pair: self._refine(pair[0], cloud, weights), found[:FINISHED], self._threads)
         progress(1.0)
-        return min(found, key=lambda pair: pair[0])[1]
+        return min(bodies, key=lambda body: self._bank.cost(body, coarse))
 
     def _find_starts(self, cloud: SingleViewCloud, coarse: CoarseCloud) -> list[BodyState]:
-        """Return the best of the bank's bodies after a few steps of Gauss-Newton."""
-        best = self._bank.find_best(coarse, STARTS)
-        bodies = parallel_map(lambda body: self._refine(body, cloud, ROUGH), best, self._threads)
-        return sorted(bodies, key=lambda body: self._bank.cost(body, coarse))[:KEPT_STARTS]
+        """Return the bank's best bodies after a few steps of Gauss-Newton, the best first."""
+        bodies = self._bank.find_best(coarse, STARTS)
+        for weights, kept in ((FIRST, KEPT_STARTS), (SECOND, KEPT[0])):
+            refine = partial(self._refine, cloud=cloud, weights=weights)
+            bodies = parallel_map(refine, bodies, self._threads)
+            bodies = sorted(bodies, key=lambda body: self._bank.cost(body, coarse))[:kept]
+        return bodies
 
     def _improve_limbs(
         self, body: BodyState, cloud: SingleViewCloud, coarse: CoarseCloud, rng: np.random.Generator
-    ) -> BodyState:
-        """Sample every limb again and keep what is better after Gauss-Newton, until nothing is."""
-        cost = self._bank.cost(body, coarse)
-        for _ in range(MAX_LIMB_ROUNDS):
-            changed = False
-            for limb in self._limbs:
-                proposed = self._resample_limb(body, limb, coarse, cost + MAX_COST_INCREASE_M, rng)
-                if proposed is None:
-                    continue
-                proposed = self._refine(proposed, cloud, CLOSE)
-                new_cost = self._bank.cost(proposed, coarse)
-                if new_cost < cost:
-                    body, cost, changed = proposed, new_cost, True
-            if not changed:
-                break
-        return body
+    ) -> tuple[BodyState, bool]:
+        """Sample every limb again and keep what is better after Gauss-Newton; return also whether anything is."""
+        cost, changed = self._bank.cost(body, coarse), False
+        for limb in self._limbs:
+            proposed = self._resample_limb(body, limb, coarse, cost + MAX_COST_INCREASE_M, rng)
+            if proposed is None:
+                continue
+            proposed = self._refine(proposed, cloud, CLOSE)
+            new_cost = self._bank.cost(proposed, coarse)
+            if new_cost < cost:
+                body, cost, changed = proposed, new_cost, True
+        return body, changed
 
     def _resample_limb(
         self, body: BodyState, limb: tuple[int, ...], coarse: CoarseCloud, max_cost: float, rng: np.random.Generator

@@ -119,8 +119,10 @@ class GaussNewton:
         equations = self._equations
         posed = equations.pose_points(state)
         hessian, gradient = system = np.zeros((equations.size, equations.size)), np.zeros(equations.size)
-        for term in terms:
-            equations.add_surface(term(posed.vertices, sigma), posed, state.rotation, system)
+        if terms:
+            # Their sum once, because to add a quadratic to the system takes ten times as long as to add two of them.
+            surface = [term(posed.vertices, sigma) for term in terms]
+            equations.add_surface(VertexQuadratic.sum(surface), posed, state.rotation, system)
         self._add_joints(targets, JOINT_WIDTH_FACTOR * sigma, posed, state.rotation, system)
         equations.add_stitching(weights.stitch, posed, state.rotation, system)
         equations.add_joint_prior(weights.pairwise, state, system)

@@ -9,16 +9,23 @@ from pathlib import Path
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.scans.obj_off import read_obj, read_off
-from flowing_puppet_ros.body.scans.pcd import read_viewpoint
-from flowing_puppet_ros.body.scans.ply import read_ply
-from flowing_puppet_ros.body.scans.tables import TEXT_SUFFIXES, read_lidar_scan, read_numpy, read_text_table
+from flowing_puppet_ros.body.scans.formats.gltf import read_gltf
+from flowing_puppet_ros.body.scans.formats.obj_off import read_obj, read_off
+from flowing_puppet_ros.body.scans.formats.pcd import read_pcd
+from flowing_puppet_ros.body.scans.formats.ply import read_ply
+from flowing_puppet_ros.body.scans.formats.stl import read_stl
+from flowing_puppet_ros.body.scans.formats.tables import read_lidar_scan, read_numpy, read_text_table
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.extras import import_extra
 
-SCAN_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".pcd", ".xyz", ".npy", ".npz", ".asc", ".pts")
+SCAN_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb", ".gltf", ".pcd", ".xyz", ".npy", ".npz", ".asc", ".pts")
 SUFFIXES = (*SCAN_SUFFIXES, ".txt", ".csv", ".bin")
 """Suffixes that are read; in a folder only `SCAN_SUFFIXES`, since the others may be anything."""
+MESH_READERS = {".obj": read_obj, ".off": read_off, ".stl": read_stl, ".glb": read_gltf, ".gltf": read_gltf}
+"""Readers of vertices and triangles by suffix."""
+PACKED = {
+    ".gz": "gunzip -k", ".zip": "unzip", ".bz2": "bunzip2 -k", ".xz": "unxz -k", ".zst": "unzstd", ".lz4": "unlz4",
+}  # fmt: skip
+LFS_POINTER = b"version https://git-lfs"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,16 +79,16 @@ def read_scan(path: Path) -> Scan:
     if not path.is_file():
         raise InputError(f"{path} does not exist or is not a file; give a mesh or cloud ({' '.join(SUFFIXES)})")
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(
-            f"{path} ends in {suffix or 'nothing'}, which is none of {' '.join(SUFFIXES)}; convert it first"
-        )
+    _refuse_other_files(path)
     if suffix in (".npy", ".npz"):
         vertices, normals, triangles = read_numpy(path)
         scan = Scan(vertices, triangles, None if normals is None else _normalise(normals))
-    elif suffix in (".obj", ".off"):
-        vertices, faces = (read_obj if suffix == ".obj" else read_off)(path)
+    elif suffix in MESH_READERS:
+        vertices, faces = MESH_READERS[suffix](path)
         scan = Scan(vertices, faces if len(faces) else None)
+    elif suffix == ".pcd":
+        cloud = read_pcd(path)
+        scan = Scan(cloud.points, None, _normalise_known(cloud.points, cloud.normals), cloud.viewpoint)
     elif suffix == ".ply":
         vertices, normals, faces = read_ply(path)
         scan = (
@@ -89,11 +96,9 @@ def read_scan(path: Path) -> Scan:
             if len(faces)
             else Scan(vertices, None, None if normals is None else _normalise(normals))
         )
-    elif suffix == ".bin" or suffix in TEXT_SUFFIXES:
+    else:
         vertices, normals = (read_lidar_scan if suffix == ".bin" else read_text_table)(path)
         scan = Scan(vertices, None, None if normals is None else _normalise(normals))
-    else:
-        scan = _read_open3d(path)
     return _validate(scan, path)
 
 
@@ -104,8 +109,10 @@ def _validate(scan: Scan, path: Path) -> Scan:
     if scan.faces is None:
         if not finite.any():
             raise InputError(f"{path} holds {len(scan.points)} points, none of which is finite; export it again")
-        normals = None if scan.normals is None else scan.normals[finite]
-        return Scan(scan.points[finite], None, normals, scan.viewpoint)
+        points, normals = scan.points[finite], None if scan.normals is None else scan.normals[finite]
+        if not np.ptp(points, axis=0).any():
+            raise InputError(f"{path} holds {len(points)} points, all in the same place; export it again")
+        return Scan(points, None, normals, scan.viewpoint)
     if scan.faces.min() < 0 or scan.faces.max() >= len(scan.points):
         raise InputError(
             f"{path} has a face that names vertex {scan.faces.max()} of {len(scan.points)}; repair the mesh"
@@ -135,21 +142,32 @@ def _orient_outward(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return faces if (np.cross(a, b) * c).sum() >= 0 else faces[:, ::-1].copy()
 
 
-def _read_open3d(path: Path) -> Scan:
-    o3d = import_extra("open3d", "scans", f"{path.suffix} of {path.name}")
+def _refuse_other_files(path: Path) -> None:
+    """Raise InputError when a file is of a kind that is not read."""
+    suffix = path.suffix.lower()
+    if suffix in PACKED:
+        raise InputError(f"{path} is packed; unpack it first: {PACKED[suffix]} {path}")
+    if suffix not in SUFFIXES:
+        raise InputError(
+            f"{path} ends in {suffix or 'nothing'}, which is none of {' '.join(SUFFIXES)}; convert it first, for"
+            " example with CloudCompare or MeshLab to .ply"
+        )
+    with path.open("rb") as file:
+        if file.read(len(LFS_POINTER)) == LFS_POINTER:
+            raise InputError(f"{path} is only a pointer to a file of Git LFS; get the file itself: git lfs pull")
 
-    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
-    if path.suffix.lower() != ".pcd":
-        mesh = o3d.io.read_triangle_mesh(path)
-        if len(mesh.triangles):
-            return Scan(np.asarray(mesh.vertices).copy(), np.asarray(mesh.triangles).astype(np.int64))
-    cloud = o3d.io.read_point_cloud(path)
-    return Scan(
-        np.asarray(cloud.points).copy(),
-        None,
-        _normalise(np.asarray(cloud.normals)) if cloud.has_normals() else None,
-        read_viewpoint(path) if path.suffix.lower() == ".pcd" else None,
-    )
+
+def _normalise_known(points: np.ndarray, normals: np.ndarray | None) -> np.ndarray | None:
+    """Return the unit normals (N, 3) where points are finite, or None when one of these is missing."""
+    if normals is None:
+        return None
+    known = np.isfinite(points).all(axis=1)
+    unit = _normalise(normals[known])
+    if unit is None:
+        return None
+    filled = np.zeros_like(points)
+    filled[known] = unit
+    return filled
 
 
 def _normalise(normals: np.ndarray) -> np.ndarray | None:

@@ -26,6 +26,7 @@ MIN_CONVEX_MAJORITY = 0.12
 MIN_THICKNESS = 0.01  # thickness, in longest sides, of a cloud that is not flat
 MIN_SAME_COSINE = np.cos(np.radians(40.0))
 """Cosine of the angle between a named place and the estimated one up to which the named one is believed."""
+MIN_DISTANCE = 0.05  # of a sensor from the cloud's box, in longest sides of it
 VIEW_EXTENTS = 2.5  # longest sides of the cloud at which the sensor is supposed
 
 
@@ -59,7 +60,7 @@ def estimate_viewpoint(points: np.ndarray) -> np.ndarray | None:
     spread = np.random.default_rng(0).permutation(len(points))[:FAST_POINTS]
     chosen = points[spread] - middle
     longest = float(np.ptp(chosen, axis=0).max())
-    if np.linalg.svd(chosen, compute_uv=False)[2] < MIN_THICKNESS * longest * np.sqrt(len(chosen)):
+    if not longest or np.linalg.svd(chosen, compute_uv=False)[2] < MIN_THICKNESS * longest * np.sqrt(len(chosen)):
         return None
     directions = _spread_half_sphere(DIRECTIONS)
     ratio = _depth_ratios(chosen, directions)
@@ -115,7 +116,9 @@ def _cosine(middle: np.ndarray, first: np.ndarray, second: np.ndarray) -> float:
 
 
 def _is_outside(points: np.ndarray, place: np.ndarray) -> bool:
-    return bool(np.any((points.min(axis=0) > place) | (points.max(axis=0) < place)))
+    """Return whether a sensor can stand at a place: outside of the cloud's box, and not on its border."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    return bool(np.max([low - place, place - high]) > MIN_DISTANCE * np.max(high - low))
 
 
 def _depth_ratios(points: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -59,12 +59,9 @@ def particles_to_state(model: StitchedPuppet, groups: list[Particles], pick: np.
 
 def states_to_particles(model: StitchedPuppet, states: list[BodyState]) -> list[Particles]:
     """Return the particles of each part, one for every body."""
+    arrays = [np.stack([getattr(state, name) for state in states]) for name in ("center", "rotation", "pose", "shape")]
+    center, rotation, pose, shape = arrays
     return [
-        Particles(
-            np.stack([state.center[part] for state in states]),
-            np.stack([state.rotation[part] for state in states]),
-            np.stack([state.pose[part, : model.pose_count(part)] for state in states]),
-            np.stack([state.shape[part] for state in states]),
-        )
+        Particles(center[:, part], rotation[:, part], pose[:, part, : model.pose_count(part)], shape[:, part])
         for part in range(len(model.tree))
     ]

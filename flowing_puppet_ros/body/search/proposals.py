@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.body.search.energy import ScoredParticles
-from flowing_puppet_ros.body.search.part_points import PartPoints
+from flowing_puppet_ros.body.search.part_points import PartPoints, PointSet
 from flowing_puppet_ros.body.search.particles import Particles
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.gaussian import Gaussian
@@ -36,10 +36,7 @@ class Conditional:
     @classmethod
     def of(cls, joint: Gaussian, kept: np.ndarray, given: np.ndarray) -> Conditional:
         """Prepare p(kept | given); variables in neither are marginalised out."""
-        zero = joint.condition(kept, given, np.zeros(len(given)))
-        gain = np.stack([joint.condition(kept, given, row).mean - zero.mean for row in np.eye(len(given))], axis=1)
-        values, axes = np.linalg.eigh(zero.covariance)
-        return cls(zero.mean, gain, axes * np.sqrt(np.maximum(values, 0.0)))
+        return cls(*joint.make_conditional(kept, given))
 
     def sample(self, rng: np.random.Generator, values: np.ndarray) -> np.ndarray:
         """Draw one sample (n, kept) for every row of `values` (n, given)."""
@@ -55,6 +52,8 @@ class Proposer:
         self._points = points
         self._neighbours = [np.array(model.tree.neighbours(part)) for part in range(len(model.tree))]
         self._deformation: dict[tuple[int, int], tuple[Conditional, Conditional]] = {}
+        # The weighted mean of an edge's interface points, as each of its two parts moves it.
+        self._middles: dict[tuple[int, int], PointSet] = {}
         for edge, (parent, child) in enumerate(model.tree.edges):
             relative = np.arange(3)
             of_parent = 3 + np.arange(model.pose_count(parent))
@@ -63,6 +62,8 @@ class Proposer:
                 (child, of_child, parent, of_parent),
                 (parent, of_parent, child, of_child),
             ):
+                weight = model.interfaces[edge].weight[None] / model.interfaces[edge].weight.sum()
+                self._middles[part, edge] = points[part].interfaces[edge].blend(weight, np.zeros((1, 3)))
                 self._deformation[part, other] = (
                     Conditional.of(model.pairwise[edge], kept, given),
                     Conditional.of(model.pairwise[edge], kept, np.concatenate([relative, given])),
@@ -118,15 +119,45 @@ class Proposer:
             shape: (S,) intrinsic shape of the new ones.
             rng: source of all randomness.
         """
-        edge, above = part - 1, self._model.tree.parents[part]
+        edge = part - 1
         relative = rng.uniform(self._model.limit_low[edge], self._model.limit_high[edge], (len(parent), 3))
+        return self._attach(part, parent, relative, shape, rng)
+
+    def attach_likely(self, part: int, parent: Particles, shape: np.ndarray, rng: np.random.Generator) -> Particles:
+        """Attach a part like `attach_to_parent`, but with rotations drawn from the joint's Gaussian (Eq. 49)."""
+        edge = part - 1
+        joint = self._model.pairwise[edge]
+        drawn = rng.multivariate_normal(joint.mean[:3], joint.covariance[:3, :3], len(parent), method="cholesky")
+        relative = np.clip(drawn, self._model.limit_low[edge], self._model.limit_high[edge])
+        return self._attach(part, parent, relative, shape, rng)
+
+    def point_to(self, part: int, particles: Particles, joint: int, target: np.ndarray) -> Particles:
+        """Turn a part about where it joins its parent so that its `joint` lies towards `target` (P, 3) m, if finite."""
+        points, known = self._points[part], np.isfinite(target).all(axis=1)
+        weight = self._model.interfaces[part - 1].weight
+        near = np.average(points.interfaces[part - 1].to_world(particles), axis=1, weights=weight)
+        number = int(np.flatnonzero(points.joint_index == joint)[0])
+        turn = _turn_between(points.joints.to_world(particles)[:, number] - near, np.where(known[:, None], target, 0) - near)
+        turn[~known] = np.eye(3)
+        center = near + (turn @ (particles.center - near)[:, :, None])[:, :, 0]
+        return Particles(center, turn @ particles.rotation, particles.pose, particles.shape)
+
+    def find_joints(self, part: int, particles: Particles) -> tuple[np.ndarray, np.ndarray]:
+        """Return the indices (M,) of the joints that a part determines alone, and their places (P, M, 3), metres."""
+        points = self._points[part]
+        return points.joint_index, points.joints.to_world(particles)
+
+    def _attach(
+        self, part: int, parent: Particles, relative: np.ndarray, shape: np.ndarray, rng: np.random.Generator
+    ) -> Particles:
+        """Attach a part to its parent's particles, turned by rotation vectors `relative` (P, 3) in their frames."""
+        edge, above = part - 1, self._model.tree.parents[part]
         sampled = self._deformation[part, above][1].sample(rng, np.concatenate([relative, parent.pose], axis=1))
         pose, shapes = np.clip(sampled, -MAX_DEVIATIONS, MAX_DEVIATIONS), np.tile(shape, (len(parent), 1))
         rotation = parent.rotation @ so3.exp(relative)
-        weight = self._model.interfaces[edge].weight
-        target = np.average(self._points[above].interfaces[edge].to_world(parent), axis=1, weights=weight)
-        own = np.average(self._points[part].interfaces[edge].deform(pose, shapes), axis=1, weights=weight)
-        return Particles(target - (rotation @ own[:, :, None])[:, :, 0], rotation, pose, shapes)
+        target = self._middles[above, edge].to_world(parent)[:, 0]
+        own = self._middles[part, edge].deform(pose, shapes)
+        return Particles(target - (rotation @ own.transpose(0, 2, 1))[:, :, 0], rotation, pose, shapes)
 
     def _stitch_to_neighbour(
         self, part: int, other: int, source: ScoredParticles, rng: np.random.Generator
@@ -147,3 +178,12 @@ class Proposer:
         weight = self._model.interfaces[edge].weight
         rotation, center = so3.procrustes(local, source.interfaces[edge], weight)
         return Particles(center, rotation, pose, given.shape)
+
+
+def _turn_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the rotations (P, 3, 3) by the smallest angles that take the directions of a (P, 3) to those of b (P, 3)."""
+    a, b = (side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12) for side in (a, b))
+    axis = np.cross(a, b)
+    sine = np.linalg.norm(axis, axis=1)
+    angle = np.arctan2(sine, (a * b).sum(axis=1))
+    return so3.exp(axis * (angle / np.maximum(sine, 1e-12))[:, None])

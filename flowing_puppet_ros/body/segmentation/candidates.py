@@ -8,14 +8,17 @@ each point to the nearest head. Walls stay, as they tell what is beside a person
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter
+from numba import njit
 from scipy.spatial import cKDTree
 
+from flowing_puppet_ros.body.segmentation.column_index import ColumnIndex
 from flowing_puppet_ros.body.segmentation.floor_grid import FloorGrid
+from flowing_puppet_ros.body.segmentation.head_columns import MIN_UPPER_M, find_columns
 from flowing_puppet_ros.body.segmentation.linkage import link_points, thin_points
 from flowing_puppet_ros.body.segmentation.people import assign_to_known
 
@@ -23,9 +26,6 @@ HEIGHT_LIMITS_M = (0.12, 2.2)  # over the floor, of points that may be a person'
 TOP_LIMITS_M = (1.05, 2.1)  # over the floor, of the topmost point of a person
 MIN_VISIBLE_HEIGHT_M = 0.35
 MAX_PERSON_WIDTH_M, COLUMN_RADIUS_M = 1.25, 0.42
-MIN_UPPER_M, MODE_WIDTH_M = 0.9, 0.28  # height of upper bodies, and width of the window of their densest columns
-PEAK_CELL_M, PEAK_RADIUS_CELLS = 0.1, 2
-MIN_PEAK_GAP_M = 0.3  # between two columns
 OVERHEAD_RADIUS_M, OVERHEAD_LIMITS_M, MAX_OVERHEAD_SHARE = 0.25, (0.1, 0.45), 0.1
 """Radius about a column and heights over its top at which a wall or a post goes on, and how many points may lie there
 for each of the column's own; a ceiling is higher."""
@@ -55,17 +55,19 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneHeights:
-    """A scene's points (N, 3) m with their height (N,) over the floor and the `floor` itself."""
+    """A scene's points (N, 3) m with their height (N,) over the floor, the `floor` itself, and an `index` of them."""
 
     points: np.ndarray
     height: np.ndarray
     floor: FloorGrid
+    index: ColumnIndex
 
     @classmethod
     def of(cls, points: np.ndarray) -> SceneHeights:
         """Find the floor of a scene with N > 0 finite points."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
         floor = FloorGrid.find(points)
-        return cls(points, floor.height(points), floor)
+        return cls(points, floor.height(points), floor, ColumnIndex.of(points))
 
 
 def find_candidates(
@@ -87,99 +89,120 @@ def find_candidates(
         return [], {}
     thin, voxel = thin_points(np.column_stack([scene.points[rows, :2], scene.height[rows]]))
     label = link_points(thin, np.linalg.norm(thin[:, :2] - viewpoint[:2], axis=1))
-    weight, by_voxel = np.bincount(voxel), _group(voxel)
+    weight = np.bincount(voxel)
+    members = _VoxelRows(rows[np.argsort(voxel, kind="stable")], np.append(0, np.cumsum(weight)))
     owned: dict[int, np.ndarray] = {}
     if known:
-        places = (
-            thin
-            + np.array([0.0, 0.0, 1.0])
-            * (scene.points[rows, 2] - scene.height[rows])[np.array([members[0] for members in by_voxel])][:, None]
-        )
+        places = thin.copy()
+        first = members.rows[members.first[:-1]]
+        places[:, 2] += scene.points[first, 2] - scene.height[first]
         new_labels = label.max() + 1
         label = assign_to_known(places, label, known, frozenset())
         for owner in np.unique(label[label >= new_labels]):
-            members = np.flatnonzero(label == owner)
-            owned[int(owner - new_labels)] = np.sort(rows[np.concatenate([by_voxel[v] for v in members])])
+            owned[int(owner - new_labels)] = members.gather(np.flatnonzero(label == owner))
         label[label >= new_labels] = -1
-    groups: list[tuple[np.ndarray, bool]] = []
-    for members in _group(label):
-        if label[members[0]] < 0:
-            continue
-        if weight[members].sum() < min_points or thin[members, 2].max() < TOP_LIMITS_M[0]:
-            continue
+    groups = [group for cluster in _list_clusters(thin, label, weight, min_points) for group in cluster]
+    found = [_make_candidate(scene, members.gather(chosen), whole, min_points) for chosen, whole in groups]
+    return _filter_by_surroundings([candidate for candidate in found if candidate is not None], scene), owned
+
+
+class _VoxelRows(NamedTuple):
+    """The `rows` of a scene by voxel, and the `first` of each voxel in them."""
+
+    rows: np.ndarray
+    first: np.ndarray
+
+    def gather(self, voxels: np.ndarray) -> np.ndarray:
+        """Return the rows (N,) in some voxels (V,), ascending."""
+        return np.sort(_gather(self.rows, self.first, voxels))
+
+
+def _list_clusters(
+    thin: np.ndarray, label: np.ndarray, weight: np.ndarray, min_points: int
+) -> Iterator[list[tuple[np.ndarray, bool]]]:
+    """Yield for each cluster of voxels (M, 3) that may hold people the voxels of its groups, and whether it is all."""
+    order = np.argsort(label, kind="stable")
+    starts = np.append(np.flatnonzero(np.diff(label[order], prepend=-2)), len(order))
+    tops, sizes = np.maximum.reduceat(thin[order, 2], starts[:-1]), np.add.reduceat(weight[order], starts[:-1])
+    large = (tops >= TOP_LIMITS_M[0]) & (sizes >= min_points) & (label[order[starts[:-1]]] >= 0)
+    for number in np.flatnonzero(large):
+        members = order[starts[number] : starts[number + 1]]
+        groups = []
         small = bool(np.hypot(*np.ptp(thin[members, :2], axis=0)) < MAX_PERSON_WIDTH_M)
-        peaks = _find_columns(thin[members], weight[members])
+        peaks = find_columns(thin[members], weight[members])
         if small:
             groups.append((members, True))
-        if not small or len(peaks) > 1:
-            distance, owner = cKDTree(peaks).query(thin[members, :2]) if len(peaks) else (np.empty(0), np.empty(0))
-            groups += [
-                (members[(owner == number) & (distance < COLUMN_RADIUS_M)], False) for number in range(len(peaks))
-            ]
-    found = [_make_candidate(scene, rows, by_voxel, members, whole) for members, whole in groups if len(members)]
-    return _filter_by_surroundings([c for c in found if c is not None and len(c.rows) >= min_points], scene), owned
+        if len(peaks) > small:
+            distance, owner = cKDTree(peaks).query(thin[members, :2], distance_upper_bound=COLUMN_RADIUS_M)
+            near = np.flatnonzero(distance < COLUMN_RADIUS_M)
+            near = near[np.argsort(owner[near], kind="stable")]
+            cuts = np.flatnonzero(np.diff(owner[near])) + 1
+            groups += [(members[column], False) for column in np.split(near, cuts) if len(column)]
+        yield groups
 
 
-def _make_candidate(
-    scene: SceneHeights, rows: np.ndarray, by_voxel: list[np.ndarray], members: np.ndarray, whole: bool
-) -> Candidate | None:
-    chosen = np.sort(rows[np.concatenate([by_voxel[voxel] for voxel in members])])
-    height = scene.height[chosen]
-    top = float(height.max())
-    if not TOP_LIMITS_M[0] < top < TOP_LIMITS_M[1] or top - height.min() < MIN_VISIBLE_HEIGHT_M:
+def _make_candidate(scene: SceneHeights, rows: np.ndarray, whole: bool, min_points: int) -> Candidate | None:
+    """Make a candidate of rows (N,), unless it is too small or its top is not where people's are."""
+    if len(rows) < min_points:
         return None
-    middle = np.median(scene.points[chosen, :2], axis=0)
-    return Candidate(chosen, middle, scene.floor.locate(*middle), top, whole)
-
-
-def _find_columns(points: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Return places (K, 2) of heads and of the densest upper bodies in a cluster of points (M, 3): x, y, height."""
-    upper = np.flatnonzero(points[:, 2] > MIN_UPPER_M)
-    if not len(upper):
-        return np.empty((0, 2))
-    low = points[upper, :2].min(axis=0) - 5 * PEAK_CELL_M
-    cell = np.floor((points[upper, :2] - low) / PEAK_CELL_M).astype(np.int64)
-    shape = tuple(cell.max(axis=0) + 6)
-    tops = np.zeros(shape)
-    np.maximum.at(tops, tuple(cell.T), points[upper, 2])
-    size = 2 * PEAK_RADIUS_CELLS + 1
-    is_head = (tops > 0) & (tops >= maximum_filter(tops, size=size) - 1e-9)
-    density = np.zeros(shape)
-    np.add.at(density, tuple(cell.T), np.sqrt(weight[upper]))
-    density = gaussian_filter(density, MODE_WIDTH_M / 2 / PEAK_CELL_M, mode="constant")
-    is_mode = (density > 0.2) & (density >= maximum_filter(density, size=size) - 1e-12) & (density > 0)
-    heads, modes = np.argwhere(is_head), np.argwhere(is_mode)
-    order = np.argsort(-tops[tuple(heads.T)], kind="stable")
-    kept: list[np.ndarray] = []
-    for place in (*heads[order], *modes):
-        middle = low + PEAK_CELL_M * (place + 0.5)
-        if all(np.hypot(*(middle - other)) > MIN_PEAK_GAP_M for other in kept):
-            kept.append(middle)
-    return np.array(kept).reshape(-1, 2)
+    low, top = _find_ends(scene.height, rows)
+    if not TOP_LIMITS_M[0] < top < TOP_LIMITS_M[1] or top - low < MIN_VISIBLE_HEIGHT_M:
+        return None
+    middle = _find_middle(scene.points, rows)
+    return Candidate(rows, middle, scene.floor.locate(*middle), top, whole)
 
 
 def _filter_by_surroundings(candidates: list[Candidate], scene: SceneHeights) -> list[Candidate]:
     """Drop the candidates that go on above a head's height, or that are a small part of something long."""
-    if not candidates:
-        return []
-    tree = cKDTree(scene.points[:, :2])
     kept = []
     for candidate in candidates:
         trunk = candidate.rows[scene.height[candidate.rows] > MIN_UPPER_M]
-        middle = np.median(scene.points[trunk if len(trunk) else candidate.rows, :2], axis=0)
-        near = np.array(tree.query_ball_point(middle, CONTEXT_RING_M[1]), dtype=np.int64)
-        height = scene.height[near]
-        away = np.hypot(*(scene.points[near, :2] - middle).T)
-        over = height - candidate.top
-        overhead = np.sum((away < OVERHEAD_RADIUS_M) & (over > OVERHEAD_LIMITS_M[0]) & (over < OVERHEAD_LIMITS_M[1]))
-        trunk_height = (height > MIN_UPPER_M) & (height < HEIGHT_LIMITS_M[1])
-        ring = np.sum(trunk_height & (away > CONTEXT_RING_M[0]))
+        middle = _find_middle(scene.points, trunk if len(trunk) else candidate.rows)
+        near, away = scene.index.find_near(scene.points, middle, CONTEXT_RING_M[1])
+        overhead, ring = _count_surroundings(scene.height, near, away, candidate.top)
         if overhead <= MAX_OVERHEAD_SHARE * len(candidate.rows) and ring <= MAX_COLUMN_CONTEXT * max(len(trunk), 1):
             kept.append(candidate)
     return kept
 
 
-def _group(label: np.ndarray) -> list[np.ndarray]:
-    """Return the indices of each label."""
-    order = np.argsort(label, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(label) else []
+@njit(cache=True, nogil=True)
+def _find_ends(height, rows):  # type: ignore[no-untyped-def]
+    low, high = np.inf, -np.inf
+    for row in rows:
+        low, high = min(low, height[row]), max(high, height[row])
+    return low, high
+
+
+@njit(cache=True, nogil=True)
+def _find_middle(points, rows):  # type: ignore[no-untyped-def]
+    """Return the median (2,) of x and of y."""
+    middle, values = np.empty(2), np.empty(len(rows))
+    for axis in range(2):
+        for k in range(len(rows)):
+            values[k] = points[rows[k], axis]
+        middle[axis] = np.median(values)
+    return middle
+
+
+@njit(cache=True, nogil=True)
+def _count_surroundings(height, near, away, top):  # type: ignore[no-untyped-def]
+    """Return how many of the points `near` lie over a candidate's head, and in its ring at the height of a trunk."""
+    overhead, ring = 0, 0
+    for k in range(len(near)):
+        over = height[near[k]] - top
+        overhead += away[k] < OVERHEAD_RADIUS_M and OVERHEAD_LIMITS_M[0] < over < OVERHEAD_LIMITS_M[1]
+        ring += away[k] > CONTEXT_RING_M[0] and MIN_UPPER_M < height[near[k]] < HEIGHT_LIMITS_M[1]
+    return overhead, ring
+
+
+@njit(cache=True, nogil=True)
+def _gather(rows, first, voxels):  # type: ignore[no-untyped-def]
+    room = 0
+    for voxel in voxels:
+        room += first[voxel + 1] - first[voxel]
+    found, count = np.empty(room, np.int64), 0
+    for voxel in voxels:
+        for k in range(first[voxel], first[voxel + 1]):
+            found[count] = rows[k]
+            count += 1
+    return found

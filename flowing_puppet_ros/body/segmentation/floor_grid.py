@@ -9,6 +9,8 @@ import numpy as np
 from numba import njit
 from scipy.ndimage import gaussian_filter
 
+from flowing_puppet_ros.body.segmentation.column_index import sort_into_cells
+
 CELL_M, MAX_CELLS = 1.0, 200  # edge of a cell; cells a side, so that the grid ends there
 LOW_SHARE = 0.03
 """Share of a cell's points that may lie below its floor: reflections and noise."""
@@ -54,17 +56,26 @@ class FloorGrid:
 
 def _find_lowest(points: np.ndarray, low: np.ndarray, shape: np.ndarray) -> np.ndarray:
     """Return a low percentile (W, D) of z in each cell, NaN where too few points are."""
-    place = np.floor((points[:, :2] - low) / CELL_M).astype(np.int64)
-    inside = ((place >= 0) & (place < shape)).all(axis=1)
-    number, z = (place[inside, 0] * shape[1] + place[inside, 1]), points[inside, 2]
-    # Sorted by NumPy: the order within a cell decides, and must not depend on how a kernel was compiled.
-    z = z[np.lexsort((z, number))]
-    count = np.bincount(number, minlength=int(shape[0] * shape[1]))
-    first = np.cumsum(count) - count
-    enough = count >= MIN_CELL_POINTS
-    lowest = np.full(len(count), np.nan)
-    lowest[enough] = z[first[enough] + (LOW_SHARE * count[enough]).astype(np.int64)]
-    return lowest.reshape(int(shape[0]), int(shape[1]))
+    inside = points
+    beyond = (points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1)
+    if beyond.any():
+        inside = points[~beyond]
+    lowest = _select_lowest(inside, *sort_into_cells(inside, low, shape, CELL_M))
+    return np.asarray(lowest.reshape(int(shape[0]), int(shape[1])))
+
+
+@njit(cache=True, nogil=True)
+def _select_lowest(points, order, first):  # type: ignore[no-untyped-def]
+    lowest = np.full(len(first) - 1, np.nan)
+    for cell in range(len(lowest)):
+        count = first[cell + 1] - first[cell]
+        if count >= MIN_CELL_POINTS:
+            z = np.empty(count)
+            for k in range(count):
+                z[k] = points[order[first[cell] + k], 2]
+            rank = int(LOW_SHARE * count)
+            lowest[cell] = np.partition(z, rank)[rank]
+    return lowest
 
 
 def _fit_plane(lowest: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray) -> np.ndarray:

@@ -8,6 +8,8 @@ from numba import njit
 
 GAP_M, GAP_PER_M, GAP_LIMITS_M = 0.10, 0.012, (0.15, 0.40)
 """Gap between points of one thing: at the sensor, more of it for each metre of distance, and its limits."""
+CELL_M, MAX_GAP_STEP_M = 0.2, 0.005
+"""Width of the columns of the linkage, and by how much the gaps of two points that are joined differ at most."""
 HEIGHT_SCALE = 0.4  # of vertical distances, which joins the rings
 VOXEL_M = (0.07, 0.10)  # edge across and up; points of one voxel are taken for one
 
@@ -36,7 +38,7 @@ def link_points(points: np.ndarray, distance: np.ndarray) -> np.ndarray:
         return np.empty(0, dtype=np.int64)
     gap = np.clip(GAP_M + GAP_PER_M * distance, *GAP_LIMITS_M)
     scaled = points * np.array([1.0, 1.0, HEIGHT_SCALE])
-    return np.unique(_link_in_cells(scaled, gap, GAP_LIMITS_M[1]), return_inverse=True)[1]
+    return np.unique(_link_in_cells(scaled, gap, CELL_M), return_inverse=True)[1]
 
 
 def link_within(points: np.ndarray, gap: float) -> np.ndarray:
@@ -49,14 +51,17 @@ def link_within(points: np.ndarray, gap: float) -> np.ndarray:
 
 
 def _link_in_cells(points: np.ndarray, gap: np.ndarray, width: float) -> np.ndarray:
-    """Return a number (N,) that the points (N, 3) of a cluster share; columns are as wide as the largest `gap` (N,)."""
+    """Return a number (N,) that the points (N, 3) of a cluster share; they lie in columns of a `width`.
+
+    The `gap` (N,) may differ by `MAX_GAP_STEP_M` between points that it joins.
+    """
     low = points[:, :2].min(axis=0)
     cell = ((points[:, :2] - low) / width).astype(np.int64)
-    deep = int(cell[:, 1].max()) + 2
+    deep = int(cell[:, 1].max()) + 1 + 2 * int(np.ceil((gap.max() + MAX_GAP_STEP_M) / width))
     key = cell[:, 0] * deep + cell[:, 1]
     order = np.argsort(key, kind="stable")
     label = np.empty(len(points), dtype=np.int64)
-    label[order] = _link(np.ascontiguousarray(points[order], dtype=np.float64), gap[order], key[order], deep)
+    label[order] = _link(np.ascontiguousarray(points[order], dtype=np.float64), gap[order], key[order], deep, width)
     return label
 
 
@@ -69,26 +74,39 @@ def _find_root(parent: np.ndarray, row: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _link(points: np.ndarray, gap: np.ndarray, key: np.ndarray, deep: int) -> np.ndarray:
+def _link(points: np.ndarray, gap: np.ndarray, key: np.ndarray, deep: int, width: float) -> np.ndarray:
     """Join points, sorted by the `key` of their cell, with those of their own cell and of the neighbours ahead."""
     count = len(points)
     parent = np.arange(count)
-    ahead = np.array([0, 1, deep - 1, deep, deep + 1])
-    for row in range(count):
-        for other_cell in range(5):
-            wanted = key[row] + ahead[other_cell]
-            first = row + 1 if other_cell == 0 else np.searchsorted(key, wanted)
-            for other in range(first, count):
-                if key[other] != wanted:
-                    break
-                limit = max(gap[row], gap[other])
-                dx = points[row, 0] - points[other, 0]
-                dy = points[row, 1] - points[other, 1]
-                dz = points[row, 2] - points[other, 2]
-                if dx * dx + dy * dy + dz * dz < limit * limit:
-                    a, b = _find_root(parent, row), _find_root(parent, other)
-                    if a != b:
-                        parent[max(a, b)] = min(a, b)
+    start = 0
+    while start < count:
+        end, largest = start, 0.0
+        while end < count and key[end] == key[start]:
+            largest = max(largest, gap[end])
+            end += 1
+        reach = int(np.ceil((largest + MAX_GAP_STEP_M) / width))
+        _join(points, gap, parent, start, end, start, end)
+        for ahead in range(reach + 1):
+            first = 1 if ahead == 0 else -reach
+            # The cells of one column lie one after the other.
+            low = np.searchsorted(key, key[start] + ahead * deep + first)
+            high = np.searchsorted(key, key[start] + ahead * deep + reach + 1)
+            _join(points, gap, parent, start, end, low, high)
+        start = end
     for row in range(count):
         parent[row] = _find_root(parent, row)
     return parent
+
+
+@njit(cache=True, nogil=True)
+def _join(points, gap, parent, start, end, low, high):  # type: ignore[no-untyped-def]
+    """Join those of the points from `start` to `end` with those from `low` to `high` that are nearer than the gap."""
+    for row in range(start, end):
+        x, y, z, own = points[row, 0], points[row, 1], points[row, 2], gap[row]
+        for other in range(max(low, row + 1), high):
+            limit = max(own, gap[other])
+            dx, dy, dz = x - points[other, 0], y - points[other, 1], z - points[other, 2]
+            if dx * dx + dy * dy + dz * dz < limit * limit:
+                a, b = _find_root(parent, row), _find_root(parent, other)
+                if a != b:
+                    parent[max(a, b)] = min(a, b)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Track several people through a stream of clouds: each keeps an id while seen and a while beyond.
 
-A full fit takes seconds, a tracked step a fraction of one. So new people, and people who were lost, queue for a full
-fit, one at a time, while everybody else is tracked on.
+A full fit takes seconds, a tracked step a fraction of one. So in a live stream new people, and people who were lost,
+queue for a full fit, one at a time, while everybody else is tracked on. A recording waits: all new people have their
+full fit in the cloud that shows them first.
 """
 
 from __future__ import annotations
@@ -72,6 +73,14 @@ class _BodyTrack:
         self.proven = self.proven or fit.reliable
         return self.proven
 
+    def begin(self, person: PersonCloud, fit: BodyFit | None) -> BodyFit | None:
+        """Return the body as the first of a new person; a doubtful one has its full fit as soon as may be."""
+        if fit is None or self.tracker.last is not None:
+            return None
+        self.tracker.start(person, fit)
+        self.fitted = person.stamp - (0 if fit.reliable else REFIT_INTERVAL_NS)
+        return fit
+
     def show(self, fit: BodyFit) -> TrackedBody:
         """Return its body at the time of the last cloud, with what is known of its motion."""
         return self.motion.add(self.id, self.stamp, fit, self.tracker.hidden)
@@ -89,9 +98,10 @@ class _BodyTrack:
 class MultiBodyTracker:
     """Tracks everybody in the clouds of one sensor.
 
-    In line (the default) the full fit is made in the cloud that needs it, at most one a cloud: the same clouds give
-    the same bodies. On an executor it runs beside the clouds, and catches up with those that came in the meantime
-    before its body is shown: what a live node needs. Which cloud shows it first depends on the time it took.
+    In line (the default) full fits are made in the cloud that needs them, of all new people and of at most one who was
+    fitted before: the same clouds give the same bodies. On an executor one runs beside the clouds, and catches up with
+    those that came in the meantime before its body is shown: what a live node needs. Which cloud shows it first depends
+    on the time it took.
     """
 
     def __init__(
@@ -145,7 +155,8 @@ class MultiBodyTracker:
             stamp: of the cloud in nanoseconds; one before the last restarts the tracker.
             seed: of what is random in this cloud.
             executor: where full fits run; None: in line.
-            first: bodies of new people that are known already, by their index in `people`.
+            first: bodies of new people that are known already, by their index in `people`: on an executor they are
+                shown at once, in line a full fit is made at once.
 
         Returns:
             The bodies of everybody who is seen and has one, in the order of their ids.
@@ -155,12 +166,12 @@ class MultiBodyTracker:
         self._stamp = stamp
         self._adopt_finished_fit()
         matched = self._associate(people, stamp)
-        for track, person in matched:
-            known = next((fit for index, fit in first.items() if people[index] is person), None)
-            if known is not None and track.tracker.last is None:
-                track.tracker.start(person, known)
-                track.fitted = stamp
-        fitted = parallel_map(_track, [(track.tracker, person) for track, person in matched], self._threads)
+        known = {} if executor is None else {id(people[index]): fit for index, fit in first.items()}
+        fitted = parallel_map(
+            lambda pair: pair[0].begin(pair[1], known.get(id(pair[1]))) or _track((pair[0].tracker, pair[1])),
+            matched,
+            self._threads,
+        )
         bodies: list[TrackedBody] = []
         waiting: list[tuple[_BodyTrack, SeededCloud]] = []
         for (track, person), fit in zip(matched, fitted, strict=True):
@@ -196,11 +207,16 @@ class MultiBodyTracker:
         return named
 
     def _start_fit(self, waiting: list[tuple[_BodyTrack, SeededCloud]], executor: Executor | None) -> list[TrackedBody]:
-        """Start a full fit of the person who needs it most; in line it is finished when this returns."""
+        """Start a full fit of the person who needs it most; in line finish it, or those of all who are new."""
         if not waiting or self._background_fit.busy:
             return []
         # Who has no body comes first, then who was fitted least often, then who has waited longest.
-        track, cloud = min(waiting, key=lambda pair: (pair[0].tracker.last is not None, pair[0].fits, pair[0].number))
+        waiting = sorted(waiting, key=lambda pair: (pair[0].tracker.last is not None, pair[0].fits, pair[0].number))
+        new = [] if executor is not None else [pair for pair in waiting if not pair[0].fits]
+        return [body for pair in new or waiting[:1] for body in self._start_one_fit(*pair, executor)]
+
+    def _start_one_fit(self, track: _BodyTrack, cloud: SeededCloud, executor: Executor | None) -> list[TrackedBody]:
+        """Start a full fit; return the body if it is finished and the first of this person."""
         track.fits, track.fitted = track.fits + 1, cloud.person.stamp
         self._report.counters["searches"] += 1
         known = track.tracker.last
@@ -247,10 +263,13 @@ class MultiBodyTracker:
                 matched[column] = self._start_track(middle, stamp, people[column].proven)
         return [(matched[column], person) for column, person in enumerate(people) if column in matched]
 
-    def _start_track(self, middle: F64, stamp: int, proven: bool) -> _BodyTrack:
+    def make_id(self) -> str:
+        """Return an id that nobody had before."""
         self._started += 1
-        tracker = BodyTracker(self._fitter, self._settings)
-        name = f"{self._prefix}{self._started}"
+        return f"{self._prefix}{self._started}"
+
+    def _start_track(self, middle: F64, stamp: int, proven: bool) -> _BodyTrack:
+        name, tracker = self.make_id(), BodyTracker(self._fitter, self._settings)
         self._tracks.append(_BodyTrack(name, self._started, middle, stamp, tracker, proven=proven))
         return self._tracks[-1]
 

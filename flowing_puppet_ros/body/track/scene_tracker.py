@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +31,8 @@ MAX_HEIGHT_M = 2.6
 """A cloud that is no wider is a person, when nobody can be told from their surroundings in it."""
 _NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
 MAX_NEW_PEOPLE = 3
-"""New people whose bodies are fitted in a cloud of a stream; the others come with the next."""
+"""New people whose bodies are fitted in a cloud of a live stream; the others come with the next. In a recording, which
+waits, so many in a row have to be nobody."""
 MIN_DECIDING_POINTS = 60
 """Points of a person from which on they tell whether people are seen from one side."""
 ONLY_ID = "b1"
@@ -84,10 +85,16 @@ def crop_to_region(points: F64, region: RegionSettings) -> Bools:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneCloud:
-    """A cloud with z up: `points` (N, 3) m, `normals` (N, 3) or None, `stamp` ns.
+    """A cloud with z up.
 
-    `single_view` says that it is known to be seen from one side, from the origin of its frame; `image` is its range
-    image where it is organised, whose pixels are those of the points.
+    Attributes:
+        points: (N, 3) metres, in a frame that is the same for all clouds of a stream.
+        normals: (N, 3) or None.
+        stamp: nanoseconds.
+        single_view: whether it is known to be seen from one side.
+        image: its range image where it is organised, whose pixels are those of the points.
+        viewpoint: (3,) metres, where the sensor is.
+        to_sensor: (3, 3), from this frame to the sensor's own with z up, however the sensor is tilted.
     """
 
     points: F64
@@ -95,6 +102,8 @@ class SceneCloud:
     stamp: int
     single_view: bool = False
     image: RangeImage | None = None
+    viewpoint: F64 = field(default_factory=lambda: np.zeros(3))
+    to_sensor: F64 = field(default_factory=lambda: np.eye(3))
 
     @property
     def whole(self) -> PersonCloud:
@@ -106,15 +115,27 @@ class SceneCloud:
         normals = None if self.normals is None else self.normals[rows]
         return replace(self, points=self.points[rows], normals=normals, image=self.image and self.image.take(rows))
 
+    @property
+    def distance(self) -> F64:
+        """Distance (N,) m of the points from the sensor."""
+        return np.asarray(np.linalg.norm(self.points - self.viewpoint, axis=1))
+
+    def draw_image(self) -> RangeImage:
+        """Return its range image; a scan without order is drawn into one as its sensor is held."""
+        if self.image is not None:
+            return self.image
+        drawn = RangeImage.of_scan((self.points - self.viewpoint) @ self.to_sensor.T, np.zeros(3))
+        return drawn.turn(self.to_sensor.T).move(self.viewpoint)
+
     def with_fields(self, people: Sequence[PersonCloud]) -> list[PersonCloud]:
-        """Return people seen from the origin with what the sensor can know of each.
+        """Return people seen from the viewpoint with what the sensor can know of each.
 
         A scan without order is drawn into an image for that, unless the person is all of it: its own extent says
         nothing about the sensor's.
         """
         image = self.image
         if image is None and any(person.rows is not None for person in people):
-            image = RangeImage.of_scan(self.points, np.zeros(3))
+            image = self.draw_image()
         if image is None:
             return list(people)
         return [
@@ -175,7 +196,7 @@ class SceneTracker:
             return self._tracker.step_one(person, seed, executor), []
         known = self._tracker.predict_bodies(cloud.stamp) if settings.track else ()
         if self._is_one_sided(cloud, remember=True):
-            found = self._find(cloud, known, MAX_NEW_PEOPLE if settings.track else None, settings.track)
+            found = self._find(cloud, known, settings.track, live=executor is not None)
             if not settings.track:
                 fits = {id(body.person): body.fit for body in found}
                 named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
@@ -188,6 +209,14 @@ class SceneTracker:
             return self._tracker.step(people, cloud.stamp, seed, executor), self._tracker.occluded_ids
         named = self._tracker.associate_only(people, cloud.stamp)
         return [TrackedBody(identity, self._fit(person, seed)) for identity, person in named], []
+
+    def step_alone(self, cloud: SceneCloud, seed: int) -> list[TrackedBody]:
+        """Return the bodies of everybody in a cloud that nothing joins to the others of the stream, under new ids."""
+        try:
+            bodies = self.fit_once(cloud, seed)
+        except InputError:  # nobody
+            return []
+        return [replace(body, id=self._tracker.make_id()) for body in bodies]
 
     def fit_once(self, cloud: SceneCloud, seed: int, progress: Progress | None = None) -> list[TrackedBody]:
         """Return the bodies of everybody in a cloud that belongs to no stream; ids count from b1.
@@ -213,7 +242,7 @@ class SceneTracker:
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
         """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
-        return self._find(cloud, (), None, remember=False)
+        return self._find(cloud, (), remember=False)
 
     def fit_found(self, found: Sequence[FoundBody], seed: int, progress: Progress | None = None) -> list[BodyFit]:
         """Return the bodies of people found in a scene, fitted again where that may help, without the doubtful."""
@@ -233,26 +262,36 @@ class SceneTracker:
             return bool(self._single_view) and self._settings.view != "full"
         points = self._in_range(cloud)[1]
         candidates = (
-            find_candidates(SceneHeights.of(points), np.zeros(3), MIN_DECIDING_POINTS)[0] if len(points) else []
+            find_candidates(SceneHeights.of(points), cloud.viewpoint, MIN_DECIDING_POINTS)[0] if len(points) else []
         )
         if not candidates:
             return False
-        single = is_single_view(points[max(candidates, key=lambda candidate: len(candidate.rows)).rows])
+        likeliest = max(candidates, key=lambda candidate: len(candidate.rows))
+        single = is_single_view(points[likeliest.rows] - cloud.viewpoint)
         if remember:
             self._single_view = single
         return single
 
     def _in_range(self, cloud: SceneCloud) -> tuple[I64, F64]:
-        """Return the rows of the points that are finite and in range of the sensor at the origin, and the points."""
-        near = np.linalg.norm(cloud.points, axis=1) < self._settings.segmentation.max_range
+        """Return the rows of the points that are finite and in range of the sensor, and the points."""
+        near = cloud.distance < self._settings.segmentation.max_range
         rows = np.flatnonzero(near)
         return rows, np.asarray(cloud.points[rows], dtype=np.float64)
 
-    def _find(self, cloud: SceneCloud, known: Sequence[F64], max_fits: int | None, remember: bool) -> list[FoundBody]:
-        """Find the people of a single view; the known ones first."""
+    def _find(self, cloud: SceneCloud, known: Sequence[F64], remember: bool, live: bool = False) -> list[FoundBody]:
+        """Find the people of a single view; the known ones first. All, or of a tracked stream the likeliest."""
         rows, points = self._in_range(cloud)
         normals = None if cloud.normals is None else cloud.normals[rows]
-        found = self._finder.find(points, normals, np.zeros(3), cloud.stamp, known, max_fits, remember)
+        found = self._finder.find(
+            points,
+            normals,
+            cloud.viewpoint,
+            cloud.stamp,
+            known,
+            MAX_NEW_PEOPLE if live else None,
+            MAX_NEW_PEOPLE if remember else None,
+            remember,
+        )
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
@@ -279,7 +318,7 @@ class SceneTracker:
         """Raise an InputError when a cloud has no point, or none in range."""
         if not len(cloud.points):
             raise InputError("the cloud has no finite point in the region of interest")
-        distance, limit = np.linalg.norm(cloud.points, axis=1).min(), self._settings.segmentation.max_range
+        distance, limit = cloud.distance.min(), self._settings.segmentation.max_range
         if self._sensor(cloud) is not None and distance > limit:
             raise InputError(
                 f"the nearest point of the cloud is {distance:.3g} m from the origin of its frame, beyond the"
@@ -297,15 +336,15 @@ class SceneTracker:
         )
 
     def _sensor(self, cloud: SceneCloud) -> F64 | None:
-        """Return where the sensor is for the segmentation: at the origin, unless people are seen from all sides."""
+        """Return where the sensor is for the segmentation, unless people are seen from all sides."""
         full = self._settings.view == "full" or (self._settings.view == "auto" and self._single_view is False)
-        return None if full and not cloud.single_view else np.zeros(3)
+        return None if full and not cloud.single_view else cloud.viewpoint
 
     def _with_viewpoint(self, cloud: SceneCloud, people: list[PersonCloud], remember: bool = True) -> list[PersonCloud]:
         """Return the people with the viewpoint for their fits.
 
-        known to be a single view  | the origin
-        setting full or single     | none, or the origin
+        known to be a single view  | the sensor's place
+        setting full or single     | none, or the sensor's place
         auto, decided before       | as before
         auto, not decided          | what the first person's points look like
         """
@@ -313,7 +352,7 @@ class SceneTracker:
             True if cloud.single_view else {"single": True, "full": False}.get(self._settings.view, self._single_view)
         )
         if single is None and people:
-            single = is_single_view(people[0].points)
+            single = is_single_view(people[0].points - cloud.viewpoint)
             if remember:
                 self._single_view = single
-        return cloud.with_fields([replace(person, viewpoint=np.zeros(3)) for person in people]) if single else people
+        return cloud.with_fields([replace(person, viewpoint=cloud.viewpoint) for person in people]) if single else people

@@ -42,12 +42,18 @@ class TrackedBody:
     status: TrackStatus = TrackStatus.NEW
     velocity: F64 = field(default_factory=lambda: np.zeros(3))
 
-    def rotate(self, rotation: F64) -> TrackedBody:
-        """Return it in a frame that is turned by `rotation` (3, 3) about the origin."""
+    def move(self, rotation: F64, translation: F64) -> TrackedBody:
+        """Return it in a frame to which `rotation` (3, 3) and then `translation` (3,) m lead.
+
+        The velocity turns with it, and stays that against the frame in which the person was tracked.
+        """
         fit, state = self.fit, self.fit.state
-        state = replace(state, center=state.center @ rotation.T, rotation=rotation @ state.rotation)
-        turned = replace(fit, state=state, vertices=fit.vertices @ rotation.T, joints=fit.joints @ rotation.T)
-        return replace(self, fit=turned, velocity=rotation @ self.velocity)
+        center, vertices, joints = (
+            points @ rotation.T + translation for points in (state.center, fit.vertices, fit.joints)
+        )
+        state = replace(state, center=center, rotation=rotation @ state.rotation)
+        moved = replace(fit, state=state, vertices=vertices, joints=joints)
+        return replace(self, fit=moved, velocity=rotation @ self.velocity)
 
 
 class TorsoMotion:

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
+from numba import njit
 
 from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights
 
 SLICES_M = (0.15, 0.6, 1.0, 1.4, 2.0)  # heights over the floor between which a candidate is measured
 RING_M, MAX_RADIUS_M = 0.5, 0.95  # of the surroundings
 RING_HEIGHTS_M = (0.12, 0.7, 1.3, 2.2)
+MAX_RING = 5.0  # points of the surroundings for each of the candidate's, beyond which more tell nothing
 OVERHEAD_M = 0.6  # over the top, of what is over a candidate's head
 SHAPE_NAMES = (
     "top", "lowest", "longer", "shorter", "flatness", "whole", "share_inside", "overhead", "head_width", "head_share",
@@ -21,51 +22,66 @@ SHAPE_NAMES = (
 
 def describe_candidates(candidates: list[Candidate], scene: SceneHeights, viewpoint: np.ndarray) -> np.ndarray:
     """Return the numbers (C, len(SHAPE_NAMES)) of candidates in a scene seen from `viewpoint` (3,) m."""
-    if not candidates:
-        return np.empty((0, len(SHAPE_NAMES)))
-    tree = cKDTree(scene.points[:, :2])
-    return np.stack([_describe(candidate, scene, tree, viewpoint) for candidate in candidates])
-
-
-def _describe(candidate: Candidate, scene: SceneHeights, tree: cKDTree, viewpoint: np.ndarray) -> np.ndarray:
-    points, height = scene.points[candidate.rows, :2], scene.height[candidate.rows]
-    middle = np.median(points, axis=0)
-    ahead = middle - viewpoint[:2]
-    ahead = ahead / max(float(np.linalg.norm(ahead)), 1e-9)
-    depth, across = (points - middle) @ ahead, (points - middle) @ np.array([-ahead[1], ahead[0]])
-    centred = points - points.mean(axis=0)
-    longer, shorter = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred / len(points))[::-1], 0.0))
-    near = np.array(tree.query_ball_point(middle, MAX_RADIUS_M), dtype=np.int64)
-    around = scene.height[near]
-    away = np.hypot(*(scene.points[near, :2] - middle).T)
-    column = np.sum((away < RING_M) & (around > SLICES_M[0]) & (around < SLICES_M[-1] + 0.1))
-    overhead = np.sum((away < RING_M) & (around > candidate.top + 0.05) & (around < candidate.top + OVERHEAD_M))
-    head = height > candidate.top - 0.25
-    count = len(points)
-    slices = np.digitize(height, SLICES_M) - 1
-    widths, depths, shares = [], [], []
-    for k in range(len(SLICES_M) - 1):
-        own = slices == k
-        several = np.sum(own) > 2
-        widths.append(float(np.ptp(np.percentile(across[own], (5, 95)))) if several else -0.1)
-        depths.append(float(np.ptp(np.percentile(depth[own], (5, 95)))) if several else -0.1)
-        shares.append(float(np.mean(own)))
-    ring = np.histogram(around[away > RING_M], RING_HEIGHTS_M)[0] / count
-    return np.array(
-        [
-            candidate.top,
-            float(height.min()),
-            longer,
-            shorter,
-            shorter / max(longer, 1e-6),
+    shape = np.empty((len(candidates), len(SHAPE_NAMES)))
+    for row, candidate in enumerate(candidates):
+        near, away = scene.index.find_near(scene.points, candidate.middle, MAX_RADIUS_M)
+        ahead = candidate.middle - viewpoint[:2]
+        _describe(
+            scene.points[candidate.rows],
+            scene.height[candidate.rows],
+            candidate.middle,
+            ahead / max(float(np.linalg.norm(ahead)), 1e-9),
+            scene.height[near],
+            away,
             float(candidate.whole),
-            count / max(column, count),
-            overhead / count,
-            float(np.ptp(across[head])),
-            float(np.mean(head)),
-            *widths,
-            *depths,
-            *shares,
-            *np.minimum(ring, 5.0),
-        ]
-    )
+            shape[row],
+        )
+    return shape
+
+
+@njit(cache=True, nogil=True)
+def _describe(points, height, middle, ahead, around, away, whole, shape):  # type: ignore[no-untyped-def]
+    """Fill `shape` in the order of `SHAPE_NAMES`; `around` and `away` are heights and distances of what is near."""
+    count, top, slices = len(points), height.max(), len(SLICES_M) - 1
+    depth, across = np.empty(count), np.empty(count)
+    for k in range(count):
+        x, y = points[k, 0] - middle[0], points[k, 1] - middle[1]
+        depth[k], across[k] = x * ahead[0] + y * ahead[1], y * ahead[0] - x * ahead[1]
+    a, b, c = np.var(depth), np.var(across), np.mean(depth * across) - depth.mean() * across.mean()
+    half, root = (a + b) / 2, np.sqrt(((a - b) / 2) ** 2 + c**2)
+    shape[0], shape[1] = top, height.min()
+    shape[2], shape[3] = np.sqrt(half + root), np.sqrt(max(half - root, 0.0))
+    shape[4], shape[5] = shape[3] / max(shape[2], 1e-6), whole
+    column, overhead = 0, 0
+    ring = np.zeros(len(RING_HEIGHTS_M) - 1)
+    for k in range(len(around)):
+        if away[k] < RING_M:
+            column += SLICES_M[0] < around[k] < SLICES_M[-1] + 0.1
+            overhead += top + 0.05 < around[k] < top + OVERHEAD_M
+        elif away[k] > RING_M:
+            for level in range(len(ring)):
+                ring[level] += RING_HEIGHTS_M[level] <= around[k] < RING_HEIGHTS_M[level + 1]
+    head = height > top - 0.25
+    shape[6], shape[7] = count / max(column, count), overhead / count
+    shape[8], shape[9] = across[head].max() - across[head].min(), head.mean()
+    for level in range(slices):
+        own = (height >= SLICES_M[level]) & (height < SLICES_M[level + 1])
+        several = own.sum() > 2
+        shape[10 + level] = _measure_spread(across[own]) if several else -0.1
+        shape[10 + slices + level] = _measure_spread(depth[own]) if several else -0.1
+        shape[10 + 2 * slices + level] = own.mean()
+    for level in range(len(ring)):
+        shape[10 + 3 * slices + level] = min(ring[level] / count, MAX_RING)
+
+
+@njit(cache=True, nogil=True)
+def _measure_spread(values):  # type: ignore[no-untyped-def]
+    """Return the distance from the 5th to the 95th percentile."""
+    values = np.sort(values)
+    ends = np.empty(2)
+    for k in range(2):
+        at = (0.05, 0.95)[k] * (len(values) - 1)
+        low = int(at)
+        high = min(low + 1, len(values) - 1)
+        ends[k] = values[low] + (at - low) * (values[high] - values[low])
+    return ends[1] - ends[0]

@@ -132,6 +132,7 @@ class PersonFinder:
         stamp: int,
         known: Sequence[np.ndarray] = (),
         max_fits: int | None = None,
+        max_misses: int | None = None,
         remember: bool = True,
     ) -> list[FoundBody]:
         """Find the people in a scan; the same scans give the same answer.
@@ -143,6 +144,7 @@ class PersonFinder:
             stamp: of the scan in nanoseconds.
             known: points (K, 3) in metres on each body that is expected in the scan, at its predicted position.
             max_fits: bodies that are fitted at most, the likeliest first; None: as set.
+            max_misses: so many fits in a row of which none is a person end it; None: none does.
             remember: whether what is no person is remembered, and what was none is left out.
         """
         self.last_rejected = []
@@ -164,14 +166,18 @@ class PersonFinder:
         taken = [np.asarray(body)[:, :2].mean(axis=0) for body in known if len(body)]
         found: list[tuple[float, Candidate, UprightFit]] = []
         bent: list[Candidate] = []
-        limit = self._settings.max_fits if max_fits is None else max_fits
+        limit, misses = self._settings.max_fits if max_fits is None else max_fits, 0
         for number in chosen[:limit]:
+            if misses == max_misses:
+                break
             candidate = candidates[number]
             judged = self._judge(candidate, float(probability[number]), scene, rays)
+            misses += 1
             if judged is None:
                 continue
             if judged[0] >= self._settings.min_probability:
                 found.append((judged[0], candidate, judged[1]))
+                misses = 0
                 continue
             self._reject(candidate, judged[0], "no upright body explains it", stamp, remember)
             if self._may_be_bent(candidate, scene, float(probability[number])):

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Files of depth images and organised clouds: every point with its pixel and the camera that saw it.
 
-A depth image is a 16-bit PNG or TIFF, or a two-dimensional .npy; its camera comes as `fx,fy,cx,cy` or in a file with
-the fields of a CameraInfo, as `ros2 topic echo --once` prints them or as a calibration's YAML. An organised .pcd, one
-with several rows, tells its camera itself.
+A depth image is a 16-bit PNG, TIFF or PGM, a TIFF or PFM of floats, or a two-dimensional .npy or .npz; its camera comes
+as `fx,fy,cx,cy` or in a file with the fields of a CameraInfo, as `ros2 topic echo --once` prints them or as a
+calibration's YAML. An organised .pcd, one with several rows, tells its camera itself.
 """
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,19 +20,18 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from flowing_puppet_ros.arrays import F64, U8
+from flowing_puppet_ros.body.scans.formats.pcd import read_pcd
 from flowing_puppet_ros.body.scans.unit import UNITS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorProjection
-from flowing_puppet_ros.extras import import_extra
 from flowing_puppet_ros.multiview.camera import Camera
 
-IMAGE_SUFFIXES = (".png", ".tif", ".tiff")
+IMAGE_SUFFIXES = (".png", ".tif", ".tiff", ".pgm", ".pfm", ".exr")
 """Of files that are depth images and nothing else."""
 
 MAX_DEPTH_M = 20.0  # beyond, no camera measures people
 MIN_DEPTHS = 200  # known ones, of an image that may show somebody
-HEADER_BYTES = 4096
 MAX_INFO_BYTES = 1_000_000
 
 
@@ -65,9 +65,9 @@ class DepthView:
 
 
 def is_depth_image(path: Path, has_camera: bool) -> bool:
-    """Return whether a file is read as a depth image: by its suffix or, for .npy, because its camera is given."""
+    """Return whether a file is read as a depth image: by its suffix or, for arrays, because its camera is given."""
     suffix = path.suffix.lower()
-    return suffix in IMAGE_SUFFIXES or (suffix == ".npy" and has_camera)
+    return suffix in IMAGE_SUFFIXES or (suffix in (".npy", ".npz") and has_camera)
 
 
 def read_depth_view(path: Path, intrinsics: str | None, unit: str) -> DepthView:
@@ -81,7 +81,7 @@ def read_depth_view(path: Path, intrinsics: str | None, unit: str) -> DepthView:
     depth = _read_pixels(path)
     height, width = depth.shape
     camera = parse_intrinsics(intrinsics, (width, height))
-    name = ("mm" if depth.dtype.kind in "ui" else "m") if unit == "auto" else unit
+    name = _guess_unit(depth) if unit == "auto" else unit
     metres = depth.astype(np.float64) * UNITS[name]
     with np.errstate(invalid="ignore"):
         known = np.isfinite(metres) & (metres > 0)
@@ -110,15 +110,11 @@ def read_depth_view(path: Path, intrinsics: str | None, unit: str) -> DepthView:
 
 def read_organised(path: Path, metres: float) -> DepthView | None:
     """Read an organised .pcd whose unit is so many metres; None for another cloud, or where no pinhole camera fits."""
-    shape = _read_shape(path)
-    if shape is None:
+    cloud = read_pcd(path)
+    shape = cloud.shape
+    if min(shape) < 2:
         return None
-    o3d = import_extra("open3d", "scans", "reading .pcd files")
-    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
-    cloud = o3d.io.read_point_cloud(path, remove_nan_points=False, remove_infinite_points=False)
-    points = metres * np.asarray(cloud.points)
-    if len(points) != shape[0] * shape[1]:
-        return None
+    points = metres * cloud.points
     pixel = np.flatnonzero(np.isfinite(points).all(axis=1) & points.any(axis=1))
     image = RangeImage.of_organised(points[pixel], pixel, shape)
     if image is None:
@@ -126,9 +122,7 @@ def read_organised(path: Path, metres: float) -> DepthView | None:
     scale, offset, axes = image.projection.scale, image.projection.offset, image.projection.axes
     matrix = [scale[0], 0, offset[0], 0, scale[1], offset[1], 0, 0, 1]
     camera = Camera.from_info(matrix, (), shape[1], shape[0], axes, np.zeros(3))
-    rgb = None
-    if cloud.has_colors():
-        rgb = np.rint(255 * np.asarray(cloud.colors)).astype(np.uint8).reshape((*shape, 3))
+    rgb = None if cloud.rgb is None else cloud.rgb.reshape((*shape, 3))
     return DepthView(points[pixel], camera, image, rgb, "-y" if np.allclose(axes, np.eye(3)) else "z")
 
 
@@ -222,17 +216,27 @@ def _list_numbers(value: Any) -> list[float]:
         return []
 
 
+def _guess_unit(depth: np.ndarray) -> str:
+    """Return mm for whole numbers, and for others whose middle is no distance in metres at which people are seen."""
+    if depth.dtype.kind in "ui":
+        return "mm"
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    return "mm" if len(known) and np.median(known) > MAX_DEPTH_M else "m"
+
+
 def _read_pixels(path: Path) -> np.ndarray:
     """Return the pixels (H, W) of a depth image as they are."""
     if not path.is_file():
         raise InputError(f"{path} does not exist or is not a file; give a depth image")
-    if path.suffix.lower() == ".npy":
-        try:
-            pixels = np.load(path, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{path} cannot be read as an array: {error}") from error
+    if path.suffix.lower() in (".npy", ".npz"):
+        pixels = _load_array(path)
     else:
-        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        try:
+            pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        except cv2.error:  # not every OpenCV reads .exr
+            pixels = None
+        if pixels is None and path.suffix.lower() == ".exr":
+            raise InputError(f"{path} is not read by this OpenCV; convert it to .npy or a float .tiff, in metres")
         if pixels is None:
             raise InputError(f"{path} is not an image, or damaged; give a 16-bit depth image")
         if pixels.ndim == 3:
@@ -245,19 +249,16 @@ def _read_pixels(path: Path) -> np.ndarray:
     return np.asarray(pixels)
 
 
-def _read_shape(path: Path) -> tuple[int, int] | None:
-    """Return (height, width) of an organised .pcd; None for one whose points are in no order."""
+def _load_array(path: Path) -> np.ndarray:
+    """Return the array of a .npy, or the one of a .npz that is called depth or has no other beside it."""
     try:
         with path.open("rb") as file:
-            header = file.read(HEADER_BYTES)
-    except OSError:
-        return None
-    found: dict[bytes, int] = {}
-    for line in header.split(b"\n"):
-        words = line.split()
-        if words[:1] == [b"DATA"]:
-            break
-        if words[:1] in ([b"WIDTH"], [b"HEIGHT"]) and len(words) == 2 and words[1].isdigit():
-            found[words[0]] = int(words[1])
-    height, width = found.get(b"HEIGHT", 0), found.get(b"WIDTH", 0)
-    return (height, width) if min(height, width) > 1 else None
+            loaded = np.load(file, allow_pickle=False)
+            if not isinstance(loaded, np.lib.npyio.NpzFile):
+                return np.asarray(loaded)
+            name = "depth" if "depth" in loaded.files or len(loaded.files) != 1 else loaded.files[0]
+            if name not in loaded.files:
+                raise InputError(f"{path} has the arrays {', '.join(loaded.files)}; call the depth image depth")
+            return np.asarray(loaded[name])
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} cannot be read as an array: {error}") from error

@@ -15,7 +15,6 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS, SeenKeypoints
 from flowing_puppet_ros.evaluate.rgbd.views import RgbdFrame
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
-from flowing_puppet_ros.evidence.cloud.sensor_field import SensorProjection
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, place_joints
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
@@ -48,18 +47,16 @@ class SensedScene:
     def of(cls, frame: RgbdFrame) -> SensedScene:
         """Take a frame as the nodes do; InputError if it shows no depth."""
         camera = frame.cameras.depth
-        thinned = np.full(frame.depth.shape, False)
-        thinned[PIXEL_STEP // 2 :: PIXEL_STEP, PIXEL_STEP // 2 :: PIXEL_STEP] = True
-        known = np.flatnonzero((thinned & np.isfinite(frame.depth)).ravel())
-        optical = frame.points.reshape(-1, 3)
-        if not len(known):
+        index = np.arange(frame.depth.size).reshape(frame.depth.shape)
+        pixel = index[PIXEL_STEP // 2 :: PIXEL_STEP, PIXEL_STEP // 2 :: PIXEL_STEP]
+        known = np.isfinite(frame.depth.ravel()[pixel])
+        if not known.any():
             raise InputError("the depth image shows nothing")
-        whole = np.flatnonzero(np.isfinite(frame.depth.ravel()))
-        k = camera.matrix
-        projection = SensorProjection.pinhole(k[0, 0], k[1, 1], k[0, 2], k[1, 2])
-        image = RangeImage.of_camera(projection, optical[whole], whole, frame.depth.shape)
+        points, own = frame.points.reshape(-1, 3)[pixel[known]], np.flatnonzero(known)
+        image = RangeImage.of_organised(points, own, pixel.shape)
+        if image is None:
+            raise InputError("the depth image is no pinhole camera's")
         upright = camera.rotation.T
-        rows = np.searchsorted(whole, known)
         eye = camera.centre
         other = frame.cameras.colour
         colour = Camera(
@@ -67,7 +64,7 @@ class SensedScene:
         )
         to_world = np.eye(4)
         to_world[:3, 3] = eye
-        return cls(optical[known] @ upright.T, known, image.turn(upright).take(rows), colour, to_world)
+        return cls(points @ upright.T, pixel[known], image.turn(upright), colour, to_world)
 
 
 class RgbdMethod(Protocol):

@@ -95,13 +95,17 @@ class OneSidedView:
             inside of it; and (N,) metres along forward by which they are behind the surface, negative in front of it,
             infinite where nothing is known.
         """
-        beside, behind = _compare(np.ascontiguousarray(points, dtype=np.float64), *self._arrays())
+        beside, behind = _compare(np.ascontiguousarray(points, dtype=np.float64), self.arrays)
         return beside, behind
 
     def find_hidden(self, points: np.ndarray) -> np.ndarray:
         """Return which of `points` (N, 3) m lie so far behind the seen surface that it hides them, (N,) bool."""
-        beside, behind = self.compare(points)
-        return (behind > OCCLUSION_DEPTH_M) & ~beside.any(axis=1)
+        return np.asarray(_find_hidden(np.ascontiguousarray(points, dtype=np.float64), self.arrays))
+
+    def find_seen(self, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Return which of `points` (N, 3) m with outward `normals` (N, 3) face the sensor and are not hidden, (N,)."""
+        points, normals = (np.ascontiguousarray(each, dtype=np.float64) for each in (points, normals))
+        return np.asarray(_find_seen(points, normals, self.arrays))
 
     def misfit(self, points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the mean distance by which surface points contradict the view, for many sets of points at once.
@@ -113,13 +117,15 @@ class OneSidedView:
         Returns:
             (P,) metres, and (P, K) bool, which points face the sensor. A point beside the silhouette or in front of the
             surface costs its distance, at most 15 cm; one behind the surface costs its depth, at most 5 cm, if it faces
-            the sensor, and nothing otherwise.
+            the sensor, and nothing otherwise; one outside the field costs 5 cm if it faces the sensor.
         """
-        return _misfit(np.ascontiguousarray(points), np.ascontiguousarray(normals), *self._arrays())
+        return _misfit(np.ascontiguousarray(points), np.ascontiguousarray(normals), *self.arrays)
 
-    def _arrays(
+    @property
+    def arrays(
         self,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, float, np.ndarray, FieldArrays]:
+        """What compiled loops need, see `compare_point`."""
         return (
             self.viewpoint, self.axes, self.directions, self.depth, self.tolerance, self.low, self.cell, self.nearest,
             NO_FIELD if self.field is None else self.field.arrays,
@@ -168,23 +174,52 @@ def _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest
     return found, depth, share * dx, share * dy
 
 
+@njit(cache=True, inline="always")
+def compare_point(x, y, z, view):  # type: ignore[no-untyped-def]
+    """Return where a place lies relative to the seen surface, for `OneSidedView.arrays`.
+
+    Metres beside the silhouette along the view's axes right and down, and metres behind the surface as in `compare`.
+    """
+    viewpoint, axes, directions, seen, tolerance, low, cell, nearest, field = view
+    if is_unknown(x, y, z, field):
+        return 0.0, 0.0, np.inf
+    found, depth, dx, dy = _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest)
+    if seen[found] < 0:
+        return 0.0, 0.0, np.inf
+    return dx, dy, depth - seen[found]
+
+
 @njit(cache=True, nogil=True)
-def _compare(points, viewpoint, axes, directions, seen, tolerance, low, cell, nearest, field):  # type: ignore[no-untyped-def]
+def _compare(points, view):  # type: ignore[no-untyped-def]
     beside, behind = np.zeros((len(points), 3)), np.empty(len(points))
+    axes = view[1]
     for k in range(len(points)):
-        if is_unknown(points[k, 0], points[k, 1], points[k, 2], field):
-            behind[k] = np.inf
-            continue
-        found, depth, dx, dy = _look_up(
-            points[k, 0], points[k, 1], points[k, 2], viewpoint, axes, directions, tolerance, low, cell, nearest
-        )
-        if seen[found] < 0:
-            behind[k] = np.inf
-            continue
-        behind[k] = depth - seen[found]
+        dx, dy, behind[k] = compare_point(points[k, 0], points[k, 1], points[k, 2], view)
         for axis in range(3):
             beside[k, axis] = dx * axes[0, axis] + dy * axes[1, axis]
     return beside, behind
+
+
+@njit(cache=True, nogil=True)
+def _find_hidden(points, view):  # type: ignore[no-untyped-def]
+    hidden = np.empty(len(points), dtype=np.bool_)
+    for k in range(len(points)):
+        dx, dy, behind = compare_point(points[k, 0], points[k, 1], points[k, 2], view)
+        hidden[k] = behind > OCCLUSION_DEPTH_M and dx == 0 and dy == 0
+    return hidden
+
+
+@njit(cache=True, nogil=True)
+def _find_seen(points, normals, view):  # type: ignore[no-untyped-def]
+    viewpoint, sees = view[0], np.zeros(len(points), dtype=np.bool_)
+    for k in range(len(points)):
+        toward = 0.0
+        for axis in range(3):
+            toward += (viewpoint[axis] - points[k, axis]) * normals[k, axis]
+        if toward > 0:
+            dx, dy, behind = compare_point(points[k, 0], points[k, 1], points[k, 2], view)
+            sees[k] = behind <= OCCLUSION_DEPTH_M or dx != 0 or dy != 0
+    return sees
 
 
 @njit(cache=True, nogil=True)
@@ -198,6 +233,8 @@ def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, 
                 toward += (viewpoint[axis] - points[p, k, axis]) * normals[p, k, axis]
             facing[p, k] = toward > 0
             if is_unknown(x, y, z, field):
+                # As what is hidden costs: a limb is no more probably out of sight than behind another.
+                cost[p] += OCCLUSION_DEPTH_M if facing[p, k] else 0.0
                 continue
             found, depth, dx, dy = _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest)
             if seen[found] < 0:
@@ -214,33 +251,42 @@ def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, 
     return cost, facing
 
 
+# Both loops run over an array of the smallest squares so far, which the compiler turns into vector instructions; a loop
+# that keeps one smallest number takes several times as long.
 @njit(cache=True, nogil=True)
 def _distances(targets, points, allowed):  # type: ignore[no-untyped-def]
     result = np.empty((len(points), len(targets)))
+    x, y, z = targets[:, 0].copy(), targets[:, 1].copy(), targets[:, 2].copy()
     for p in range(len(points)):
+        best = result[p]
+        best[:] = MAX_DISTANCE_M * MAX_DISTANCE_M
+        for k in range(points.shape[1]):
+            if allowed[p, k]:
+                _lower_to(best, x, y, z, points[p, k, 0], points[p, k, 1], points[p, k, 2])
         for m in range(len(targets)):
-            best = MAX_DISTANCE_M * MAX_DISTANCE_M
-            for k in range(points.shape[1]):
-                if allowed[p, k]:
-                    dx = points[p, k, 0] - targets[m, 0]
-                    dy = points[p, k, 1] - targets[m, 1]
-                    dz = points[p, k, 2] - targets[m, 2]
-                    best = min(best, dx * dx + dy * dy + dz * dz)
-            result[p, m] = np.sqrt(best)
+            best[m] = np.sqrt(best[m])
     return result
 
 
 @njit(cache=True, nogil=True)
 def _mean_distance(points, targets):  # type: ignore[no-untyped-def]
     result = np.zeros(len(points))
+    best = np.empty(points.shape[1])
     for p in range(len(points)):
+        x, y, z = points[p, :, 0].copy(), points[p, :, 1].copy(), points[p, :, 2].copy()
+        best[:] = MAX_DISTANCE_M * MAX_DISTANCE_M
+        for m in range(len(targets)):
+            _lower_to(best, x, y, z, targets[m, 0], targets[m, 1], targets[m, 2])
         for k in range(points.shape[1]):
-            best = MAX_DISTANCE_M * MAX_DISTANCE_M
-            for m in range(len(targets)):
-                dx = points[p, k, 0] - targets[m, 0]
-                dy = points[p, k, 1] - targets[m, 1]
-                dz = points[p, k, 2] - targets[m, 2]
-                best = min(best, dx * dx + dy * dy + dz * dz)
-            result[p] += np.sqrt(best)
+            result[p] += np.sqrt(best[k])
         result[p] /= points.shape[1]
     return result
+
+
+@njit(cache=True, nogil=True)
+def _lower_to(best, x, y, z, a, b, c):  # type: ignore[no-untyped-def]
+    """Lower the squares `best` (M,) to the squared distances of places (x, y, z) (M,) to the point (a, b, c)."""
+    for m in range(len(best)):
+        dx, dy, dz = a - x[m], b - y[m], c - z[m]
+        squared = dx * dx + dy * dy + dz * dz
+        best[m] = squared if squared < best[m] else best[m]

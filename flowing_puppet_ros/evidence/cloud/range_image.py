@@ -113,6 +113,10 @@ class RangeImage:
         """Return the same image in a frame that `rotation` (3, 3) leads to."""
         return replace(self, projection=self.projection.turn(rotation))
 
+    def move(self, step: F64) -> RangeImage:
+        """Return the same image in a frame in which everything is moved by `step` (3,) m."""
+        return replace(self, projection=self.projection.move(step))
+
     def make_field(self, rows: I64 | Bools | slice) -> SensorField:
         """Return what the sensor can know of the person whose points are the scan's `rows`."""
         own = self.pixel[rows]

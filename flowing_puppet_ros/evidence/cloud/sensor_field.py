@@ -57,6 +57,10 @@ class SensorProjection:
         """Return the projection of the same places in a frame that `rotation` (3, 3) leads to."""
         return replace(self, viewpoint=rotation @ self.viewpoint, axes=np.ascontiguousarray(self.axes @ rotation.T))
 
+    def move(self, step: F64) -> SensorProjection:
+        """Return the projection of the same places in a frame in which they are moved by `step` (3,) m."""
+        return replace(self, viewpoint=self.viewpoint + step)
+
     def project(self, points: F64) -> tuple[F64, F64]:
         """Return the pixels (N, 2) and depths (N,) m of `points` (N, 3) m."""
         arrays = (self.viewpoint, self.axes, self.scale, self.offset, np.zeros(4), NO_FIELD[5], self.kind)

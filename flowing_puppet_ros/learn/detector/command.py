@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.image.formats.annotations import Annotations
+from flowing_puppet_ros.learn.annotations import add_annotation_arguments, load_annotations
 from flowing_puppet_ros.learn.detector.data import make_examples
 from flowing_puppet_ros.learn.detector.training import (
     CALIBRATION_PEOPLE,
@@ -27,11 +27,7 @@ from flowing_puppet_ros.threads import one_blas_thread
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `learn detector`."""
-    parser.add_argument("annotations", type=Path, help="JSON file with the joints of people")
-    parser.add_argument("--media", type=Path, help="folder of the images or videos [that of the annotations]")
-    parser.add_argument(
-        "--leave-out", type=Path, help="annotations whose videos, and others of their source, are not used"
-    )
+    add_annotation_arguments(parser)
     parser.add_argument("--name", default="upper", help="name of the detector [%(default)s]")
     parser.add_argument("--out", type=Path, required=True, help="folder for detector_NAME.npz and its model card")
     LearnDetectorSettings.add_arguments(parser)
@@ -41,9 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Learn one detector, write it with its card and print its path; progress on stderr."""
     settings = LearnDetectorSettings.from_arguments(arguments)
     make_out_folder(arguments.out)
-    annotations = Annotations.load(arguments.annotations, arguments.media)
-    if arguments.leave_out is not None:
-        annotations = annotations.exclude_sources_of(Annotations.load(arguments.leave_out, arguments.media))
+    annotations = load_annotations(arguments)
     began = time.process_time()
     # Sums depend on the number of BLAS threads; with one thread the weights are the same on every machine.
     with one_blas_thread():

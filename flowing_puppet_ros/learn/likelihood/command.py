@@ -12,7 +12,7 @@ import numpy as np
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.contour import CELL_METRES, LEVELS
 from flowing_puppet_ros.evidence.image.likelihood import TERMS_OF
-from flowing_puppet_ros.image.formats.annotations import Annotations
+from flowing_puppet_ros.learn.annotations import add_annotation_arguments, load_annotations
 from flowing_puppet_ros.learn.likelihood.samples import pose_people
 from flowing_puppet_ros.learn.likelihood.training import LearnedLikelihood, LikelihoodSettings, learn_likelihood
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -24,9 +24,7 @@ PARTS = 10
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `learn likelihood`."""
-    parser.add_argument("annotations", type=Path, help="JSON of the annotation tool, or of joints per clip")
-    parser.add_argument("--media", type=Path, help="folder of the images or videos [where the JSON is, or its clips/]")
-    parser.add_argument("--leave-out", type=Path, help="annotations whose files and source videos are not learned from")
+    add_annotation_arguments(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder for likelihood_10.npz and its model card")
     LikelihoodSettings.add_arguments(parser)
 
@@ -34,9 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Learn the likelihood, write it with its card and print its path; progress on stderr."""
     settings = LikelihoodSettings.from_arguments(arguments)
-    annotations = Annotations.load(arguments.annotations, arguments.media)
-    if arguments.leave_out is not None:
-        annotations = annotations.exclude_sources_of(Annotations.load(arguments.leave_out))
+    annotations = load_annotations(arguments)
     make_out_folder(arguments.out)
     model = DeformableStructures.load("neutral", PARTS)
     people = list(pose_people(annotations, model, settings.every))

@@ -8,7 +8,7 @@ import json
 import sys
 from pathlib import Path
 
-from flowing_puppet_ros.image.formats.annotations import Annotations
+from flowing_puppet_ros.learn.annotations import add_annotation_arguments, load_annotations
 from flowing_puppet_ros.learn.likelihood.samples import pose_people
 from flowing_puppet_ros.learn.thesis_loop.energy_weights import WeightSettings, gather_choices, search_weights
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -17,9 +17,7 @@ from flowing_puppet_ros.settings import make_out_folder
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `learn flowing`."""
-    parser.add_argument("annotations", type=Path, help="JSON of joints per clip, or of the annotation tool")
-    parser.add_argument("--media", type=Path, help="folder of the videos [where the JSON is, or its clips/]")
-    parser.add_argument("--leave-out", type=Path, help="annotations whose files and source videos are not used")
+    add_annotation_arguments(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder for the model card flowing_weights.md")
     WeightSettings.add_arguments(parser)
 
@@ -27,9 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Search, write the card, and print the weights as JSON; progress on stderr."""
     settings = WeightSettings.from_arguments(arguments)
-    annotations = Annotations.load(arguments.annotations, arguments.media)
-    if arguments.leave_out is not None:
-        annotations = annotations.exclude_sources_of(Annotations.load(arguments.leave_out))
+    annotations = load_annotations(arguments)
     make_out_folder(arguments.out)
     model = DeformableStructures.load()
     people = pose_people(annotations, model, settings.every, True)

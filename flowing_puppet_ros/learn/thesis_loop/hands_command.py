@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from flowing_puppet_ros.evidence.image.hands import ACROSS, ALONG, CELL_METRES, HandDetectors
-from flowing_puppet_ros.image.formats.annotations import Annotations
+from flowing_puppet_ros.learn.annotations import add_annotation_arguments, load_annotations
 from flowing_puppet_ros.learn.likelihood.samples import pose_people
 from flowing_puppet_ros.learn.thesis_loop.hands import HandBoxes, HandSettings, learn_hands
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -22,9 +22,7 @@ NAME = "upper"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `learn hands`."""
-    parser.add_argument("annotations", type=Path, help="JSON of joints per clip, or of the annotation tool")
-    parser.add_argument("--media", type=Path, help="folder of the videos [where the JSON is, or its clips/]")
-    parser.add_argument("--leave-out", type=Path, help="annotations whose files and source videos are not learned from")
+    add_annotation_arguments(parser)
     parser.add_argument("--out", type=Path, required=True, help=f"folder for hands_{NAME}.npz and its model card")
     HandSettings.add_arguments(parser)
 
@@ -32,9 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Learn the detectors, write them with their card and print the path; progress on stderr."""
     settings = HandSettings.from_arguments(arguments)
-    annotations = Annotations.load(arguments.annotations, arguments.media)
-    if arguments.leave_out is not None:
-        annotations = annotations.exclude_sources_of(Annotations.load(arguments.leave_out))
+    annotations = load_annotations(arguments)
     make_out_folder(arguments.out)
     model = DeformableStructures.load()
 

@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings, Progress
-from flowing_puppet_ros.body.scans.scan_frame import parse_axis, rotation_to_z_up
+from flowing_puppet_ros.body.scans.scan_frame import UP_AXES
 from flowing_puppet_ros.body.track.scene_tracker import (
     RegionSettings,
     SceneCloud,
@@ -22,6 +20,7 @@ from flowing_puppet_ros.body.track.scene_tracker import (
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
+from flowing_puppet_ros.fusion.coarse_place import CoarsePerson, place_others
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.fusion.tracker import FusedTracker
@@ -35,7 +34,7 @@ from flowing_puppet_ros.stream.components.silhouette_bodies import SilhouetteBod
 from flowing_puppet_ros.stream.depth_pairs import DepthPairs
 from flowing_puppet_ros.stream.messages.clouds import decode_pixels
 from flowing_puppet_ros.stream.messages.depth import make_depth_cloud
-from flowing_puppet_ros.stream.messages.geometry import stamp_ns
+from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.message_types import (
     BODIES,
     CAMERA_INFO,
@@ -48,17 +47,14 @@ from flowing_puppet_ros.stream.messages.message_types import (
 )
 from flowing_puppet_ros.stream.messages.puppets import JointPosition, decode_body_joints, make_bodies, make_body
 from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
+from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
 from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
 
-OPTICAL = re.compile(r"optical(_frame)?$")
-"""Frames that look along z with y down (REP-103)."""
 ASSUMED_INTERVAL_NS = 100_000_000
 """Between clouds whose stamps do not advance (drivers that stamp nothing)."""
-COLOUR_PORTS = ("puppets", "puppets/camera_info", "/tf_static")
+COLOUR_PORTS = ("puppets", "puppets/camera_info", "/tf_static", "/tf")
 MIN_OUTSIDE_SHARE = 0.1
 """Of a cloud's points, outside of the camera's view, from which on people are found there without puppets."""
-MIN_CAMERA_DISTANCE_M = 0.1
-MAX_FIELD_OF_VIEW = 1.2  # tangent of half of it: 100 degrees from side to side
 
 
 @dataclass(frozen=True)
@@ -70,7 +66,20 @@ class BodyFitterSettings(SceneSettings):
         "auto",
         "axis of the cloud's frame that points up; auto: -y in frames named *optical or *optical_frame and for"
         " clouds without a frame_id that lie ahead along z as those of cameras do, else z",
-        choices=("auto", "z", "y", "-y"),
+        choices=("auto", *UP_AXES),
+    )
+    fixed_frame: str = setting(
+        "",
+        "frame with z up that stands still (map, odom), in which people are tracked while the sensor moves or is tilted;"
+        " empty: the cloud's, as `up` says",
+    )
+    sensor_frame: str = setting(
+        "",
+        "frame of the sensor of clouds that come in another frame (base_link, odom, map); empty: the cloud's",
+        advanced=True,
+    )
+    transform_wait: int = setting(
+        3, "clouds to wait for late transforms before one is fitted without them", low=0, high=50, advanced=True
     )
     wait: int = setting(
         1, "clouds to wait for late initial joints before fitting a cloud without them", low=0, high=50, advanced=True
@@ -100,10 +109,11 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         Port("puppets", PUPPETS, optional=True),
         Port("puppets/camera_info", CAMERA_INFO, "sensor", optional=True),
         Port("/tf_static", TRANSFORMS, "latched", optional=True),
+        Port("/tf", TRANSFORMS, optional=True),
         Port("initial", BODIES, optional=True),
         Port("silhouettes", SILHOUETTES),
     )
-    outputs: tuple[Port, ...] = BodyOutputs.ports
+    outputs: tuple[Port, ...] = BodyOutputs.always
 
     def __init__(self, settings: BodyFitterSettings, factory: MessageFactory) -> None:
         """Load the body model."""
@@ -118,15 +128,19 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             self.report,
             self.publish_id,
         )
-        self._puppets = PuppetPairs(self._model, settings.fusion)
+        self._frames = FrameTree()
+        self._puppets = PuppetPairs(self._model, settings.fusion, self._frames)
+        self._places = SensorPlaces(
+            self._frames, settings.up, settings.fixed_frame, settings.sensor_frame, self.report
+        )
+        self._is_fixed = False
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
         self._depth = DepthPairs(self.report)
-        self._up_of_nameless = ""
         self._clock: tuple[int, int] | None = None
         self._line = PendingQueue()
         self._initial = StampBuffer()
         self._outputs = BodyOutputs(settings.output, settings.ros4hri, factory, self._model)
-        self.outputs = (*BodyOutputs.ports, *self._outputs.ros4hri.ports)
+        self.outputs = self._outputs.ports
 
     def warm_up(self) -> None:
         """Do beforehand what the first clouds of a live stream would wait for."""
@@ -141,7 +155,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._depth.reset()
         self._line.clear()
         self._initial.clear()
-        self._up_of_nameless = ""
+        self._places.reset()
+        self._frames.forget_moving()
         self._clock = None
 
     def flush(self) -> Output:
@@ -156,12 +171,12 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         Nothing of other clouds is used or changed. Returns the BodyArray message and its bodies, in the cloud's frame.
         InputError in one sentence when the cloud cannot be used.
         """
-        scene, to_z_up = self._decode(cloud, of_depth=False)
+        scene, place, _ = self._decode(cloud, of_depth=False)
         if initial is not None and initial.bodies:
-            bodies = self._fit_initial(scene, to_z_up, initial, seed, progress)
+            bodies = self._fit_initial(scene, place, initial, seed, progress)
         else:
             bodies = self._publish_ids(self._scene.fit_once(scene, seed, progress))
-        bodies = [body.rotate(to_z_up.T) for body in bodies]
+        bodies = [body.move(*place.back) for body in bodies]
         messages = [make_body(self.factory, self._model, body) for body in bodies]
         return make_bodies(self.factory, cloud.header, messages), bodies
 
@@ -173,8 +188,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
     def _publish_ids(self, bodies: list[TrackedBody]) -> list[TrackedBody]:
         return [replace(body, id=self.publish_id(body.id)) for body in bodies]
 
-    def _decode(self, cloud: Any, of_depth: bool) -> tuple[SceneCloud, F64]:
-        """Return the points of a cloud message in the region of interest, z up, and the rotation (3, 3) to there.
+    def _decode(self, cloud: Any, of_depth: bool) -> tuple[SceneCloud, SensorPlace, bool]:
+        """Return the points of a cloud message in the region of interest, z up, their place, and whether it is known.
 
         That of a depth image is seen from one side, in an optical frame, whatever its name, whose y axis points down.
         """
@@ -184,40 +199,26 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         if not inside.all():
             points, normals = points[inside], None if normals is None else normals[inside]
             image = image and image.take(inside)
-        to_z_up = rotation_to_z_up(parse_axis(self._find_up(cloud.header.frame_id, points, of_depth)))
-        rotated = None if normals is None else normals @ to_z_up.T
-        image = image and image.turn(to_z_up)
-        return SceneCloud(points @ to_z_up.T, rotated, stamp_ns(cloud), of_depth, image), to_z_up
-
-    def _find_up(self, frame: str, points: F64, of_depth: bool) -> str:
-        """Return the axis that is up in a frame; for one without a name the first cloud decides."""
-        if self.settings.up != "auto":
-            return self.settings.up
-        if of_depth or OPTICAL.search(frame):
-            return "-y"
-        if frame or not len(points):
-            return "z"
-        if not self._up_of_nameless:
-            ahead = is_ahead_along_z(points)
-            self._up_of_nameless = "-y" if ahead else "z"
-            self.report.warn(
-                f"the clouds have no frame_id: {self._up_of_nameless} is taken as up, since their points lie "
-                f"{'ahead along z as in the frame of a camera' if ahead else 'around the origin'}; `up` sets it"
-            )
-        return self._up_of_nameless
+        where, stamp = (cloud.header, stamp_ns(cloud), points, of_depth), stamp_ns(cloud)
+        found = self._places.find(*where)
+        place = found or self._places.find_alone(*where)
+        normals = None if normals is None else normals @ place.rotation.T
+        image = image and image.turn(place.rotation).move(place.translation)
+        scene = SceneCloud(place.put(points), normals, stamp, of_depth, image, place.viewpoint, place.to_sensor)
+        return scene, place, found is not None
 
     def _fit_initial(
-        self, scene: SceneCloud, to_z_up: F64, initial: Any, seed: int, progress: Progress | None = None
+        self, scene: SceneCloud, place: SensorPlace, initial: Any, seed: int, progress: Progress | None = None
     ) -> list[TrackedBody]:
         """Fit each of the bodies in `initial` to the whole cloud, from its joints."""
-        viewpoint = np.zeros(3) if self.settings.view == "single" or scene.single_view else None
+        viewpoint = scene.viewpoint if self.settings.view == "single" or scene.single_view else None
         field = scene.image.make_field(slice(None)) if scene.image is not None and viewpoint is not None else None
         bodies = []
         for number, body in enumerate(initial.bodies, start=1):
             fit = self._fitter.fit(
                 scene.points,
                 scene.normals,
-                initial=_rotate_joints(decode_body_joints(body), to_z_up),
+                initial=_put_joints(decode_body_joints(body), place),
                 viewpoint=viewpoint,
                 field=field,
                 seed=seed,
@@ -265,62 +266,80 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         while self._line.waiting:
             stamp, (cloud, of_depth) = self._line.waiting[0]
             initial = self._initial.get(stamp)
-            if not (final or self._is_ready(stamp, initial)):
+            if not (final or self._is_ready(cloud.header.frame_id, stamp, initial)):
                 break
             self._line.pop()
             self._initial.drop_until(stamp)
             outputs += self._fit_one(stamp, cloud, of_depth, initial)
         return outputs
 
-    def _is_ready(self, stamp: int, initial: Any | None) -> bool:
+    def _is_ready(self, frame: str, stamp: int, initial: Any | None) -> bool:
         """Return whether all that is expected for the first cloud in line is there, or it has waited long enough."""
         waiting = len(self._line.waiting) - 1
         if "initial" in self._expected and initial is None and waiting < self.settings.wait:
             return False
+        if waiting < self.settings.transform_wait and self._places.is_awaited(frame, stamp):
+            return False
         # Without a calibration no puppet can be used, however long a cloud waits for it.
         calibrated = self._puppets.is_calibrated or "puppets/camera_info" in self._expected
         puppets = calibrated and "puppets" in self._expected and waiting < self.settings.fusion.wait
-        return not puppets or self._puppets.is_ready(stamp)
+        return not puppets or self._puppets.is_ready(frame, stamp)
 
     def _fit_one(self, stamp: int, cloud: Any, of_depth: bool, initial: Any | None) -> Output:
         self.counters["clouds"] += 1
         bodies: list[TrackedBody] = []
         occluded: list[str] = []
+        self._coarse: list[CoarsePerson] = []
         try:
-            scene, to_z_up = self._decode(cloud, of_depth)
+            scene, place, is_known = self._decode(cloud, of_depth)
             scene = replace(scene, stamp=self._advance_clock(stamp))
+            if is_known and place.is_fixed != self._is_fixed:
+                self._is_fixed = place.is_fixed
+                self._scene.reset()
+                self._fused.reset()
             if initial is not None and initial.bodies:
-                bodies = self._fit_initial(scene, to_z_up, initial, self.seed_of(stamp))
+                bodies = self._fit_initial(scene, place, initial, self.seed_of(stamp))
             else:
-                bodies, occluded = self._fit_scene(scene, cloud.header, stamp, to_z_up)
-            bodies = [body.rotate(to_z_up.T) for body in bodies]
+                bodies, occluded = self._fit_scene(scene, cloud.header, stamp, place, is_known)
+            bodies = [body.move(*place.back) for body in bodies]
         except InputError as error:
             self.report.count_unusable(error)
         self.counters["bodies"] += len(bodies)
-        return self._outputs.make(cloud.header, bodies, occluded, self._subscribed)
+        self.counters["people in colour only"] += len(self._coarse)
+        coarse = [person.move(*place.back) for person in self._coarse]
+        return self._outputs.make(cloud.header, bodies, occluded, self._subscribed, coarse)
 
     def _fit_scene(
-        self, scene: SceneCloud, header: Any, stamp: int, to_z_up: F64
+        self, scene: SceneCloud, header: Any, stamp: int, place: SensorPlace, is_known: bool
     ) -> tuple[list[TrackedBody], list[str]]:
         """Return the bodies of everybody, and the ids of those out of sight: with a camera's puppets, or without.
 
-        Where the camera looks, only who has a puppet has a body. Elsewhere people are found in the cloud alone.
+        Where the camera looks, only who has a puppet has a body. Elsewhere people are found in the cloud alone. A cloud
+        whose place is not known is fitted by itself.
         """
         seed = self.seed_of(stamp)
+        step = self._step_scene if is_known else self._step_alone
         if "puppets" not in self._expected or not self.settings.scene:
-            return self._step_scene(scene, seed)
+            return step(scene, seed)
         try:
-            paired = self._puppets.find(header, stamp, to_z_up)
+            paired = self._puppets.find(header, stamp, *place.back)
         except InputError as error:
             self.report.warn(str(error))
             self.counters["clouds without puppets"] += 1
-            return self._step_scene(scene, seed)
+            return step(scene, seed)
         self._puppets.drop_until(stamp)
+        seen = SeenCloud.of(scene.points, paired.camera, scene.viewpoint)
+        coarse = paired.puppets if self.settings.fusion.colour_only else []
+        if not len(scene.points):
+            self._coarse = place_others(self._model, coarse, seen)
         self._scene.check(scene)
-        seen = SeenCloud.of(scene.points, paired.camera)
-        image = scene.image or RangeImage.of_scan(scene.points, np.zeros(3))
-        bodies, own = self._fused.step(seen, image, paired.puppets, scene.stamp)
+        if is_known:
+            bodies, own = self._fused.step(seen, scene.draw_image(), paired.puppets, scene.stamp)
+        else:
+            bodies, own = self._fused.step_alone(seen, scene.draw_image(), paired.puppets)
         occluded = self._fused.occluded_ids
+        with_body = {body.id for body in bodies}
+        self._coarse = place_others(self._model, [each for each in coarse if each.id not in with_body], seen)
         if paired.puppets and not own.any():
             self.report.warn(
                 f"none of the {len(paired.puppets)} puppets lies on the cloud: nobody is near enough to the sensor, or "
@@ -328,9 +347,13 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             )
         outside = ~seen.in_view & ~own
         if outside.mean() > MIN_OUTSIDE_SHARE:
-            others, hidden = self._step_scene(scene.take(outside), seed)
+            others, hidden = step(scene.take(outside), seed)
             bodies, occluded = [*bodies, *others], [*occluded, *hidden]
         return bodies, occluded
+
+    def _step_alone(self, scene: SceneCloud, seed: int) -> tuple[list[TrackedBody], list[str]]:
+        """Return the bodies of everybody in a cloud that nothing joins to the others, and nobody's ids."""
+        return self._publish_ids(self._scene.step_alone(scene, seed)), []
 
     def _advance_clock(self, stamp: int) -> int:
         """Return the time of a cloud, ns: its stamp, or some time after the cloud before it if that has the same."""
@@ -360,17 +383,6 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         return self._outputs.make(header, bodies, subscribed=self._subscribed) if header is not None else []
 
 
-def is_ahead_along_z(points: F64) -> bool:
-    """Return whether (all but one in a hundred of) the points (N, 3) m lie in a cone ahead of a camera at the origin.
-
-    In an optical frame (REP-103) all that a camera sees lies within its field of view about z. In a frame with z up the
-    floor does not.
-    """
-    z = points[:, 2]
-    inside = (z > MIN_CAMERA_DISTANCE_M) & (np.abs(points[:, :2]).max(axis=1) < MAX_FIELD_OF_VIEW * z)
-    return bool(inside.mean() > 0.99)
-
-
-def _rotate_joints(joints: dict[str, JointPosition], rotation: F64) -> dict[str, JointPosition]:
-    places = {name: rotation @ np.array(joint[:3]) for name, joint in joints.items()}
+def _put_joints(joints: dict[str, JointPosition], place: SensorPlace) -> dict[str, JointPosition]:
+    places = {name: place.put(np.array(joint[:3])) for name, joint in joints.items()}
     return {name: (float(p[0]), float(p[1]), float(p[2]), joints[name][3]) for name, p in places.items()}

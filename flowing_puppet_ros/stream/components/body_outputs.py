@@ -13,18 +13,22 @@ import numpy as np
 from flowing_puppet_ros.arrays import I64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.visibility import Visibility
-from flowing_puppet_ros.body.track.tracked_body import TrackedBody
+from flowing_puppet_ros.body.measurements.measure import measure_fit
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody, TrackStatus
+from flowing_puppet_ros.fusion.coarse_place import CoarsePerson
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import Output, Port
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, to_name_component
+from flowing_puppet_ros.stream.messages.bodies.human_urdf import make_urdf
+from flowing_puppet_ros.stream.messages.bodies.measured_people import make_measurements
 from flowing_puppet_ros.stream.messages.bodies.people import (
     PlacedPerson,
     make_people,
     make_person_pose,
     make_place,
 )
-from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames, make_urdf
+from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames
 from flowing_puppet_ros.stream.messages.bodies.shapes import (
     make_deletions,
     make_mesh_marker,
@@ -36,6 +40,7 @@ from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import header_ns, make_transform
 from flowing_puppet_ros.stream.messages.message_types import (
     BODIES,
+    MEASUREMENTS,
     MESH,
     PEOPLE,
     PERSON_POSE,
@@ -43,10 +48,12 @@ from flowing_puppet_ros.stream.messages.message_types import (
     TRANSFORMS,
     MessageFactory,
 )
-from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_body
+from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_body, make_coarse_body
 
 URDF_CHANGE_M = 0.02
 """Metres by which a joint must move in its parent link before a person's URDF is published again."""
+MEASURING_INTERVAL_NS = 1_000_000_000
+"""Between the measurements of one person, by the stamps: sizes change little, and each takes a sixth of a second."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +71,7 @@ class BodyOutputSettings(Settings):
         2000, "maximum number of triangles of a body in body_meshes; 0: all of the model", low=0, high=100000
     )
     part_frames: bool = setting(True, "publish a TF frame <part>_<id> for every part of a body")
+    measure: bool = setting(False, "publish `measurements`, of each person once a second", advanced=True)
     frame_prefix: str = setting("", "in front of the names of TF frames, where robots share a tree", advanced=True)
     person: str = setting(
         "", "id of the person on `person_pose`; empty: the nearest to the frame's origin", advanced=True
@@ -73,7 +81,7 @@ class BodyOutputSettings(Settings):
 class BodyOutputs:
     """Makes the messages for the bodies of one component, and remembers which people it has published."""
 
-    ports = (
+    always = (
         Port("bodies", BODIES),
         Port("body_meshes", "visualization_msgs/msg/MarkerArray", lazy=True),
         Port("part_poses", "geometry_msgs/msg/PoseArray"),
@@ -94,25 +102,36 @@ class BodyOutputs:
         self._skeleton = Skeleton(model)
         self._urdf_origins: dict[str, dict[str, np.ndarray]] = {}
         self.ros4hri = Ros4HriPublisher(ros4hri, factory, "joint_states", "urdf", "position", "velocity")
+        self._measuring = BodyMeasuring(settings.measure, factory, model)
+        self.ports = (*self.always, *self.ros4hri.ports, *self._measuring.ports)
         self._marker_ids: dict[str, int] = {}
         self._marker_count = 0
         self._last_mesh_stamp: int | None = None
         self._topology_sent = False
 
     def make(
-        self, header: Any, bodies: Sequence[TrackedBody], hidden: Collection[str] = (), subscribed: Collection[str] = ()
+        self,
+        header: Any,
+        bodies: Sequence[TrackedBody],
+        hidden: Collection[str] = (),
+        subscribed: Collection[str] = (),
+        coarse: Sequence[CoarsePerson] = (),
     ) -> Output:
         """Return everything to publish for the `bodies` in one cloud, whose stamp and frame are those of `header`.
 
         `hidden` are the ids of people who are occluded: they have no body in this cloud but are not lost yet.
-        `subscribed` are the lazy outputs that have subscribers.
+        `subscribed` are the lazy outputs that have subscribers. `coarse` are people of whom only joints are known.
         """
         factory = self._factory
         fits = [(body.id, body.fit) for body in bodies]
         alive = sorted({body.id for body in bodies} | set(hidden), key=id_sort_key)
-        outputs: Output = [
-            ("bodies", make_bodies(factory, header, [make_body(factory, self._model, body) for body in bodies]))
-        ]
+        messages = {body.id: make_body(factory, self._model, body) for body in bodies}
+        for person in coarse:
+            messages[person.id] = make_coarse_body(
+                factory, self._model.joint_names, person.id, person.joints, person.confidence
+            )
+        ordered = [messages[identity] for identity in sorted(messages, key=id_sort_key)] if coarse else [*messages.values()]
+        outputs: Output = [("bodies", make_bodies(factory, header, ordered))]
         if fits and not self._topology_sent:
             self._topology_sent = True
             outputs.append(("body_topology", make_topology(factory, self._model)))
@@ -131,6 +150,7 @@ class BodyOutputs:
         pose = make_person_pose(factory, header, people, self._settings.person) if "person_pose" in subscribed else None
         if pose is not None:
             outputs.append(("person_pose", pose))
+        outputs += self._measuring.make(header, bodies, alive)
         return outputs + (self._make_ros4hri(header, fits, people, alive) if self.ros4hri.enabled else [])
 
     def _place(self, body: TrackedBody) -> PlacedPerson:
@@ -218,10 +238,41 @@ class BodyOutputs:
             origins, known = self._skeleton.joint_origins(fit.state.shape), self._urdf_origins.get(identity)
             if known is None or max(np.linalg.norm(origins[name] - known[name]) for name in known) > URDF_CHANGE_M:
                 self._urdf_origins[identity] = origins
-                messages[identity]["urdf"] = self._factory.make(
-                    "std_msgs/msg/String", data=make_urdf(to_name_component(identity), origins)
-                )
+                urdf = make_urdf(to_name_component(identity), origins, self._skeleton.mass(fit.state.shape))
+                messages[identity]["urdf"] = self._factory.make("std_msgs/msg/String", data=urdf)
         return self.ros4hri.make(header, alive, messages)
+
+
+class BodyMeasuring:
+    """Makes the messages `measurements`, and remembers when each person was measured."""
+
+    def __init__(self, enabled: bool, factory: MessageFactory, model: StitchedPuppet) -> None:
+        """Make the port, or none when nobody asks for measurements."""
+        self.ports = (Port("measurements", MEASUREMENTS),) if enabled else ()
+        self._factory = factory
+        self._model = model
+        self._last: dict[str, int] = {}
+
+    def make(self, header: Any, bodies: Sequence[TrackedBody], alive: Collection[str]) -> Output:
+        """Return the message for those of the `bodies` in one cloud whose turn it is, nothing when it is nobody's.
+
+        Who is hidden shows nothing new, and waits. Who is not among the ids `alive` is forgotten.
+        """
+        if not self.ports:
+            return []
+        stamp = header_ns(header)
+        self._last = {identity: last for identity, last in self._last.items() if identity in alive}
+        due = [body for body in bodies if body.status != TrackStatus.HIDDEN and self._is_due(body.id, stamp)]
+        if not due:
+            return []
+        self._last |= {body.id: stamp for body in due}
+        people = [(body, measure_fit(self._model, body.fit.state, body.fit.vertices)) for body in due]
+        return [("measurements", make_measurements(self._factory, header, people))]
+
+    def _is_due(self, identity: str, stamp: int) -> bool:
+        """Return whether a person is new, was not measured for a while, or the stamps began anew."""
+        last = self._last.get(identity)
+        return last is None or not 0 <= stamp - last < MEASURING_INTERVAL_NS
 
 
 def id_sort_key(identity: str) -> tuple[int, str]:

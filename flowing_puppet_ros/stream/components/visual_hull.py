@@ -25,6 +25,7 @@ from flowing_puppet_ros.stream.components.person_views import (
     observe_person,
 )
 from flowing_puppet_ros.stream.messages.bodies.silhouettes import make_silhouettes
+from flowing_puppet_ros.stream.messages.camera_info import describe_images
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image, decode_labels
@@ -197,6 +198,7 @@ class VisualHullComponent(Component[VisualHullSettings]):
         info = self._infos.get(name)
         if info is None:
             raise InputError(f"no camera_info came yet on {name}/camera_info")
+        info = describe_images(info)
         frame = info.header.frame_id
         if first:
             # Looked up for every set: /tf_static may come after the first images.

@@ -10,6 +10,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F32
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.stream.messages.camera_info import describe_images
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.images import decode_depth
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory
@@ -33,8 +34,12 @@ def back_project_image(depth: F32, info: Any) -> F32:
     or calibrated for another image size.
     """
     height, width = depth.shape
+    info = describe_images(info, (width, height))
     if (int(info.width), int(info.height)) != (width, height):
-        raise InputError(f"the depth image is {width}x{height}, its camera_info says {info.width}x{info.height}")
+        raise InputError(
+            f"the depth image is {width}x{height}, its camera_info says {info.width}x{info.height}: publish the"
+            " camera_info of these images, as image_proc's resize does"
+        )
     fx, fy, cx, cy = _read_pinhole(info)
     step = max(1, math.ceil(math.sqrt(width * height / MAX_POINTS)))
     rows, columns = np.arange(step // 2, height, step), np.arange(step // 2, width, step)

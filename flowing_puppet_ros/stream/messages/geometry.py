@@ -8,16 +8,23 @@ messages of either kind.
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.model.rotation import quaternion
+from flowing_puppet_ros.model.rotation import exp, log, quaternion
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, MessageFactory
 from flowing_puppet_ros.units import NANOSECONDS
+
+KEPT_NS = 10 * NANOSECONDS
+"""Time for which the poses of a moving frame are kept."""
+MAX_DISORDER_NS = 100_000_000
+"""A transform whose stamp is this much before the last of its frame is that of a new recording."""
 
 
 def header_ns(header: Any) -> int:
@@ -112,47 +119,167 @@ def make_camera_info(
     )
 
 
+@dataclass(slots=True, eq=False)
+class _Link:
+    """A frame in its parent: poses (x, y, z, qx, qy, qz, qw) by stamp, ns, or one that always holds."""
+
+    parent: str
+    stamps: list[int]
+    poses: list[tuple[float, ...]]
+    is_static: bool
+
+
 class FrameTree:
-    """The static frames received on `/tf_static`."""
+    """The frames received on `/tf_static`, and on `/tf` those that move, each with its poses of the last while."""
 
     def __init__(self) -> None:
-        self._parent: dict[str, tuple[str, F64, F64]] = {}
+        self._links: dict[str, _Link] = {}
+        self._newest = 0
 
-    def add(self, message: Any) -> None:
-        """Add the transforms of a TFMessage; a later one replaces an earlier one of the same child.
+    def add(self, message: Any, moving: bool = False) -> None:
+        """Add the transforms of a TFMessage; `moving` are those of `/tf`, which hold at their stamps.
 
-        InputError names the first that cannot be used, after all others were added.
+        A later static one replaces an earlier one of the same child. A stamp that jumps back starts a moving frame
+        anew. InputError names the first that cannot be used, after all others were added.
         """
         unusable = []
         for item in message.transforms:
             parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
             t, q = item.transform.translation, item.transform.rotation
+            pose = (float(t.x), float(t.y), float(t.z), float(q.x), float(q.y), float(q.z), float(q.w))
             try:
-                self._parent[child] = (parent, np.array([t.x, t.y, t.z], float), rotation_matrix((q.x, q.y, q.z, q.w)))
+                _check_pose(pose)
             except InputError as error:
                 unusable.append(f"the transform from {parent!r} to {child!r} cannot be used: {error}")
+                continue
+            if not moving:
+                self._links[child] = _Link(parent, [0], [pose], True)
+            else:
+                self._add_moving(parent, child, header_ns(item.header), pose)
         if unusable:
             raise InputError(unusable[0])
 
+    def _add_moving(self, parent: str, child: str, stamp: int, pose: tuple[float, ...]) -> None:
+        link = self._links.get(child)
+        if link is not None and link.is_static:
+            return
+        if link is None or link.parent != parent or stamp < link.stamps[-1] - MAX_DISORDER_NS:
+            link = self._links[child] = _Link(parent, [], [], False)
+            self._newest = min(self._newest, stamp)
+        place = bisect_left(link.stamps, stamp)
+        if place < len(link.stamps) and link.stamps[place] == stamp:
+            link.poses[place] = pose
+        else:
+            link.stamps.insert(place, stamp)
+            link.poses.insert(place, pose)
+        if stamp - link.stamps[0] > 2 * KEPT_NS:  # seldom, since it moves all others
+            old = bisect_left(link.stamps, stamp - KEPT_NS)
+            del link.stamps[:old], link.poses[:old]
+        if stamp > self._newest + KEPT_NS:
+            self._newest = stamp
+            self._links = {name: each for name, each in self._links.items() if not _is_old(each, stamp)}
+
+    def forget_moving(self) -> None:
+        """Forget the frames that move."""
+        self._links = {child: link for child, link in self._links.items() if link.is_static}
+
     def find_root(self, frame: str) -> str:
         """Return the topmost known ancestor of `frame`, or `frame` itself when it has none."""
-        return self._pose_in_root(frame)[0]
+        return self._list_ancestors(frame)[-1]
 
-    def _pose_in_root(self, frame: str) -> tuple[str, F64, F64]:
-        position, rotation = np.zeros(3), np.eye(3)
-        seen = {frame}
-        while frame in self._parent:
-            frame, parent_position, parent_rotation = self._parent[frame]
-            if frame in seen:
-                raise InputError(f"the frames on /tf_static form a loop through {frame!r}")
-            seen.add(frame)
-            position, rotation = parent_rotation @ position + parent_position, parent_rotation @ rotation
-        return frame, position, rotation
+    def _list_ancestors(self, frame: str) -> list[str]:
+        """Return a frame and its ancestors, the root last."""
+        found = [frame]
+        while found[-1] in self._links:
+            above = self._links[found[-1]].parent
+            if above in found:
+                topic = "/tf_static" if all(self._links[name].is_static for name in found) else "/tf"
+                raise InputError(f"the frames on {topic} form a loop through {above!r}")
+            found.append(above)
+        return found
 
-    def lookup_pose(self, frame: str, target: str) -> tuple[F64, F64] | None:
-        """Return the position (3,) and rotation (3, 3) of `frame` in `target`; None when they are not connected."""
-        frame_root, position, rotation = self._pose_in_root(frame.lstrip("/"))
-        target_root, target_position, target_rotation = self._pose_in_root(target.lstrip("/"))
-        if frame_root != target_root:
+    def _list_links(self, frame: str, target: str) -> tuple[list[_Link], list[_Link]] | None:
+        """Return the links from two frames up to their nearest common ancestor; None when they have none."""
+        own, other = self._list_ancestors(frame.lstrip("/")), self._list_ancestors(target.lstrip("/"))
+        if own[-1] != other[-1]:
             return None
-        return target_rotation.T @ (position - target_position), target_rotation.T @ rotation
+        while len(own) > 1 and len(other) > 1 and own[-2] == other[-2]:
+            own.pop()
+            other.pop()
+        return [self._links[name] for name in own[:-1]], [self._links[name] for name in other[:-1]]
+
+    def is_connected(self, frame: str, target: str) -> bool:
+        """Return whether two frames belong together, whenever that is known."""
+        return self._list_links(frame, target) is not None
+
+    def is_awaited(self, frame: str, target: str, stamp: int) -> bool:
+        """Return whether transforms that are yet to come may tell how two frames lie at a stamp, ns."""
+        links = self._list_links(frame, target)
+        return links is None or any(not link.is_static and link.stamps[-1] < stamp for link in (*links[0], *links[1]))
+
+    def lookup_pose(self, frame: str, target: str, stamp: int | None = None) -> tuple[F64, F64] | None:
+        """Return the position (3,) and rotation (3, 3) of `frame` in `target`; None when that is not known.
+
+        Frames that move are where they are at a stamp, ns: between two stamps they move and turn evenly, and nothing
+        is known before the first and after the last. Without a stamp they are where they were last.
+        """
+        links = self._list_links(frame, target)
+        if links is None:
+            return None
+        poses = []
+        for chain in links:
+            position, turn = np.zeros(3), np.eye(3)
+            for link in chain:
+                pose = _find_pose(link, stamp)
+                if pose is None:
+                    return None
+                position, turn = pose[1] @ position + pose[0], pose[1] @ turn
+            poses.append((position, turn))
+        (position, turn), (target_position, target_turn) = poses
+        return target_turn.T @ (position - target_position), target_turn.T @ turn
+
+    def describe_missing(self, frame: str, target: str, stamp: int) -> str:
+        """Return why the pose of a frame in another is not known at a stamp, ns, and what to do."""
+        frame, target = frame.lstrip("/"), target.lstrip("/")
+        links = self._list_links(frame, target)
+        if links is None:
+            return f"/tf and /tf_static do not connect {frame!r} with {target!r}; publish or record the transform"
+        moving = [link for link in (*links[0], *links[1]) if not link.is_static]
+        late = max((stamp - link.stamps[-1] for link in moving), default=0)
+        if late > 0:
+            return (
+                f"the last transform between {frame!r} and {target!r} is {late * 1e-9:.2f} s older than what it is "
+                "needed for; publish it more often or sooner, or synchronise the clocks"
+            )
+        return f"there is no transform between {frame!r} and {target!r} as old as what it is needed for"
+
+
+def _check_pose(pose: tuple[float, ...]) -> None:
+    """Raise an InputError for a pose that is none."""
+    if not math.isfinite(length := math.hypot(*pose[3:])) or length == 0:
+        rotation_matrix(pose[3:])
+    if not all(map(math.isfinite, pose[:3])):
+        raise InputError(f"the translation ({', '.join(f'{c:g}' for c in pose[:3])}) is not finite")
+
+
+def _is_old(link: _Link, stamp: int) -> bool:
+    """Return whether nothing has been heard of a moving frame for long before a stamp, ns."""
+    return not link.is_static and stamp - link.stamps[-1] > 2 * KEPT_NS
+
+
+def _find_pose(link: _Link, stamp: int | None) -> tuple[F64, F64] | None:
+    """Return position and rotation in the parent at a stamp, ns, or the last ones; None outside of what is known."""
+    if link.is_static or stamp is None:
+        later = len(link.stamps) - 1
+        share = 0.0
+    else:
+        later = bisect_left(link.stamps, stamp)
+        if later == len(link.stamps) or (later == 0 and link.stamps[0] > stamp):
+            return None
+        share = 0.0 if link.stamps[later] == stamp else 1.0
+    after = np.array(link.poses[later][:3]), rotation_matrix(link.poses[later][3:])
+    if share == 0.0 or stamp is None:
+        return after
+    before = np.array(link.poses[later - 1][:3]), rotation_matrix(link.poses[later - 1][3:])
+    share = (stamp - link.stamps[later - 1]) / (link.stamps[later] - link.stamps[later - 1])
+    return before[0] + share * (after[0] - before[0]), before[1] @ exp(share * log(before[1].T @ after[1]))

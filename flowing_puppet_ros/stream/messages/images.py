@@ -29,6 +29,8 @@ _RAW: dict[str, tuple[int, int, int | None]] = {
     "8uc3": (3, 8, cv2.COLOR_BGR2RGB),
     "rgba8": (4, 8, cv2.COLOR_RGBA2RGB),
     "bgra8": (4, 8, cv2.COLOR_BGRA2RGB),
+    "argb8": (4, 8, None),
+    "abgr8": (4, 8, None),
     "8uc4": (4, 8, cv2.COLOR_BGRA2RGB),
     "mono8": (1, 8, cv2.COLOR_GRAY2RGB),
     "8uc1": (1, 8, cv2.COLOR_GRAY2RGB),
@@ -39,7 +41,7 @@ _RAW: dict[str, tuple[int, int, int | None]] = {
     "bgra16": (4, 16, cv2.COLOR_BGRA2RGB),
     "16uc4": (4, 16, cv2.COLOR_BGRA2RGB),
     **{f"mono{bits}": (1, bits, cv2.COLOR_GRAY2RGB) for bits in (10, 12, 14, 16)},
-    **dict.fromkeys(("yuv422", "uyvy", "uyvy422", "2vuy"), (2, 8, cv2.COLOR_YUV2RGB_UYVY)),
+    **dict.fromkeys(("yuv422", "yuv422_uyvy", "uyvy", "uyvy422", "2vuy"), (2, 8, cv2.COLOR_YUV2RGB_UYVY)),
     **dict.fromkeys(("yuv422_yuy2", "yuyv", "yuyv422", "yuy2"), (2, 8, cv2.COLOR_YUV2RGB_YUY2)),
     "yvyu": (2, 8, cv2.COLOR_YUV2RGB_YVYU),
     **{
@@ -137,6 +139,8 @@ def decode_image(message: Any) -> U8:
     pixels = _read_rows(message, channels, np.dtype("u1" if bits == 8 else ">u2" if message.is_bigendian else "<u2"))
     if bits > 8:
         pixels = np.minimum(pixels >> (bits - 8), 255).astype(np.uint8)
+    if channels == 4 and conversion is None:  # transparency comes first
+        pixels = pixels[:, :, 1:] if encoding == "argb8" else pixels[:, :, :0:-1]
     if conversion is None:
         # Kernels are compiled for writeable arrays, which all other conversions return.
         return np.array(pixels)
@@ -213,6 +217,7 @@ def _read_rows(message: Any, channels: int, dtype: np.dtype[Any]) -> Array:
         raise InputError(f"an image of {width}x{height} is larger than {MAX_PIXELS // 1_000_000} million pixels")
     data = message_bytes(message.data)
     needed = width * channels * dtype.itemsize
+    step = step or needed  # some drivers leave it out
     if height < 1 or width < 1 or step < needed or len(data) < step * (height - 1) + needed:
         raise InputError(f"an image of {width}x{height} {message.encoding} has step {step} and {len(data)} bytes")
     rows = np.lib.stride_tricks.as_strided(data, (height, needed), (step, 1), writeable=False)

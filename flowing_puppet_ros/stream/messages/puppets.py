@@ -124,6 +124,20 @@ def make_body(factory: MessageFactory, model: StitchedPuppet, body: TrackedBody)
     )
 
 
+def make_coarse_body(
+    factory: MessageFactory, names: Sequence[str], identity: str, joints: Array, confidence: Array
+) -> Any:
+    """Return the Body message of a person of whom only joints (J, 3) m and their confidence (J,) are known, roughly."""
+    inferred = [0] * len(joints)
+    known = np.isfinite(joints).all(axis=1)
+    return factory.make(
+        _MESSAGES + "Body",
+        id=identity,
+        confidence=confidence[known].mean(),
+        joints=make_joints(factory, names, joints, confidence, inferred),
+    )
+
+
 def make_bodies(factory: MessageFactory, header: Any, bodies: list[Any]) -> Any:
     """Return a BodyArray."""
     return factory.make(BODIES, header=header, bodies=bodies)

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
-import open3d as o3d
 import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -27,6 +27,7 @@ from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.model import rotation, weights
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
+o3d = pytest.importorskip("open3d", reason="the extra `scans`")  # cuts surfaces by itself
 PEOPLE = 20
 TOLERANCE_M = 0.01
 """Asked of lengths and girths; the volume, in cubic metres, is asked more closely by it."""
@@ -62,11 +63,11 @@ def people() -> tuple[np.ndarray, list[tuple[np.ndarray, dict[str, np.ndarray]]]
     return anny.triangles, [(rest.vertices, anny.locate_landmarks(rest.vertices, rest.joints)) for rest in rests]
 
 
-def tensor(values: np.ndarray) -> o3d.core.Tensor:
+def tensor(values: np.ndarray) -> Any:
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(values))
 
 
-def cut(mesh: o3d.t.geometry.TriangleMesh, level: float) -> list[float]:
+def cut(mesh: Any, level: float) -> list[float]:
     """Return the lengths of tapes around the loops that another library cuts, the longest first."""
     lines = mesh.slice_plane(tensor(np.array([0.0, 0.0, level])), tensor(np.array([0.0, 0.0, 1.0])), [0.0])
     points, pairs = lines.point.positions.numpy()[:, :2], lines.line.indices.numpy()

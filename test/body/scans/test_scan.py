@@ -99,6 +99,7 @@ BAD: dict[str, bytes | None] = {
     "empty.xyz": b"",
     "words.xyz": b"not numbers at all\n",
     "two.xyz": b"1 2\n3 4\n",
+    "same.xyz": b"1 2 3\n" * 60,
     "broken.npy": b"\x93NUMPY\x01\x00",
     "broken.npz": b"PK\x03\x04junk",
     "broken.obj": b"\x00\x01\x02",

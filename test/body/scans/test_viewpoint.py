@@ -90,3 +90,11 @@ def test_a_view_known_to_be_single_takes_what_there_is() -> None:
     assert place is not None
     away = place - whole.mean(axis=0)
     np.testing.assert_allclose(away / np.linalg.norm(away), [0, 0.6, 0.8])
+
+
+def test_clouds_that_nobody_can_have_seen_from_a_side_have_no_viewpoint() -> None:
+    """A tube that stands about the origin, which lies on the border of its box; and points all in one place."""
+    angle, height = np.random.default_rng(0).uniform(0, 1, (2, 5000)) * [[2 * np.pi], [1.7]]
+    tube = np.stack([0.2 * np.cos(angle), 0.2 * np.sin(angle), height + 1e-4], axis=1)
+    assert find_viewpoint(tube, None) is None
+    assert find_viewpoint(np.ones((500, 3)), None) is None

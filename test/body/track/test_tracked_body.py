@@ -63,7 +63,7 @@ def test_a_turned_frame_turns_body_and_velocity_alike() -> None:
     motion = TorsoMotion()
     motion.add("b1", 0, body_at(np.zeros(3)))
     found = motion.add("b1", INTERVAL_NS, body_at(0.1 * SPEED))
-    turned = found.rotate(rotation.exp(np.array([0.0, 0.0, np.pi / 2])))
+    turned = found.move(rotation.exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
     np.testing.assert_allclose(turned.velocity, [0.4, 1.2, 0.0], atol=1e-6)
     joints = np.stack([-found.fit.joints[:, 1], found.fit.joints[:, 0], found.fit.joints[:, 2]], axis=1)
     np.testing.assert_allclose(turned.fit.joints, joints, atol=1e-12)
@@ -72,7 +72,7 @@ def test_a_turned_frame_turns_body_and_velocity_alike() -> None:
 
 def test_a_jump_that_nobody_can_make_is_not_sure_until_the_next_body_agrees() -> None:
     motion, fit = TorsoMotion(), body_at(np.zeros(3))
-    around = TrackedBody("b1", fit).rotate(rotation.exp(np.array([0.0, 0.0, np.pi]))).fit
+    around = TrackedBody("b1", fit).move(rotation.exp(np.array([0.0, 0.0, np.pi])), np.zeros(3)).fit
     step = 67_000_000
     assert motion.add("b1", 0, fit).fit.reliable
     assert motion.add("b1", step, fit).fit.reliable

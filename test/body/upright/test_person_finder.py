@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A person whom no puppet model made is found in a scan, at their height, and furniture is not."""
 
+from concurrent.futures import ThreadPoolExecutor
 from importlib.util import find_spec
 
 import numpy as np
@@ -60,6 +61,29 @@ def test_the_person_is_found_at_their_height_and_the_cupboard_is_not(
     assert abs(fit.vertices[:, 2].min() + HEIGHT) < 0.05
     assert fit.confidence > 0.7
     assert fit.vertices.tobytes() == found[1][1].vertices.tobytes()
+
+
+@LEARN
+def test_in_a_recording_everybody_has_a_body_in_the_first_scan() -> None:
+    """Live, three at most have one, so that no scan waits long for its bodies."""
+    from flowing_puppet_ros.learn.anny.body import AnnyBody
+
+    anny = AnnyBody("neutral")
+    rest = anny.make_rest_body(anny.mean_phenotype())
+    standing = rest.vertices - [*rest.vertices[:, :2].mean(axis=0), rest.vertices[:, 2].min()]
+    places = np.array([[6.0, 2.0 * k - 4.0, 0.0] for k in range(5)])
+    floor = make_box(np.array([0, 0, -0.05]), np.array([40, 40, 0.1]), np.eye(3))
+    people = [(standing + place, anny.triangles) for place in places]
+    points = scan_scene([floor], people, np.random.default_rng(0), "spinning-64", HEIGHT)[0]
+    tracker = SceneTracker(BodyFitter(StitchedPuppet.load(), FitterSettings()), SceneSettings())
+    bodies = tracker.step(SceneCloud(points, None, 100_000_000), 0)[0]
+    assert [body.id for body in bodies] == ["b1", "b2", "b3", "b4", "b5"]
+    middles = np.array([body.fit.vertices[:, :2].mean(axis=0) for body in bodies])
+    nearest = np.linalg.norm(middles[:, None] - places[:, :2], axis=2)
+    assert sorted(nearest.argmin(axis=1)) == [0, 1, 2, 3, 4] and nearest.min(axis=1).max() < 0.15
+    tracker.reset()
+    with ThreadPoolExecutor(1) as beside:
+        assert len(tracker.step(SceneCloud(points, None, 100_000_000), 0, beside)[0]) == 3
 
 
 @LEARN

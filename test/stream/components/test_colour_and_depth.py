@@ -106,7 +106,10 @@ def test_without_a_puppet_nobody_in_view_has_a_body(model: StitchedPuppet) -> No
 
 @pytest.mark.parametrize(
     ("frame", "calibrated", "sentence"),
-    [("other", True, "/tf_static does not connect"), ("eye", False, "no puppets/camera_info came yet")],
+    [
+        ("other", True, "/tf and /tf_static do not connect 'eye' with 'other'"),
+        ("eye", False, "no puppets/camera_info came yet"),
+    ],
 )
 def test_what_cannot_be_joined_is_one_sentence_and_the_cloud_is_used_alone(
     model: StitchedPuppet, frame: str, calibrated: bool, sentence: str
@@ -136,6 +139,31 @@ def test_depth_that_is_nowhere_known_is_one_sentence_and_ids_go_on(model: Stitch
         if not shown:
             image.data = np.full((HEIGHT, WIDTH), np.nan, np.float32).view(np.uint8).ravel()
         (array,) = bodies_in(component.handle("depth", image))
-        assert [body.id for body in array.bodies] == (["a1"] if shown else [])
+        assert [(body.id, len(body.parts)) for body in array.bodies] == [("a1", 16 if shown else 0)]
     (said,) = component.report.drain_warnings()
     assert "the cloud has no finite point" in said
+
+
+def test_who_is_seen_in_colour_only_is_as_far_away_as_the_size_says(model: StitchedPuppet) -> None:
+    """Somebody beyond the depth sensor's range stays in the messages, somebody before a wall that it sees does not."""
+    near, far = stand_at(joints_of(), 2.5, 0.4), stand_at(joints_of(), 9.0, -0.8)
+    component = make()
+    component.handle("puppets/camera_info", info(SECOND, 2.0))
+    component.handle("camera_info", info(SECOND, 1.0))
+    component.handle("puppets", puppets(model, SECOND, [near, far]))
+    image = depth(SECOND, [near])
+    metres = np.frombuffer(image.data.tobytes(), np.float32).reshape(HEIGHT, WIDTH).copy()
+    metres[metres > 3.5] = np.nan  # the sensor's range ends before the wall
+    image.data = metres.view(np.uint8).ravel()
+    (array,) = bodies_in(component.handle("depth", image) + component.flush())
+    assert [(body.id, len(body.parts), body.reliable) for body in array.bodies] == [("a1", 16, True), ("a2", 0, False)]
+    joints = {joint.name: joint for joint in array.bodies[1].joints}
+    hip, true = joints["left_hip"].position, far.joints["left_hip"]
+    assert np.hypot(hip.x / hip.z + true[1] / true[0], hip.y / hip.z + true[2] / true[0]) < 0.02  # on its ray
+    assert hip.z == pytest.approx(true[0], rel=0.2)
+    assert all(joint.visibility == 0 and joint.confidence < 0.35 for joint in joints.values())
+
+    component.handle("camera_info", info(2 * SECOND, 1.0))
+    component.handle("puppets", puppets(model, 2 * SECOND, [near, far]))
+    (array,) = bodies_in(component.handle("depth", depth(2 * SECOND, [near])) + component.flush())
+    assert [body.id for body in array.bodies] == ["a1"]  # a wall is where a2 should be seen

@@ -23,7 +23,8 @@ from flowing_puppet_ros.stream.components.ros4hri import (
     make_skeleton2d,
     to_name_component,
 )
-from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import JOINTS, MOVING_JOINTS, Skeleton, make_urdf
+from flowing_puppet_ros.stream.messages.bodies.human_urdf import find_limits, make_urdf
+from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import JOINTS, MOVING_JOINTS, Skeleton
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image
 
@@ -136,7 +137,7 @@ def test_the_puppets_of_an_image_are_humans(recorded: tuple[list[Any], dict[int,
 
 def test_a_person_as_urdf() -> None:
     model = StitchedPuppet.load()
-    root = ET.fromstring(make_urdf("b1", Skeleton(model).joint_origins(model.rest_state().shape)))
+    root = ET.fromstring(make_urdf("b1", Skeleton(model).joint_origins(model.rest_state().shape), 70.0))
     links = [link.attrib["name"] for link in root.findall("link")]
     joints = {joint.attrib["name"]: joint for joint in root.findall("joint")}
     assert len(set(links)) == len(links) == len(joints) + 1 and links[0] == "body_b1"
@@ -148,3 +149,71 @@ def test_a_person_as_urdf() -> None:
         parent, child = joint.find("parent"), joint.find("child")
         assert parent is not None and child is not None
         assert links.index(parent.attrib["link"]) < links.index(child.attrib["link"])
+
+
+def turn(origin: ET.Element) -> np.ndarray:
+    """Return the rotation (3, 3) of an <origin>: about x, then y, then z, fixed axes."""
+    roll, pitch, yaw = map(float, origin.attrib["rpy"].split())
+    x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
+    y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    z = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    return z @ y @ x
+
+
+def test_the_urdf_has_a_persons_mass_and_their_moments_of_inertia() -> None:
+    model = StitchedPuppet.load()
+    skeleton, shape = Skeleton(model), model.rest_state().shape
+    mass, origins = skeleton.mass(shape), skeleton.joint_origins(shape)
+    assert 50 < mass < 90
+    root = ET.fromstring(make_urdf("b1", origins, mass))
+    masses, center, inertia = [], np.zeros(3), np.zeros((3, 3))
+    places = {"body_b1": np.zeros(3)}
+    for joint in root.findall("joint"):
+        parent, child, origin = joint.find("parent"), joint.find("child"), joint.find("origin")
+        assert parent is not None and child is not None and origin is not None
+        place = places[parent.attrib["link"]] + np.array([float(v) for v in origin.attrib["xyz"].split()])
+        places[child.attrib["link"]] = place
+    for link in root.findall("link"):
+        inertial = link.find("inertial")
+        assert len(link.findall("visual")) == len(link.findall("collision"))
+        if inertial is None:
+            continue
+        own, weight, moments = inertial.find("origin"), inertial.find("mass"), inertial.find("inertia")
+        assert own is not None and weight is not None and moments is not None
+        at = places[link.attrib["name"]] + np.array([float(v) for v in own.attrib["xyz"].split()])
+        masses.append(float(weight.attrib["value"]))
+        center += masses[-1] * at
+        main = np.diag([float(moments.attrib[name]) for name in ("ixx", "iyy", "izz")])
+        assert (np.linalg.eigvalsh(main)[:2].sum() >= np.linalg.eigvalsh(main)[2]).all(), "no such body exists"
+        inertia += turn(own) @ main @ turn(own).T + masses[-1] * (at @ at * np.eye(3) - np.outer(at, at))
+    assert sum(masses) == pytest.approx(mass, rel=1e-3) and len(masses) == 14
+    center /= mass
+    inertia -= mass * (center @ center * np.eye(3) - np.outer(center, center))
+    # Standing people of 70 kg: centre of mass near the navel; 12, 11 and 1.2 kg m2 about depth, width and length.
+    assert abs(center[:2]).max() < 0.1 and 0.0 < center[2] < 0.3
+    np.testing.assert_allclose(np.diag(inertia)[:2] / mass, [12 / 70, 11 / 70], rtol=0.35)
+    assert 0.8 / 70 < inertia[2, 2] / mass < 2.2 / 70
+
+
+def test_no_person_of_the_model_breaks_the_limits_of_the_joints() -> None:
+    model, rng = StitchedPuppet.load(), np.random.default_rng(4)
+    skeleton = Skeleton(model)
+    beyond = []
+    for _ in range(60):
+        state = model.sample(rng)
+        angles = skeleton.joint_angles(model.joints(model.vertices(state)), state)
+        beyond += [name for name, value in angles.items() if not find_limits(name)[0] <= value <= find_limits(name)[1]]
+    assert not beyond
+    assert find_limits("l_knee") != find_limits("r_elbow") and find_limits("r_y_shoulder") == (-np.pi, np.pi)
+
+
+def test_links_have_the_names_that_hri_rviz_shows() -> None:
+    """Its TF display knows a skeleton's frames by these names, an underscore and an id of five letters."""
+    shown = {"head", "torso", "waist", "p_head", "y_head"} | {
+        f"{side}_{name}"
+        for side in "lr"
+        for name in ("ankle", "elbow", "hip", "knee", "p_hip", "p_shoulder", "shoulder", "wrist", "y_hip", "y_shoulder")
+    }
+    # It leaves out the link between torso and head that rolls.
+    assert {joint.link for joint in JOINTS} - shown == {"r_head"}
+    assert shown <= {joint.link for joint in JOINTS}

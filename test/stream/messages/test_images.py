@@ -47,10 +47,15 @@ def test_packed_colours_come_back_exactly() -> None:
         "8UC3": rgb[:, :, ::-1],
         "rgba8": alpha,
         "bgra8": alpha[:, :, [2, 1, 0, 3]],
+        "argb8": alpha[:, :, [3, 0, 1, 2]],
+        "abgr8": alpha[:, :, [3, 2, 1, 0]],
     }.items():
         for padding in (0, 5):
             decoded = images.decode_image(message(pixels, encoding, padding))
             np.testing.assert_array_equal(decoded, rgb, err_msg=encoding)
+        left_out = message(pixels, encoding)
+        left_out.step = 0
+        np.testing.assert_array_equal(images.decode_image(left_out), rgb, err_msg=encoding)
 
 
 def test_a_shared_image_is_decoded_once_while_it_is_kept() -> None:
@@ -83,7 +88,7 @@ def test_grey_becomes_three_equal_channels(big: Any) -> None:
     np.testing.assert_array_equal(images.decode_image(message(pixels, "mono16", 2, big)), np.dstack([grey] * 3))
 
 
-@pytest.mark.parametrize(("encoding", "order"), [("yuv422", "uyvy"), ("yuv422_yuy2", "yuyv"), ("uyvy", "uyvy")])
+@pytest.mark.parametrize(("encoding", "order"), [("yuv422", "uyvy"), ("yuv422_yuy2", "yuyv"), ("yuv422_uyvy", "uyvy")])
 def test_yuv422_packs_one_colour_for_two_pixels(encoding: Any, order: Any) -> None:
     rgb = ramp()
     yuv = cv2.cvtColor(rgb, cv2.COLOR_RGB2YUV).astype(float)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kinematic skeleton of REP-155 fitted into a body: 20 joint angles, link frames and a URDF.
+"""The kinematic skeleton of REP-155 fitted into a body: 20 joint angles, link frames, origins of joints, the mass.
 
 Names, order and axes are those of REP-155: at zero the person stands upright with hanging limbs, x out of the chest,
 y to the left, z to the head. Lengths are those of the fitted person.
@@ -11,14 +11,16 @@ import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from flowing_puppet_ros.body.measurements.sections import signed_volume
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
+BODY_DENSITY = 985.0
+"""Of a person whose lungs hold air, kg/m3."""
 RELIABLE_BEND_SINE = 0.2
 """Sine of the bend at which a limb's two bones determine the hinge's axis as reliably as the part's rotation does."""
 
@@ -27,11 +29,16 @@ type Axis = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class SkeletonJoint:
-    """A joint with the link of the same name, its parent link and its axis of rotation (x, y, z); None is fixed."""
+    """A joint, its parent link and its axis of rotation (x, y, z); None is fixed."""
 
     name: str
     parent: str
     axis: Axis | None = None
+
+    @property
+    def link(self) -> str:
+        """The link that it moves, of the same name; but a limb's first bone is l_shoulder and not l_r_shoulder."""
+        return self.name.replace("_r_shoulder", "_shoulder").replace("_r_hip", "_hip")
 
 
 def _limb_joints(
@@ -45,7 +52,7 @@ def _limb_joints(
     ]
     return [
         *first,
-        SkeletonJoint(f"{side}_{hinge}", roll, (0, -1, 0)),
+        SkeletonJoint(f"{side}_{hinge}", first[-1].link, (0, -1, 0)),
         SkeletonJoint(f"{side}_{end}", f"{side}_{hinge}"),
     ]
 
@@ -111,6 +118,11 @@ class Skeleton:
                 found[f"{short}_{second}"] = np.array([0.0, 0.0, -np.linalg.norm(b - a)])
                 found[f"{short}_{third}"] = np.array([0.0, 0.0, -np.linalg.norm(c - b)])
         return found
+
+    def mass(self, shape: np.ndarray) -> float:
+        """Return the mass in kg of a person of `shape` (16, S): that of the volume of their body at rest."""
+        vertices = self._model.vertices(replace(self._model.rest_state(), shape=shape))
+        return BODY_DENSITY * signed_volume(vertices, self._model.faces)
 
     def joint_angles(self, joints: np.ndarray, state: BodyState) -> dict[str, float]:
         """Return the angles (radians) of the 20 moving joints by name, in the order of `MOVING_JOINTS`.
@@ -185,46 +197,8 @@ def link_frames(origins: Mapping[str, np.ndarray], angles: Mapping[str, float]) 
     for joint in JOINTS:
         position, orientation = frames[joint.parent]
         own = np.eye(3) if joint.axis is None else rotation.exp(angles[joint.name] * np.array(joint.axis, float))
-        frames[joint.name] = position + orientation @ origins[joint.name], orientation @ own
+        frames[joint.link] = position + orientation @ origins[joint.name], orientation @ own
     return frames
-
-
-def make_urdf(identity: str, origins: Mapping[str, np.ndarray]) -> str:
-    """Return the person's URDF: links and joints of `JOINTS`, names ending in `_<identity>`, bones as cylinders."""
-    lines = ['<?xml version="1.0"?>', f"<robot name={quoteattr('human_' + identity)}>"]
-    lines.append(f"  <link name={quoteattr('body_' + identity)}/>")
-    bones: dict[str, list[np.ndarray]] = {}
-    for joint in JOINTS:
-        bones.setdefault(joint.parent, []).append(origins[joint.name])
-    for joint in JOINTS:
-        lines += _make_link(f"{joint.name}_{identity}", bones.get(joint.name, []), ball=joint.name == "head")
-        x, y, z = origins[joint.name]
-        kind = "fixed" if joint.axis is None else "revolute"
-        lines.append(f'  <joint name={quoteattr(f"{joint.name}_{identity}")} type="{kind}">')
-        lines.append(f"    <parent link={quoteattr(f'{joint.parent}_{identity}')}/>")
-        lines.append(f"    <child link={quoteattr(f'{joint.name}_{identity}')}/>")
-        lines.append(f'    <origin xyz="{x:.4f} {y:.4f} {z:.4f}" rpy="0 0 0"/>')
-        if joint.axis is not None:
-            lines.append('    <axis xyz="{:g} {:g} {:g}"/>'.format(*joint.axis))
-            lines.append('    <limit lower="-3.1416" upper="3.1416" effort="0" velocity="0"/>')
-        lines.append("  </joint>")
-    return "\n".join([*lines, "</robot>", ""])
-
-
-def _make_link(name: str, bones: list[np.ndarray], ball: bool) -> list[str]:
-    long = [bone for bone in bones if np.linalg.norm(bone) > 0.01]
-    shapes = ['<origin xyz="0 0 0" rpy="0 0 0"/><geometry><sphere radius="0.1"/></geometry>'] if ball else []
-    for bone in long:
-        length = float(np.linalg.norm(bone))
-        x, y, z = bone / 2
-        # A cylinder lies along z: rotated about y, then about z.
-        pitch, yaw = np.arccos(np.clip(bone[2] / length, -1, 1)), np.arctan2(bone[1], bone[0])
-        origin = f'<origin xyz="{x:.4f} {y:.4f} {z:.4f}" rpy="0 {pitch:.4f} {yaw:.4f}"/>'
-        shapes.append(f'{origin}<geometry><cylinder length="{length:.4f}" radius="0.03"/></geometry>')
-    if not shapes:
-        return [f"  <link name={quoteattr(name)}/>"]
-    visuals = [f"    <visual>{shape}</visual>" for shape in shapes]
-    return [f"  <link name={quoteattr(name)}>", *visuals, "  </link>"]
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -12,8 +12,6 @@ from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.stream.messages.bodies.ros4hri_skeleton import MOVING_JOINTS, Skeleton, link_frames
 
-LINKS = {"shoulder": "r_shoulder", "elbow": "elbow", "wrist": "wrist", "hip": "r_hip", "knee": "knee", "ankle": "ankle"}
-
 
 @pytest.fixture(scope="module")
 def model() -> StitchedPuppet:
@@ -93,7 +91,7 @@ def test_links_lie_on_the_limbs_of_any_body_anywhere(model: StitchedPuppet, skel
         for side, short in (("left", "l"), ("right", "r")):
             for first, second in (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle")):
                 bone = axes.T @ (joints[index[f"{side}_{second}"]] - joints[index[f"{side}_{first}"]])
-                link = placed[f"{short}_{LINKS[second]}"][0] - placed[f"{short}_{LINKS[first]}"][0]
+                link = placed[f"{short}_{second}"][0] - placed[f"{short}_{first}"][0]
                 cosine = bone @ link / np.linalg.norm(bone) / np.linalg.norm(link)
                 # The lower bones bend about the hinge of the upper only.
                 assert cosine > (0.9999 if second in ("elbow", "knee") else 0.98), (side, second)

@@ -51,6 +51,8 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
         InputError: when it is not a .ply file, ends early, or has no vertices with x, y and z.
     """
     data = path.read_bytes().removeprefix(codecs.BOM_UTF8)
+    if data.startswith((b"ply\rformat ascii", b"ply\rcomment")):  # lines end as they did on old Macs
+        data = data.replace(b"\r", b"\n")
     end = data.find(b"end_header")
     start = data.find(b"\n", end) + 1
     if not data.startswith(b"ply") or end < 0 or not start:
@@ -67,6 +69,8 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
     normals = None
     if all(name in vertex for name in ("nx", "ny", "nz")):
         normals = np.stack([vertex[name] for name in ("nx", "ny", "nz")], axis=1).astype(np.float64)
+    if tables.get("tristrips"):
+        raise InputError(f"{path} has strips instead of faces; export it again with triangles")
     faces = next((tables["face"][name] for name in POLYGON_NAMES if name in tables.get("face", {})), np.empty((0, 3)))
     return points, normals, np.asarray(faces, dtype=np.int64)
 

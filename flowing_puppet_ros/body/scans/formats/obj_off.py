@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import triangulate_fans
-from flowing_puppet_ros.body.scans.tables import read_text_file
+from flowing_puppet_ros.body.scans.formats.tables import read_text_file
 from flowing_puppet_ros.errors import InputError
 
 
@@ -25,7 +25,7 @@ def read_obj(path: Path) -> tuple[np.ndarray, np.ndarray]:
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
     for number, line in enumerate(_read_lines(path), start=1):
-        words = line.split()
+        words = line.split("#")[0].split()
         try:
             if words[:1] == ["v"]:
                 vertices.append([float(word) for word in words[1:4]])
@@ -49,10 +49,12 @@ def read_off(path: Path) -> tuple[np.ndarray, np.ndarray]:
         InputError: when it is not an .off file or ends before its last face.
     """
     lines = [words for line in _read_lines(path) if (words := line.split("#")[0].split())]
-    if not lines or not lines[0][0].endswith("OFF"):
+    start = re.fullmatch(r"[A-Z4]*OFF(\d*)", lines[0][0]) if lines else None
+    if start is None:
         raise InputError(f"{path} does not begin with OFF; export it again")
-    if lines[0] != ["OFF"] and len(lines[0]) > 1:
-        lines.insert(1, lines[0][1:])
+    counts = [start[1]] * bool(start[1]) + lines[0][1:]
+    if counts:  # on the first line, even without a space before them
+        lines.insert(1, counts)
     try:
         count, faces = int(lines[1][0]), int(lines[1][1])
         body = lines[2 : 2 + count + faces]

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.scans.pcd import read_viewpoint
 from flowing_puppet_ros.body.scans.scan import Scan, read_scan
 from flowing_puppet_ros.errors import InputError
 
@@ -54,6 +53,15 @@ TEXTS = {
     "tabs and windows lines": lines("\t").replace("\n", "\r\n"),
     "decimal commas": lines(" ", ","),
     "decimal commas and semicolons": lines(";", ","),
+    "decimal commas and commas": lines(", ", ","),
+    "a title": f"Scan of the second of March\n\n{lines()}",
+    "comments of percent": f"% a scan\n{lines()}% the end\n",
+    "names with units": f"x[m];y[m];z[m]\n{lines(';')}",
+    "names of a table of points": f'"Points:0","Points:1","Points:2"\n{lines(",")}',
+    "names of maps": f"Easting,Northing,Height\n{lines(',')}",
+    "brackets": "\n".join(f"[{line}]," for line in lines(", ").splitlines()),
+    "quotes": "\n".join('"{}","{}","{}"'.format(*row) for row in POINTS.tolist()),
+    "exponents of Fortran": "\n".join(" ".join(f"{number:.6E}".replace("E", "D") for number in row) for row in POINTS),
 }
 
 
@@ -71,6 +79,20 @@ def test_columns_are_taken_by_their_names(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_scan(tmp_path / "a.txt").points, POINTS)
 
 
+@pytest.mark.parametrize("heading", ["time,x,y,z", "# time x y z", "time;pos_x [m];pos_y [m];pos_z [m]", "t,X,Y,Z"])
+def test_names_say_which_columns_are_coordinates(tmp_path: Path, heading: str) -> None:
+    rows = "\n".join(",".join(map(str, (k / 7, *row))) for k, row in enumerate(POINTS.tolist()))
+    (tmp_path / "a.csv").write_text(f"{heading}\n{rows}\n")
+    np.testing.assert_allclose(read_scan(tmp_path / "a.csv").points, POINTS)
+
+
+def test_columns_of_other_names_are_not_guessed(tmp_path: Path) -> None:
+    rows = "\n".join(",".join(map(str, (k / 7, *row))) for k, row in enumerate(POINTS.tolist()))
+    (tmp_path / "a.csv").write_text(f"t,north,east,down\n{rows}\n")
+    with pytest.raises(InputError, match="the columns t, north, east, down; call those of the coordinates x, y and z"):
+        read_scan(tmp_path / "a.csv")
+
+
 def test_arrays_of_other_shapes(tmp_path: Path) -> None:
     fields = np.zeros(40, dtype=[("intensity", "f4"), ("x", "f8"), ("y", "f8"), ("z", "f8"), ("rgb", "u4")])
     for name, column in zip("xyz", POINTS.T, strict=True):
@@ -79,12 +101,17 @@ def test_arrays_of_other_shapes(tmp_path: Path) -> None:
         "transposed": POINTS.T,
         "homogeneous": np.vstack([POINTS.T, np.ones(40)]),
         "organised": POINTS.reshape(5, 8, 3),
+        "channels first": np.moveaxis(POINTS[:34].reshape(2, 17, 3), 2, 0),
         "structured": fields,
+        "upper case": fields.view([(name.upper(), fields.dtype[name]) for name in fields.dtype.names or ()]),
+        "big endian": fields.astype([(name, ">f8") for name in fields.dtype.names or ()]),
+        "grouped": np.array([(row, 1) for row in POINTS.tolist()], dtype=[("xyz", "f8", 3), ("label", "u1")]),
         "normals": np.hstack([POINTS, NORMALS]).T,
     }
     for name, array in shapes.items():
         scan = save(tmp_path / f"{name}.npy", array)
-        np.testing.assert_allclose(scan.points, POINTS, err_msg=name)
+        np.testing.assert_allclose(scan.points, POINTS[: len(scan.points)], err_msg=name)
+        assert len(scan.points) == (34 if name == "channels first" else 40)
         assert (scan.normals is not None) == (name == "normals")
 
 
@@ -97,14 +124,24 @@ def test_archives_with_objects_and_colours_beside_the_points(tmp_path: Path) -> 
     np.testing.assert_allclose(scan.normals, NORMALS)
     np.savez(tmp_path / "b.npz", scan=POINTS, colors=BYTES, meta=meta)
     np.testing.assert_allclose(read_scan(tmp_path / "b.npz").points, POINTS)
+    for name, arrays in {
+        "short names": {"v": POINTS, "f": np.array([[0, 1, 2], [1, 2, 3]])},
+        "columns": dict(zip("xyz", POINTS.T, strict=True)),
+        "upper case": {"Points": POINTS},
+        "a grid": {"lidar": POINTS.reshape(5, 8, 3)},
+    }.items():
+        np.savez(tmp_path / f"{name}.npz", **arrays)
+        np.testing.assert_allclose(read_scan(tmp_path / f"{name}.npz").points, POINTS, err_msg=name)
     np.savez(tmp_path / "c.npz", points=meta)
     with pytest.raises(InputError, match=r"points \(pickled\)"):
         read_scan(tmp_path / "c.npz")
 
 
-@pytest.mark.parametrize(("width", "last"), [(4, RNG.random(40)), (5, RNG.integers(0, 32, 40))])
+@pytest.mark.parametrize(
+    ("width", "last"), [(4, RNG.random(40)), (5, RNG.integers(0, 32, 40)), (6, RNG.integers(0, 32, 40))]
+)
 def test_raw_lidar_scans(tmp_path: Path, width: int, last: np.ndarray) -> None:
-    # 40 rows of five are also 50 rows of four.
+    # 40 rows of five are also 50 rows of four, those of six 60.
     table = np.hstack([10 * POINTS, RNG.random((40, width - 4)) * 200, last[:, None]]).astype("<f4")
     (tmp_path / "a.bin").write_bytes(table.tobytes())
     np.testing.assert_allclose(read_scan(tmp_path / "a.bin").points, 10 * POINTS, rtol=1e-6)
@@ -163,7 +200,6 @@ def test_a_vertex_without_a_place_in_a_face_is_named(tmp_path: Path) -> None:
         read_scan(tmp_path / "a.obj")
 
 
-@pytest.mark.slow
 def test_viewpoint_of_a_pcd(tmp_path: Path) -> None:
     header = "VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 40\nHEIGHT 1\nVIEWPOINT {}\n"
     header += f"POINTS 40\nDATA ascii\n{lines()}"
@@ -173,4 +209,4 @@ def test_viewpoint_of_a_pcd(tmp_path: Path) -> None:
     np.testing.assert_array_equal(scan.viewpoint, [1.5, -2, 0.25])
     for words in ("0 0 0 1 0 0 0", "nan 0 0 1 0 0 0", "a b c", "1"):
         (tmp_path / "b.pcd").write_text(header.format(words))
-        assert read_viewpoint(tmp_path / "b.pcd") is None
+        assert read_scan(tmp_path / "b.pcd").viewpoint is None

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from flowing_puppet_ros.body.scans.ply import read_ply
+from flowing_puppet_ros.body.scans.formats.ply import read_ply
 from flowing_puppet_ros.body.scans.scan import read_scan, write_ply
 from flowing_puppet_ros.errors import InputError
 

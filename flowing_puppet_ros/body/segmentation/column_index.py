@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The points of a scene by the cell of the floor that they are over, so that those near a place are found at once."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+CELL_M, MAX_CELLS = 0.5, 2000  # edge of a cell; cells a side, so that the last ones hold whatever lies beyond
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColumnIndex:
+    """Where the points of each cell are.
+
+    Attributes:
+        order: (N,) indices of the points by cell, ascending in each.
+        first: (W D + 1,) of each cell in `order`.
+        low: (2,) metres, corner of the first cell.
+        shape: (2,) number of cells along x and y.
+    """
+
+    order: np.ndarray
+    first: np.ndarray
+    low: np.ndarray
+    shape: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray) -> ColumnIndex:
+        """Sort points (N, 3) m, N > 0, into cells."""
+        low = np.maximum(points[:, :2].min(axis=0), np.median(points[:, :2], axis=0) - CELL_M * MAX_CELLS / 2)
+        shape = np.minimum(((points[:, :2].max(axis=0) - low) / CELL_M).astype(np.int64) + 1, MAX_CELLS)
+        return cls(*sort_into_cells(points, low, shape, CELL_M), low, shape)
+
+    def find_near(self, points: np.ndarray, place: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the indices (K,) of the points (N, 3) m within `radius` of a place (2,) m, and how far they are."""
+        return _find_near(points, self.order, self.first, self.low, self.shape, place[0], place[1], radius)
+
+
+@njit(cache=True, nogil=True)
+def sort_into_cells(points, low, shape, width):  # type: ignore[no-untyped-def]
+    """Return the indices of points (N, 3) by their cell, clamped to the grid, and where each cell's begin."""
+    wide, deep = shape[0], shape[1]
+    cell = np.empty(len(points), np.int64)
+    first = np.zeros(wide * deep + 1, np.int64)
+    for row in range(len(points)):
+        i = min(max(int(np.floor((points[row, 0] - low[0]) / width)), 0), wide - 1)
+        j = min(max(int(np.floor((points[row, 1] - low[1]) / width)), 0), deep - 1)
+        cell[row] = i * deep + j
+        first[cell[row] + 1] += 1
+    first = np.cumsum(first)
+    place = first[:-1].copy()
+    order = np.empty(len(points), np.int64)
+    for row in range(len(points)):
+        order[place[cell[row]]] = row
+        place[cell[row]] += 1
+    return order, first
+
+
+@njit(cache=True, nogil=True)
+def _find_near(points, order, first, low, shape, x, y, radius):  # type: ignore[no-untyped-def]
+    i0 = min(max(int(np.floor((x - radius - low[0]) / CELL_M)), 0), shape[0] - 1)
+    i1 = min(max(int(np.floor((x + radius - low[0]) / CELL_M)), 0), shape[0] - 1)
+    j0 = min(max(int(np.floor((y - radius - low[1]) / CELL_M)), 0), shape[1] - 1)
+    j1 = min(max(int(np.floor((y + radius - low[1]) / CELL_M)), 0), shape[1] - 1)
+    room = 0
+    for i in range(i0, i1 + 1):
+        room += first[i * shape[1] + j1 + 1] - first[i * shape[1] + j0]
+    rows, away, count = np.empty(room, np.int64), np.empty(room), 0
+    for i in range(i0, i1 + 1):
+        for k in range(first[i * shape[1] + j0], first[i * shape[1] + j1 + 1]):
+            row = order[k]
+            distance = np.hypot(points[row, 0] - x, points[row, 1] - y)
+            if distance <= radius:
+                rows[count], away[count] = row, distance
+                count += 1
+    return rows[:count], away[:count]

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where people roughly are whom a camera sees and the depth does not: as far away as their size in the image says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.fusion.puppet_joints import MIN_PUPPET_JOINTS, PuppetJoints
+from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+LONG_BONES = (
+    ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
+)  # fmt: skip
+"""Whose length in the image tells the distance, on both sides."""
+LONG_SHARE = 0.25
+"""Share of the bones that may appear longer than they are: most are foreshortened, and seem farther away."""
+MIN_CONFIDENCE = 0.3
+RADIUS_M, MAX_SEEN_SHARE = 0.06, 0.3
+"""Around a joint, within which a point of the cloud says that there is depth, and the share of joints with depth from
+which on it is the cloud's to say whether somebody is there."""
+COARSE_CONFIDENCE = 0.3
+"""Of a joint that the camera is sure of: the place across the ray is known, along it only roughly."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarsePerson:
+    """A person with joints (J, 3) m in the body model's order, NaN where unknown, and their confidence (J,)."""
+
+    id: str
+    joints: F64
+    confidence: F64
+
+    def move(self, rotation: F64, translation: F64) -> CoarsePerson:
+        """Return the person in a frame to which `rotation` (3, 3) and then `translation` (3,) m lead."""
+        return CoarsePerson(self.id, self.joints @ rotation.T + translation, self.confidence)
+
+
+def place_coarsely(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud) -> CoarsePerson | None:
+    """Return the person of a puppet where no depth is known; None where it is, or where the puppet tells no size."""
+    sure = puppet.known & (puppet.confidence >= MIN_CONFIDENCE)
+    if np.count_nonzero(sure) < MIN_PUPPET_JOINTS:
+        return None
+    rays = cloud.camera.cast_rays(puppet.pixels)
+    distances = _measure_distances(model, rays, sure)
+    if not len(distances):
+        return None
+    distance = float(np.quantile(distances, LONG_SHARE))
+    seen = cloud.pixels[cloud.seen]
+    if len(seen):
+        radius = RADIUS_M * cloud.camera.focal / distance
+        near, _ = cKDTree(seen).query(puppet.pixels[sure], distance_upper_bound=max(radius, 1.0))
+        if np.isfinite(near).mean() > MAX_SEEN_SHARE:
+            return None
+    joints = np.where(puppet.known[:, None], cloud.camera.centre + rays * distance, np.nan)
+    return CoarsePerson(puppet.id, joints, np.where(puppet.known, COARSE_CONFIDENCE * puppet.confidence, 0.0))
+
+
+def place_others(
+    model: StitchedPuppet, puppets: Sequence[PuppetJoints], cloud: SeenCloud
+) -> list[CoarsePerson]:
+    """Return the people of the puppets with an id of whom there is no depth."""
+    found = [place_coarsely(model, puppet, cloud) for puppet in puppets if puppet.id]
+    return [person for person in found if person is not None]
+
+
+def _measure_distances(model: StitchedPuppet, rays: F64, sure: np.ndarray) -> F64:
+    """Return the distances (B,) m at which the bones between `sure` (J,) joints have an average person's lengths."""
+    names = model.joint_names
+    average = model.joints(model.vertices(model.rest_state()))
+    found = []
+    for side in ("left", "right"):
+        for above, below in LONG_BONES:
+            first, last = names.index(f"{side}_{above}"), names.index(f"{side}_{below}")
+            if sure[first] and sure[last]:
+                angle = float(np.linalg.norm(rays[first] - rays[last]))
+                found.append(float(np.linalg.norm(average[first] - average[last])) / max(angle, 1e-6))
+    return np.array(found)

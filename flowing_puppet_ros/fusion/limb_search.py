@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Limbs that may be in a wrong place, hung anew: likely poses that cloud and joints agree with.
+
+Gauss-Newton finds the nearest pose only. A limb that the joints leave open, because they are hidden or because the body
+has not come to them, is sampled from the joints' prior. What the cloud and the joints contradict least is refined, and
+kept if the whole body then costs less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses
+from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
+from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
+from flowing_puppet_ros.fusion.lift import LiftedJoints
+from flowing_puppet_ros.fusion.limb_depths import SLOPE_M, measure_bone_cost, measure_seen_share
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+
+LIMB_PARTS = {
+    "arm": (("shoulder", "upper_arm", "lower_arm", "hand"), ("shoulder", "elbow", "wrist")),
+    "leg": (("upper_leg", "lower_leg", "foot"), ("hip", "knee", "ankle")),
+}
+"""Parts and joints of each kind of limb, from the trunk outwards."""
+FAR_JOINTS = {"upper_arm": "elbow", "lower_arm": "wrist", "upper_leg": "knee", "lower_leg": "ankle"}
+SAMPLES, KEPT = 300, 2
+"""Poses that are sampled of a limb, and those that are refined."""
+FREE_SHARE = 0.2
+"""Of the samples that do not point to the joints."""
+ACROSS_M, HIDDEN_ACROSS_M, ALONG_M = 0.02, 0.05, 0.03
+"""Standard deviation of the places to which samples point, across and along the ray of a joint."""
+MIN_APART_M = 0.15
+"""Between the joints of two poses that are refined."""
+JOINT_COST_M, FULL_COST_M, ALONG_SHARE = 0.01, 0.12, 0.3
+"""Cost of a certain joint that is as far as this from its ray, or farther, beside the cost of a body in a cloud; and the
+share that a gap along the ray counts."""
+MAX_GAP_M, MAX_SEEN_GAP_M = 0.06, 0.12
+"""Between a joint and its ray, and its place on a surface, beyond which a limb may be in a wrong place."""
+MIN_SEEN_SHARE = 0.9  # probability that a joint is seen, below which its limb may be in a wrong place
+MIN_GAIN_M = 0.0005  # by which a body with a limb hung anew costs less
+MIN_CONFIDENCE = 0.2  # of joints that count
+
+
+class LimbSearcher:
+    """Hangs limbs of one model's bodies anew."""
+
+    def __init__(self, hypotheses: BodyHypotheses, model: StitchedPuppet) -> None:
+        """Sample and judge with the parts of `hypotheses`."""
+        self._model, self._bank, self._proposer = model, hypotheses.pose_bank, hypotheses.proposer
+        self._limbs = [
+            (
+                tuple(model.tree.index(f"{side}_{part}") for part in parts),
+                np.array([model.joint_names.index(f"{side}_{joint}") for joint in joints]),
+            )
+            for parts, joints in LIMB_PARTS.values()
+            for side in ("left", "right")
+        ]
+        self._far_joint = {
+            model.tree.index(f"{side}_{part}"): model.joint_names.index(f"{side}_{joint}")
+            for side in ("left", "right")
+            for part, joint in FAR_JOINTS.items()
+        }
+
+    def improve(
+        self,
+        body: BodyState,
+        coarse: CoarseCloud,
+        joints: LiftedJoints,
+        refine: Callable[[BodyState], BodyState],
+        rng: np.random.Generator,
+    ) -> BodyState:
+        """Return the body with the limbs that may be wrong hung anew, where that costs less after `refine`."""
+        cost = self.measure_cost(body, coarse, joints)
+        for limb, rows in self._limbs:
+            if not self._may_be_wrong(body, rows, joints):
+                continue
+            for tried in self._sample(body, limb, rows, coarse, joints, rng):
+                refined = refine(tried)
+                new_cost = self.measure_cost(refined, coarse, joints)
+                if new_cost < cost - MIN_GAIN_M:
+                    body, cost = refined, new_cost
+        return body
+
+    def measure_cost(self, body: BodyState, coarse: CoarseCloud, joints: LiftedJoints) -> float:
+        """Return the cost of a body in a cloud plus that of its joints, metres."""
+        places = self._model.joints(self._model.vertices(body))
+        return self._bank.cost(body, coarse) + float(_measure_joint_cost(places[None], joints, _can_count(joints))[0])
+
+    def _may_be_wrong(self, body: BodyState, rows: np.ndarray, joints: LiftedJoints) -> bool:
+        rows = rows[1:]
+        gap = (self._model.joints(self._model.vertices(body)) - joints.points)[rows]
+        used = _can_count(joints)[rows]
+        if not used.any():
+            return False
+        ray = joints.rays[rows]
+        across = np.linalg.norm(gap - (gap * ray).sum(axis=1, keepdims=True) * ray, axis=1)
+        doubtful = np.array([self._is_doubtful(int(row), joints) for row in rows])
+        wrong = doubtful | (across > MAX_GAP_M) | (np.linalg.norm(gap, axis=1) > MAX_SEEN_GAP_M)
+        return bool((used & wrong).any())
+
+    @staticmethod
+    def _is_doubtful(row: int, joints: LiftedJoints) -> bool:
+        """Return whether a joint may well be elsewhere on its ray."""
+        choices = joints.choices.get(row)
+        several = choices is not None and np.count_nonzero(choices.seen) > 1
+        return joints.hidden[row] or several or measure_seen_share(joints.confidence[row], False) < MIN_SEEN_SHARE
+
+    def _sample(
+        self,
+        body: BodyState,
+        limb: tuple[int, ...],
+        rows: np.ndarray,
+        coarse: CoarseCloud,
+        joints: LiftedJoints,
+        rng: np.random.Generator,
+    ) -> list[BodyState]:
+        """Return the body with the best of many poses of one limb."""
+        groups = states_to_particles(self._model, [body])
+        rest = [part for part in range(len(groups)) if part not in limb]
+        without = self._bank.coverage_cost(groups, coarse, rest)
+        places = np.tile(self._model.joints(self._model.vertices(body)), (SAMPLES, 1, 1))
+        targets = self._draw_targets(places[0], rows, joints, rng)
+        for part in limb:
+            above = groups[self._model.tree.parents[part]]
+            above = above if len(above) > 1 else above.take(np.zeros(SAMPLES, dtype=np.int64))
+            groups[part] = self._proposer.attach_likely(part, above, body.shape[part], rng)
+            for joint, target in targets.items():
+                if joint == self._far_joint.get(part):
+                    groups[part] = self._proposer.point_to(part, groups[part], joint, target)
+            index, found = self._proposer.find_joints(part, groups[part])
+            places[:, index] = found
+        cost = self._bank.coverage_cost(groups, coarse, limb, without.distance).cost
+        counted = np.zeros(places.shape[1], dtype=bool)
+        counted[rows[1:]] = True
+        cost = cost + _measure_joint_cost(places, joints, counted & _can_count(joints))
+        chosen: list[int] = []
+        for row in np.argsort(cost, kind="stable"):
+            apart = [np.linalg.norm(places[row, rows] - places[other, rows], axis=1).max() for other in chosen]
+            if all(gap > MIN_APART_M for gap in apart):
+                chosen.append(int(row))
+            if len(chosen) == KEPT:
+                break
+        return [self._take(groups, limb, row) for row in chosen]
+
+    def _draw_targets(
+        self, places: F64, rows: np.ndarray, joints: LiftedJoints, rng: np.random.Generator
+    ) -> dict[int, F64]:
+        """Draw places (SAMPLES, 3) m of a limb's two outer joints, NaN for samples that do not point to them.
+
+        `places` (J, 3) m are those of the body's joints, and `rows` the limb's joints from the trunk outwards.
+        """
+        root, middle, end = (int(row) for row in rows)
+        known = [row for row in (middle, end) if row in joints.choices and joints.confidence[row] >= MIN_CONFIDENCE]
+        if not known:
+            return {}
+        length = np.linalg.norm(places[[middle, end]] - places[[root, middle]], axis=1)
+        lists = {row: joints.choices[row] for row in known}
+        cost = np.zeros((1, 1))
+        if middle in lists:
+            inner = lists[middle]
+            slope = (inner.points - places[root]) @ joints.rays[middle] / SLOPE_M
+            bone = measure_bone_cost(places[root][None], inner.points, float(length[0]), inner.spread)[0]
+            cost = (inner.cost + bone + 0.5 * slope**2)[:, None]
+        if end in lists:
+            outer = lists[end]
+            cost = cost + outer.cost
+            if middle in lists:
+                slope = (lists[middle].depth[:, None] - outer.depth) / SLOPE_M
+                spread = np.hypot(lists[middle].spread[:, None], outer.spread)
+                bone = measure_bone_cost(lists[middle].points, outer.points, float(length[1]), spread)
+                cost = cost + bone + 0.5 * slope**2
+        share = np.exp(cost.min() - cost).ravel()
+        drawn = np.unravel_index(rng.choice(len(share), SAMPLES, p=share / share.sum()), cost.shape)
+        free = rng.random(SAMPLES) < FREE_SHARE
+        targets = {}
+        for row, index in zip((middle, end), drawn, strict=True):
+            if row not in lists:
+                continue
+            noise = rng.standard_normal((SAMPLES, 3))
+            along = (noise @ joints.rays[row])[:, None] * joints.rays[row]
+            across = HIDDEN_ACROSS_M if joints.hidden[row] else ACROSS_M
+            targets[row] = lists[row].points[index] + across * (noise - along) + ALONG_M * along
+            targets[row][free] = np.nan
+        return targets
+
+    def _take(self, groups: list[Particles], limb: tuple[int, ...], row: int) -> BodyState:
+        pick = np.zeros(len(groups), dtype=np.int64)
+        pick[list(limb)] = row
+        return particles_to_state(self._model, groups, pick)
+
+
+def _can_count(joints: LiftedJoints) -> Bools:
+    return np.asarray(joints.found & (joints.confidence >= MIN_CONFIDENCE))
+
+
+def _measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F64:
+    """Return what the `counted` (J,) joints of bodies, at `places` (P, J, 3) m, cost each of them (P,), metres."""
+    cost = np.zeros(len(places))
+    for row in np.flatnonzero(counted):
+        ray, confidence = joints.rays[row], joints.confidence[row]
+        gap = places[:, row] - joints.points[row]
+        along = gap @ ray
+        cost += confidence**2 * _saturate(np.linalg.norm(gap - along[:, None] * ray, axis=1))
+        choices = joints.choices.get(row)
+        if choices is not None:
+            surfaces = (choices.points[choices.seen] - joints.points[row]) @ ray
+            off_surface = np.abs(along[:, None] - surfaces).min(axis=1)
+            cost += ALONG_SHARE * measure_seen_share(confidence, False) * _saturate(off_surface)
+    return JOINT_COST_M * cost
+
+
+def _saturate(distance: F64) -> F64:
+    return np.asarray(np.minimum(distance / FULL_COST_M, 1.0) ** 2)

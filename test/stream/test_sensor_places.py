@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where sensors are in the frame in which people are tracked, and the sentences for what is not known."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from test.stream.messages.test_frame_tree import FACTORY, SECOND, link, message, robot, turned
+
+from flowing_puppet_ros.reporting import Report
+from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header, make_transform
+from flowing_puppet_ros.stream.sensor_places import ANCHOR_GRID_M, SensorPlaces
+
+POINTS = np.array([[2.0, 0.3, -0.4], [3.0, -1.0, 0.5]])
+
+
+def places(frames: FrameTree, fixed: str = "map", sensor: str = "", up: str = "auto") -> tuple[SensorPlaces, Report]:
+    report = Report()
+    return SensorPlaces(frames, up, fixed, sensor, report), report
+
+
+def find(made: SensorPlaces, frame: str, seconds: float) -> Any:
+    stamp = round(seconds * SECOND)
+    return made.find(make_header(FACTORY, stamp, frame), stamp, POINTS, False)
+
+
+def test_points_are_put_where_the_sensor_was_at_their_stamp() -> None:
+    made, _ = places(robot())
+    place = find(made, "camera", 10.5)
+    eye = np.array([2.0 + 0.5 * np.sqrt(0.5), 0.5 * np.sqrt(0.5), 0])
+    np.testing.assert_allclose(place.viewpoint, eye, atol=1e-12)
+    np.testing.assert_allclose(place.put(POINTS), POINTS @ turned(45.0).T + eye, atol=1e-12)
+    rotation, translation = place.back
+    np.testing.assert_allclose(place.put(POINTS) @ rotation.T + translation, POINTS, atol=1e-12)
+    np.testing.assert_allclose(place.to_sensor, turned(45.0).T, atol=1e-12)
+
+
+def test_large_coordinates_are_counted_from_near_the_first_place() -> None:
+    frames = FrameTree()
+    frames.add(message(link(1, "map", "camera", 400_050.0 + 1.25), link(1, "x", "y", 0)), moving=True)
+    made, _ = places(frames)
+    assert find(made, "camera", 1.0).viewpoint[0] == pytest.approx(51.25 - ANCHOR_GRID_M)
+
+
+def test_a_sensor_that_hangs_upside_down_is_no_special_case() -> None:
+    frames = FrameTree()
+    over = np.diag([1.0, -1.0, -1.0])
+    frames.add(message(make_transform(FACTORY, make_header(FACTORY, 0, "map"), "lidar", np.array([0, 0, 3.0]), over)))
+    place = find(places(frames)[0], "lidar", 1.0)
+    np.testing.assert_allclose(place.put(np.array([2.0, 0.5, 1.2])), [2.0, -0.5, 1.8])
+    np.testing.assert_allclose(place.to_sensor @ np.array([0, 0, 1.0]), [0, 0, -1.0])
+    alone = find(places(frames, fixed="", up="-z")[0], "lidar", 1.0)
+    assert alone.put(np.array([0, 0, 1.2]))[2] == pytest.approx(-1.2)
+
+
+def test_frames_that_nothing_connects_are_one_sentence_and_the_sensors_frame_is_used() -> None:
+    made, report = places(robot(), fixed="odom")
+    for seconds in (10.2, 10.3):
+        place = find(made, "camera", seconds)
+        assert not place.is_fixed
+        np.testing.assert_allclose(place.put(POINTS), POINTS)
+    (said,) = report.drain_warnings()
+    assert said == (
+        "/tf and /tf_static do not connect 'camera' with 'odom'; publish or record the transform: people are tracked in "
+        "the former"
+    )
+    assert not made.is_awaited("camera", 11 * SECOND)  # given up
+
+
+def test_a_late_transform_is_waited_for_and_then_one_sentence() -> None:
+    made, report = places(robot())
+    assert find(made, "camera", 10.5).is_fixed
+    assert made.is_awaited("camera", round(11.2 * SECOND))
+    assert find(made, "camera", 11.2) is None
+    (said,) = report.drain_warnings()
+    assert "is 0.20 s older" in said
+    assert said.endswith("what has no place in fixed_frame is fitted by itself")
+    assert made.is_awaited("camera", round(11.3 * SECOND))
+
+
+@pytest.mark.parametrize("fixed", ["map", ""])
+def test_clouds_in_the_maps_frame_need_the_sensors(fixed: str) -> None:
+    made, report = places(robot(), fixed=fixed)
+    np.testing.assert_allclose(find(made, "map", 10.5).viewpoint, np.zeros(3))
+    (said,) = report.drain_warnings()
+    assert "where their sensor is in it is not known" in said
+    assert "set sensor_frame" in said
+    known, report = places(robot(), fixed=fixed, sensor="base")
+    place = find(known, "map", 10.5)
+    np.testing.assert_allclose(place.viewpoint, [2.0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(place.to_sensor, turned(45.0).T, atol=1e-12)
+    np.testing.assert_allclose(place.put(POINTS), POINTS)
+    assert report.drain_warnings() == []
+    assert known.is_awaited("map", round(11.2 * SECOND))
