@@ -12,6 +12,7 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowSettings
+from flowing_puppet_ros.multiview.bundle import rig_check
 from flowing_puppet_ros.stream.component import Component
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
@@ -267,6 +268,22 @@ def test_frames_that_come_after_the_first_images_place_the_hull(recorded: dict[s
     assert drive(component, [item for item in stream if item[0] != "/tf_static"]) == []
     component.reset()
     assert {message.header.frame_id for _, message in drive(component, stream)} == {"world"}
+
+
+def test_a_hull_says_that_people_would_be_giants(
+    recorded: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The poses are in millimetres: nobody is found, and nothing else would say why."""
+    monkeypatch.setattr(rig_check, "_SETS", 2)
+    stream = deepcopy(hull_stream(recorded))
+    for item in stream[0][1].transforms:
+        for axis in "xyz":
+            setattr(item.transform.translation, axis, 1000 * getattr(item.transform.translation, axis))
+    component = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2", hull_every=1), FACTORY)
+    assert drive(component, stream) == []
+    (sentence,) = component.report.drain_warnings()
+    tall = float(sentence.split("would be ")[1].split(" m tall")[0])
+    assert 1300 < tall < 2200 and "in mm" in sentence and "--unit" in sentence
 
 
 def move_rig(stream: Stream, speed: np.ndarray, late: bool) -> Stream:
