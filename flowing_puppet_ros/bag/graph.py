@@ -135,7 +135,7 @@ def build_graph(
     graph = Graph([_make_tracker(camera, topics, settings, factory) for camera in cameras])
     graph.notes += [*_note_missing_detections(graph.instances, topics), *depth_notes]
     if len(cameras) >= MIN_CAMERAS:
-        calibrated, note = _select_calibrated(cameras, frames, infos)
+        calibrated, note = _select_calibrated(cameras, moving or frames, infos)
         graph.notes += [note] if note else []
         if len(calibrated) >= MIN_CAMERAS:
             graph.instances += _make_hull_and_fitter(calibrated, settings, factory)

@@ -19,6 +19,7 @@ _GAUSS_NEWTON_STEPS = 8  # from the best proposal of two views
 # What is known beforehand decides between proposals that views support alike; 1 is a view with full confidence.
 _PLACE_WEIGHT = 0.8  # of the place where a joint is expected
 _BONE_WEIGHT, _BONE_LOG = 0.6, 0.2  # of each bone of a joint, and the relative error from which it has another length
+_PENALTY_ALLOWED = 0.25  # before a joint is less sure
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ def triangulate_plane(
     confidence = np.where(placed, agreeing * agreeing / np.maximum(count * total, 1e-12), 0.0)
     if expected is not None:
         penalty = expected.penalise_places(result) + expected.penalise_bones(result, result)
-        confidence = confidence * np.maximum(1 - penalty, 0.0)
+        confidence = confidence * np.clip(1 + _PENALTY_ALLOWED - penalty, 0.0, 1.0)
     return result, confidence
 
 

@@ -9,11 +9,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, I64
-from flowing_puppet_ros.multiview.association.view import CalibratedView
+from flowing_puppet_ros.multiview.association.view import CalibratedView, measure_mismatch
 
 _GROUPS = (("shoulder", "elbow", "wrist", "hand"), ("hip", "knee", "ankle", "foot"))
 _MAX_DISTANCE_M = 0.30  # at which a joint no longer speaks for or against
 _MEMORY = 0.7  # of what was found in the sets before
+_FITS = 0.3  # in mismatch, below which nobody asks whether sides are exchanged
+_EXCHANGE_COST = 0.1  # in mismatch
 _MIN_EVIDENCE = 0.8  # joints by which the exchanged limbs must fit better, to be exchanged or to stay so
 
 
@@ -36,6 +38,19 @@ class ExchangedLimbs:
                 if evidence > _MIN_EVIDENCE and gain > 0:
                     corrected[name] = _exchange(corrected[name], group)
         return corrected
+
+
+def measure_either_mismatch(view: CalibratedView, joints: F64, max_distance: float, groups: Sequence[I64]) -> float:
+    """Return how badly a view fits joints (J, 3) m, as `measure_mismatch` does, with left and right as they fit better.
+
+    `groups` are those of `find_sides`.
+    """
+    plain = measure_mismatch(view, joints, max_distance)
+    if plain < _FITS:
+        return plain
+    for group in groups:
+        view = _exchange(view, group)
+    return min(plain, measure_mismatch(view, joints, max_distance) + _EXCHANGE_COST)
 
 
 def find_sides(names: Sequence[str]) -> list[I64]:

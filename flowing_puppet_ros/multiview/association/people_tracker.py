@@ -22,7 +22,7 @@ from flowing_puppet_ros.multiview.association.clusters import (
     find_clusters,
     triangulate_views,
 )
-from flowing_puppet_ros.multiview.association.exchange import ExchangedLimbs
+from flowing_puppet_ros.multiview.association.exchange import ExchangedLimbs, find_sides, measure_either_mismatch
 from flowing_puppet_ros.multiview.association.identity import choose_returning
 from flowing_puppet_ros.multiview.association.settings import AssociationSettings
 from flowing_puppet_ros.multiview.association.track_3d import PersonTrack3D, find_bones
@@ -31,7 +31,6 @@ from flowing_puppet_ros.multiview.association.view import (
     CalibratedView,
     PersonInView,
     calibrate_views,
-    measure_mismatch,
 )
 from flowing_puppet_ros.multiview.association.weights import doubt_hidden_joints, doubt_joints_on_others
 from flowing_puppet_ros.multiview.camera import Camera
@@ -77,6 +76,7 @@ class PeopleTracker3D:
         self.settings = settings or AssociationSettings()
         self.triangulation = triangulation or TriangulationSettings()
         self._bones = find_bones(self.names)
+        self._sides = find_sides(self.names)
         self._tracks: list[PersonTrack3D] = []
         # Pairs of (camera, id in it) that agreed in the last set and this one -> in how many sets so far.
         self._candidates: dict[frozenset[tuple[str, str]], int] = {}
@@ -103,6 +103,9 @@ class PeopleTracker3D:
         found: dict[str, tuple[PersonTrack3D, dict[str, int]]] = {}
         free: set[Key] = {(name, k) for name, group in views.items() for k in range(len(group))}
         for track, chosen in claimed:
+            own = {name: views[name][k] for name, k in chosen.items()}
+            for name, view in track.exchanged.correct(own, track.predict(stamp)).items():
+                views[name][chosen[name]] = view
             agreeing, joints, _ = drop_disagreeing(
                 {name: views[name][k] for name, k in chosen.items()}, self.settings, self.triangulation
             )
@@ -130,7 +133,7 @@ class PeopleTracker3D:
             cost = np.array(
                 [
                     [
-                        measure_mismatch(view, joints, self.settings.max_joint_distance)
+                        measure_either_mismatch(view, joints, self.settings.max_joint_distance, self._sides)
                         - _MEMBER_BONUS * (track.members.get(name) == view.person.id)
                         for view in group
                     ]
@@ -198,7 +201,7 @@ class PeopleTracker3D:
         for identity, (track, chosen) in found.items():
             own = {name: views[name][k] for name, k in chosen.items()}
             others = [each.joints for other, each in expected.items() if other != identity]
-            cleaned = self._clean(track, own, expected[identity].joints, others)
+            cleaned = self._clean(own, expected[identity].joints, others)
             joints, confidence = triangulate_views(list(cleaned.values()), self.triangulation, expected[identity])
             track.update(stamp, joints)
             track.members = {name: view.person.id for name, view in own.items()}
@@ -213,12 +216,12 @@ class PeopleTracker3D:
         return sorted(result, key=lambda person: int(person.id[1:]))
 
     def _clean(
-        self, track: PersonTrack3D, views: Mapping[str, CalibratedView], expected: F64, others: Sequence[F64]
+        self, views: Mapping[str, CalibratedView], expected: F64, others: Sequence[F64]
     ) -> dict[str, CalibratedView]:
-        """Return a person's views with left and right as `expected` (J, 3) m, without joints that are not its own."""
+        """Return a person's views without joints that are not its own, and with doubt in those that are hidden."""
         return {
             name: doubt_hidden_joints(doubt_joints_on_others(view, expected, others), expected, others, self._bones)
-            for name, view in track.exchanged.correct(views, expected).items()
+            for name, view in views.items()
         }
 
 

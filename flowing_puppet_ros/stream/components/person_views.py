@@ -16,7 +16,7 @@ from flowing_puppet_ros.image.tracking.appearance import TORSO_CORNERS, torso_ap
 from flowing_puppet_ros.multiview.association.people_tracker import PeopleTracker3D, PersonInSpace
 from flowing_puppet_ros.multiview.association.settings import AssociationSettings
 from flowing_puppet_ros.multiview.association.view import PersonInView
-from flowing_puppet_ros.multiview.bundle.size_check import SizeCheck
+from flowing_puppet_ros.multiview.bundle.rig_check import RigCheck
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.hull_builder import CameraObservation, HullBuilder
 from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
@@ -43,7 +43,7 @@ class PersonMatcher:
         self._settings = settings
         self._triangulation = triangulation
         self._tracker: PeopleTracker3D | None = None
-        self._size: SizeCheck | None = None
+        self._check: RigCheck | None = None
         self.problem = ""
         """What was found wrong with the calibration in the last set, in one sentence; empty if nothing."""
 
@@ -68,7 +68,7 @@ class PersonMatcher:
         names = kinds.most_common(1)[0][0]
         if self._tracker is None or (self._tracker.names != names and self._tracker.names not in kinds):
             self._tracker = PeopleTracker3D(names, self._settings, self._triangulation)
-            self._size = SizeCheck(names)
+            self._check = RigCheck(names)
         wanted = self._tracker.names
         usable = {
             name: [puppet for puppet in frame.puppets if _list_names(puppet) == wanted]
@@ -76,8 +76,8 @@ class PersonMatcher:
         }
         people = {name: _decode_people(wanted, frames[name].image, group) for name, group in usable.items()}
         found = self._tracker.step(stamp, cameras, people)
-        assert self._size is not None
-        self.problem = self._size.add(cameras, people, [person.joints for person in found])
+        assert self._check is not None
+        self.problem = self._check.add(cameras, people, found)
         return [(person, {name: usable[name][k] for name, k in person.views.items()}) for person in found]
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -81,6 +82,7 @@ class VisualHullComponent(Component[VisualHullSettings]):
         self.inputs = (
             *(port for name in self._camera_names for port in _camera_ports(name)),
             Port("/tf_static", TRANSFORMS, "latched"),
+            Port("/tf", TRANSFORMS, optional=True),
         )
         self._builder = HullBuilder(settings)
         self._matcher = PersonMatcher(settings.association, settings.triangulation)
@@ -90,6 +92,7 @@ class VisualHullComponent(Component[VisualHullSettings]):
         self._set_sync = TimeSynchronizer(
             self._camera_names, round(settings.slop * 1e9), patience=settings.max_waiting_images
         )
+        self._waiting: deque[dict[str, tuple[int, Any]]] = deque()  # sets, for transforms that are yet to come
         self._last_stamp: int | None = None
         self._person_sets = 0
         self._frame = ""
@@ -107,32 +110,50 @@ class VisualHullComponent(Component[VisualHullSettings]):
         self._matcher.reset()
         for synchronizer in (*self._camera_sync.values(), self._set_sync):
             synchronizer.reset()
+        self._waiting.clear()
         self._last_stamp = None
         self._person_sets = 0
 
     def flush(self) -> Output:
         """Process the sets that still wait."""
-        outputs: Output = []
-        for complete in self._set_sync.flush():
-            outputs += self._process_set(complete)
+        self._waiting += self._set_sync.flush()
+        outputs = self._process_waiting(final=True)
         self._update_counters()
         return outputs
 
     def _process(self, port: str, message: Any) -> Output:
-        if port == "/tf_static":
-            self._frame_tree.add(message)
-            return []
+        if port in ("/tf_static", "/tf"):
+            self._frame_tree.add(message, moving=port == "/tf")
+            return self._process_waiting()
         name, kind = port.rsplit("/", 1)
         if kind == "camera_info":
             self._infos[name] = message
             return []
-        outputs: Output = []
         for view in self._camera_sync[name].add(kind, stamp_ns(message), message):
             stamp = view["image"][0]
-            for complete in self._set_sync.add(name, stamp, {key: item for key, (_, item) in view.items()}):
-                outputs += self._process_set(complete)
+            self._waiting += self._set_sync.add(name, stamp, {key: item for key, (_, item) in view.items()})
+        outputs = self._process_waiting()
         self._update_counters()
         return outputs
+
+    def _process_waiting(self, final: bool = False) -> Output:
+        """Process the complete sets in line, up to the first one whose cameras' place at its stamp is yet to come."""
+        outputs: Output = []
+        most = self.settings.max_waiting_images or len(self._waiting)
+        while self._waiting and (final or len(self._waiting) > most or not self._is_awaited(self._waiting[0])):
+            outputs += self._process_set(self._waiting.popleft())
+        return outputs
+
+    def _is_awaited(self, complete: Mapping[str, tuple[int, Any]]) -> bool:
+        """Return whether transforms that are yet to come tell where a moving camera is in a set."""
+        known = {name: self._infos[name].header.frame_id.lstrip("/") for name in complete if name in self._infos}
+        pairs = [
+            (name, frame, self.settings.frame or self._frame_tree.find_root(frame)) for name, frame in known.items()
+        ]
+        return any(
+            self._frame_tree.is_connected(frame, root) and self._frame_tree.is_awaited(frame, root, complete[name][0])
+            for name, frame, root in pairs
+        )
 
     def _update_counters(self) -> None:
         for level, synchronizer in [("sets", self._set_sync), *self._camera_sync.items()]:
@@ -186,15 +207,15 @@ class VisualHullComponent(Component[VisualHullSettings]):
         cameras: dict[str, Camera] = {}
         for name in complete:
             try:
-                cameras[name] = self._make_camera(name, first=not cameras)
+                cameras[name] = self._make_camera(name, complete[name][0], first=not cameras)
             except InputError as error:
                 self.report.count_unusable(error)
                 continue
             self._builder.set_camera(name, cameras[name])
         return cameras
 
-    def _make_camera(self, name: str, first: bool) -> Camera:
-        """Return a camera in the common frame, which the `first` one sets; InputError says what is missing."""
+    def _make_camera(self, name: str, stamp: int, first: bool) -> Camera:
+        """Return a camera at a stamp, ns, in the common frame, which the `first` one sets; InputError if unknown."""
         info = self._infos.get(name)
         if info is None:
             raise InputError(f"no camera_info came yet on {name}/camera_info")
@@ -203,9 +224,9 @@ class VisualHullComponent(Component[VisualHullSettings]):
         if first:
             # Looked up for every set: /tf_static may come after the first images.
             self._frame = self.settings.frame or self._frame_tree.find_root(frame.lstrip("/"))
-        world = self._frame_tree.lookup_pose(self._frame, frame)
+        world = self._frame_tree.lookup_pose(self._frame, frame, stamp)
         if world is None:
-            raise InputError(f"/tf_static does not connect the frame {frame!r} of {name} with {self._frame!r}")
+            raise InputError(f"{name}: {self._frame_tree.describe_missing(frame, self._frame, stamp)}")
         translation, rotation = world
         size = info.width, info.height
         try:
