@@ -8,6 +8,7 @@ the one that the cloud contradicts less is kept.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -56,7 +57,7 @@ class JointFitter:
         self.fitter = fitter
         self.model = fitter.model
         self._strength = strength
-        self._limbs = LimbSearcher(fitter.hypotheses, fitter.model)
+        self.limbs = LimbSearcher(fitter.hypotheses, fitter.model)
         self._is_limb = np.ones(len(self.model.joint_names), dtype=bool)
         self._is_limb[trunk_rows(self.model)] = False
 
@@ -104,11 +105,24 @@ class JointFitter:
             found = run(self.start(own) if body is None else body, cloud, targets, pulled, terms)
             tried.append((self.fitter.hypotheses.pose_bank.cost(found, coarse), found, own, targets))
         _, body, joints, targets = tried[tried[1][0] < MAX_SWAP_RATIO * tried[0][0]]
-        body = self._limbs.improve(
-            body, coarse, joints, lambda tried: run(tried, cloud, targets, close, terms), np.random.default_rng(0)
-        )
+        body = self.limbs.improve(
+            body, coarse, joints, self.limbs.find_doubtful(body, joints),
+            lambda tried: run(tried, cloud, targets, close, terms),
+        )  # fmt: skip
         held = self._hold_hidden(joints, targets)
         return self.fitter.assess(run(body, cloud, held, free, terms), cloud)
+
+    def hang_anew(
+        self, cloud: SingleViewCloud, body: BodyState, joints: LiftedJoints, limbs: Sequence[int]
+    ) -> BodyFit | None:
+        """Return the fit of a body with `limbs` hung anew, None where nothing better is found."""
+        unknown = measure_unknown_share(self.model, body, cloud)
+        close, targets = strengthen_priors(CLOSE, unknown), self.make_targets(joints)
+        found = self.limbs.improve(
+            body, CoarseCloud.of(cloud), joints, limbs,
+            lambda tried: self.fitter.gauss_newton.run(tried, cloud, targets, close, [cloud.free_space_term]),
+        )  # fmt: skip
+        return None if found is body else self.fitter.assess(found, cloud)
 
     def _hold_hidden(self, joints: LiftedJoints, targets: JointTargets) -> JointTargets:
         """Return the pull of the hidden joints alone, which nothing else would hold."""

@@ -8,6 +8,7 @@ body and cloud tells when the track is lost.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -150,6 +151,21 @@ class BodyTracker:
         """Start from a body that was found in the person's cloud."""
         seen = _Observation(fit, person.stamp, person.points.mean(axis=0))
         self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
+
+    def correct(self, fit: BodyFit, parts: Sequence[int]) -> None:
+        """Take another body for the last cloud, of which `parts` are elsewhere; they are not taken to have moved."""
+        last, before = self._state.last, self._state.before
+        if last is None:
+            return
+        if before is not None:
+            earlier, new, rows = before.fit.state, fit.state, list(parts)
+            turn = earlier.rotation[0] @ new.rotation[0].T
+            center, rotated = earlier.center.copy(), earlier.rotation.copy()
+            center[rows] = earlier.center[0] + (new.center[rows] - new.center[0]) @ turn.T
+            rotated[rows] = turn @ new.rotation[rows]
+            moved = replace(earlier, center=center, rotation=rotated)
+            before = replace(before, fit=replace(before.fit, state=moved))
+        self._state = replace(self._state, before=before, last=replace(last, fit=fit), lost=False)
 
     @property
     def hidden(self) -> bool:
