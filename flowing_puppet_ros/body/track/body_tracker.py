@@ -352,9 +352,11 @@ class BodyTracker:
             terms.append(lambda vertices, _: floor_term(vertices, floor))
         learned = SHAPE_WEIGHT_PER_FRAME * min(self._state.frames, MAX_SHAPE_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
-        # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
+        # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden. Where
+        # joints say where it is, it does not lag, and one that is hidden is not drawn to what hides it.
         facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint, cloud.field)
-        body = self._fitter.gauss_newton.run(start, facing, prepared.targets, weights, terms)
+        seen = facing if prepared.targets.rays is None else cloud
+        body = self._fitter.gauss_newton.run(start, seen, prepared.targets, weights, terms)
         # A limb that left the view stays in its last pose: its motion would go on for ever.
         last = start if self._state.last is None else self._state.last.fit.state
         body = hang_unseen_parts(self._fitter.model, (last, body), cloud, prepared.targets)
