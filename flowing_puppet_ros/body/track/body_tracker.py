@@ -8,6 +8,7 @@ body and cloud tells when the track is lost.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -150,6 +151,21 @@ class BodyTracker:
         """Start from a body that was found in the person's cloud."""
         seen = _Observation(fit, person.stamp, person.points.mean(axis=0))
         self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
+
+    def correct(self, fit: BodyFit, parts: Sequence[int]) -> None:
+        """Take another body for the last cloud, of which `parts` are elsewhere; they are not taken to have moved."""
+        last, before = self._state.last, self._state.before
+        if last is None:
+            return
+        if before is not None:
+            earlier, new, rows = before.fit.state, fit.state, list(parts)
+            turn = earlier.rotation[0] @ new.rotation[0].T
+            center, rotated = earlier.center.copy(), earlier.rotation.copy()
+            center[rows] = earlier.center[0] + (new.center[rows] - new.center[0]) @ turn.T
+            rotated[rows] = turn @ new.rotation[rows]
+            moved = replace(earlier, center=center, rotation=rotated)
+            before = replace(before, fit=replace(before.fit, state=moved))
+        self._state = replace(self._state, before=before, last=replace(last, fit=fit), lost=False)
 
     @property
     def hidden(self) -> bool:
@@ -336,9 +352,11 @@ class BodyTracker:
             terms.append(lambda vertices, _: floor_term(vertices, floor))
         learned = SHAPE_WEIGHT_PER_FRAME * min(self._state.frames, MAX_SHAPE_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
-        # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
+        # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden. Where
+        # joints say where it is, it does not lag, and one that is hidden is not drawn to what hides it.
         facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint, cloud.field)
-        body = self._fitter.gauss_newton.run(start, facing, prepared.targets, weights, terms)
+        seen = facing if prepared.targets.rays is None else cloud
+        body = self._fitter.gauss_newton.run(start, seen, prepared.targets, weights, terms)
         # A limb that left the view stays in its last pose: its motion would go on for ever.
         last = start if self._state.last is None else self._state.last.fit.state
         body = hang_unseen_parts(self._fitter.model, (last, body), cloud, prepared.targets)
