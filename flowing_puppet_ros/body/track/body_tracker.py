@@ -39,6 +39,9 @@ MAX_SHAPE_FRAMES = 30  # that count for the shape: with more, a first mistake wo
 MIN_VISIBLE = 0.4  # visible fraction, relative to normal, below which the person counts as occluded ...
 MIN_VISIBLE_OF_FEW = 0.75  # ... and where few points show the person, and half of them bends the body more
 VISIBLE_HALF_LIFE_S = 2.0  # in which the normal visible surface falls to half where less is seen
+MAX_TURNED_RATIO = 1.25
+"""Two-way distance of a body that walks ahead, relative to that of one that walks backwards, up to which it is taken:
+few points hardly tell front from back, and hardly anybody walks backwards."""
 MAX_STRETCH = 2.0  # frames by which a motion is extrapolated at most
 
 
@@ -150,6 +153,23 @@ class BodyTracker:
         """Start from a body that was found in the person's cloud."""
         seen = _Observation(fit, person.stamp, person.points.mean(axis=0))
         self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
+
+    def turn_round(self, person: PersonCloud) -> BodyFit | None:
+        """Turn the last body, who walks backwards, if one that walks ahead explains the cloud nearly as well.
+
+        Returns:
+            The turned body; None where it stays as it is.
+        """
+        last, floor, viewpoint = self._state.last, person.floor, person.viewpoint
+        if last is None or floor is None or viewpoint is None:
+            return None
+        with one_blas_thread():
+            cloud = self._upright.make_cloud(person.points, viewpoint, None, person.field)
+            turned = self._upright.turn_round(last.fit.state, cloud, floor).fit
+        if turned.two_way_distance > MAX_TURNED_RATIO * last.fit.two_way_distance:
+            return None
+        self.start(person, turned)
+        return turned
 
     @property
     def hidden(self) -> bool:

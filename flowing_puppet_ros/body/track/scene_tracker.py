@@ -30,8 +30,8 @@ _MAX_COORDINATE = 10_000.0
 MAX_HEIGHT_M = 2.6
 """A cloud that is no wider is a person, when nobody can be told from their surroundings in it."""
 _NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
-MAX_NEW_PEOPLE = 3
-"""New people whose bodies are fitted in a cloud of a stream; the others come with the next."""
+MAX_NEW_FITS = 8
+"""Candidates to which bodies are fitted in a cloud of a stream, the likeliest first; the others come with the next."""
 MIN_DECIDING_POINTS = 60
 """Points of a person from which on they tell whether people are seen from one side."""
 ONLY_ID = "b1"
@@ -136,6 +136,7 @@ class SceneTracker:
         self._single_view: bool | None = None
         self._planes = PlaneCache()
         self._finder = PersonFinder(fitter, settings.people)
+        self._searched = np.empty(0, dtype=np.int64)
 
     def warm_up(self) -> None:
         """Do beforehand what the first cloud would wait for."""
@@ -175,14 +176,15 @@ class SceneTracker:
             return self._tracker.step_one(person, seed, executor), []
         known = self._tracker.predict_bodies(cloud.stamp) if settings.track else ()
         if self._is_one_sided(cloud, remember=True):
-            found = self._find(cloud, known, MAX_NEW_PEOPLE if settings.track else None, settings.track)
+            found = self._find(cloud, known, MAX_NEW_FITS if settings.track else None, settings.track)
             if not settings.track:
                 fits = {id(body.person): body.fit for body in found}
                 named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
                 return [TrackedBody(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
             first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
             seen = [body.person for body in found]
-            return self._tracker.step(seen, cloud.stamp, seed, executor, first), self._tracker.occluded_ids
+            bodies = self._tracker.step(seen, cloud.stamp, seed, executor, first, self._judge)
+            return bodies, self._tracker.occluded_ids
         people = self._with_viewpoint(cloud, self._segment(cloud, known, self._planes))
         if settings.track:
             return self._tracker.step(people, cloud.stamp, seed, executor), self._tracker.occluded_ids
@@ -251,11 +253,17 @@ class SceneTracker:
     def _find(self, cloud: SceneCloud, known: Sequence[F64], max_fits: int | None, remember: bool) -> list[FoundBody]:
         """Find the people of a single view; the known ones first."""
         rows, points = self._in_range(cloud)
+        self._searched = rows
         normals = None if cloud.normals is None else cloud.normals[rows]
         found = self._finder.find(points, normals, np.zeros(3), cloud.stamp, known, max_fits, remember)
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
+
+    def _judge(self, person: PersonCloud, fit: BodyFit) -> tuple[float, float]:
+        """Return what the cloud that was searched last says about a body: see `PersonFinder.judge`."""
+        assert person.rows is not None
+        return self._finder.judge(person, np.searchsorted(self._searched, np.sort(person.rows)), fit)
 
     def _improve(
         self, person: PersonCloud, fit: BodyFit | None, seed: int, progress: Progress | None = None
