@@ -24,7 +24,13 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, ch
 from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.upright.upright_fit import FEW_POINTS, MIN_MANY_POINTS, UprightFitter, floor_term
+from flowing_puppet_ros.body.upright.upright_fit import (
+    FEW_POINTS,
+    MIN_MANY_POINTS,
+    UprightFitter,
+    floor_term,
+    keep_place_only,
+)
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
@@ -263,6 +269,8 @@ class BodyTracker:
 
     def _record(self, fit: BodyFit, lost: bool, prepared: _Prepared) -> BodyFit:
         state = self._state
+        if prepared.floor is not None:
+            fit = keep_place_only(self._fitter.model, fit, len(prepared.cloud.points))
         seen = _Observation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
         best = state.best if lost or prepared.occluded else min(state.best, fit.two_way_distance)
         frames = state.frames + (not prepared.occluded)

@@ -15,6 +15,7 @@ from flowing_puppet_ros.body.cloud.coverage import is_single_view
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
+from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
@@ -32,6 +33,8 @@ MAX_HEIGHT_M = 2.6
 _NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
 MAX_NEW_FITS = 8
 """Candidates to which bodies are fitted in a cloud of a stream, the likeliest first; the others come with the next."""
+MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
+_UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
 MIN_DECIDING_POINTS = 60
 """Points of a person from which on they tell whether people are seen from one side."""
 ONLY_ID = "b1"
@@ -137,6 +140,8 @@ class SceneTracker:
         self._planes = PlaneCache()
         self._finder = PersonFinder(fitter, settings.people)
         self._searched = np.empty(0, dtype=np.int64)
+        self._was_searched = False
+        self._report = report or Report()
 
     def warm_up(self) -> None:
         """Do beforehand what the first cloud would wait for."""
@@ -151,6 +156,7 @@ class SceneTracker:
         self._single_view = None
         self._planes = PlaneCache()
         self._finder.reset()
+        self._was_searched = False
 
     def step(
         self, cloud: SceneCloud, seed: int, executor: Executor | None = None
@@ -200,7 +206,8 @@ class SceneTracker:
         if self._settings.scene and self.is_one_sided_scene(cloud):
             proven = self.fit_found(self.find_once(cloud), seed, progress)
             if not proven:
-                raise InputError(_NOBODY.format(len(cloud.points)))
+                down = looks_upside_down(self._in_range(cloud)[1])
+                raise InputError(_NOBODY.format(len(cloud.points)) + (f"; {_UPSIDE_DOWN}" if down else ""))
             return [TrackedBody(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
         people = self._segment(cloud) if self._settings.scene else []
         if not people and (not self._settings.scene or extent <= MAX_HEIGHT_M):
@@ -248,12 +255,18 @@ class SceneTracker:
         """Return the rows of the points that are finite and in range of the sensor at the origin, and the points."""
         near = np.linalg.norm(cloud.points, axis=1) < self._settings.segmentation.max_range
         rows = np.flatnonzero(near)
+        if len(rows) > MAX_SCENE_POINTS:
+            rows = rows[np.linspace(0, len(rows) - 1, MAX_SCENE_POINTS).astype(np.int64)]
         return rows, np.asarray(cloud.points[rows], dtype=np.float64)
 
     def _find(self, cloud: SceneCloud, known: Sequence[F64], max_fits: int | None, remember: bool) -> list[FoundBody]:
         """Find the people of a single view; the known ones first."""
         rows, points = self._in_range(cloud)
         self._searched = rows
+        if not self._was_searched and len(points):
+            self._was_searched = True
+            if looks_upside_down(points):
+                self._report.warn(_UPSIDE_DOWN)
         normals = None if cloud.normals is None else cloud.normals[rows]
         found = self._finder.find(points, normals, np.zeros(3), cloud.stamp, known, max_fits, remember)
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])

@@ -12,6 +12,7 @@ from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
+from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.upright.upright_bank import (
@@ -20,7 +21,7 @@ from flowing_puppet_ros.body.upright.upright_bank import (
 )
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.model import rotation as so3
-from flowing_puppet_ros.model.sp import BodyState
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import parallel_map, usable_threads
 
 STARTS = 7  # bodies of the bank that are refined
@@ -33,6 +34,9 @@ COST_SCALE_M, SAME_POSE_M, FINAL_STEPS = 0.003, 0.2, 2
 are averaged, and steps from the mean."""
 FLOOR_WEIGHT, SOLE_VERTICES = 0.3, 25
 """Weight of the floor against that of the cloud, and the lowest vertices that are on it."""
+MIN_LIMB_POINTS = 60
+"""Points from which on they tell about limbs."""
+TRUNK_PARTS = ("torso", "head")
 MAX_FIT_POINTS = 1500
 
 
@@ -113,7 +117,8 @@ class UprightFitter:
         if not many and len(found) > 1:
             found = [improve((0.0, self._average([(cost, body) for cost, body, _ in found])), FINAL_STEPS)]
         cost, body, stature = min(found, key=lambda each: each[0])
-        return UprightFit(self._fitter.assess(body, cloud), cost, stature)
+        fit = keep_place_only(self._fitter.model, self._fitter.assess(body, cloud), len(cloud.points))
+        return UprightFit(fit, cost, stature)
 
     def turn_round(self, body: BodyState, cloud: SingleViewCloud, floor: float) -> UprightFit:
         """Fit a body that faces the other way, with its limbs where they are; `floor` is z of the floor, metres."""
@@ -153,6 +158,20 @@ class UprightFitter:
             np.tensordot(share, np.stack([body.pose for body in bodies]), 1),
             np.tensordot(share, np.stack([body.shape for body in bodies]), 1),
         )
+
+
+def keep_place_only(model: StitchedPuppet, fit: BodyFit, points: int) -> BodyFit:
+    """Return a body on so few `points` that only its place, height and heading can be told, marked as such.
+
+    Its limbs are inferred, its trunk and head are near what was seen, and as a whole it is not reliable.
+    """
+    if points >= MIN_LIMB_POINTS:
+        return fit
+    trunk = np.isin(np.array(model.tree.names)[model.part_of_vertex], TRUNK_PARTS)
+    state = np.minimum(fit.visibility.vertices, np.where(trunk, Visibility.NEAR, Visibility.INFERRED)).astype(np.int8)
+    visibility = BodyVisibility.of_vertices(model, state)
+    told = np.isin(model.tree.names, TRUNK_PARTS)
+    return replace(fit, visibility=visibility, part_confidence=fit.part_confidence * told, reliable=False)
 
 
 def floor_term(vertices: np.ndarray, floor: float) -> VertexQuadratic:
