@@ -188,7 +188,7 @@ class MultiBodyTracker:
         matched = self._associate(people, stamp)
         known = {} if executor is None else {id(people[index]): fit for index, fit in first.items()}
         fitted = parallel_map(
-            lambda pair: pair[0].begin(pair[1], known.get(id(pair[1]))) or _track((pair[0].tracker, pair[1])),
+            lambda pair: pair[0].begin(pair[1], known.get(id(pair[1]))) or _track(pair),
             matched,
             self._threads,
         )
