@@ -24,8 +24,8 @@ from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
-from flowing_puppet_ros.fusion.limb_search import LimbSearcher
 from flowing_puppet_ros.fusion.lift import LiftedJoints
+from flowing_puppet_ros.fusion.limb_search import LimbSearcher
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -109,8 +109,8 @@ class JointFitter:
         targets, bank = self.make_targets(joints), self.fitter.hypotheses.pose_bank
         body = run(start, cloud, targets, pulled, terms)
         other = swap_lifted(self.model, joints)
-        other_targets = self.make_targets(other)
-        exchanged = run(self.start(other, FEW_STEPS), cloud, other_targets, strengthen_priors(EXCHANGED, unknown), terms)
+        other_targets, few = self.make_targets(other), strengthen_priors(EXCHANGED, unknown)
+        exchanged = run(self.start(other, FEW_STEPS), cloud, other_targets, few, terms)
         if bank.cost(exchanged, coarse) < MAX_SWAP_RATIO * bank.cost(body, coarse):
             body, joints, targets = exchanged, other, other_targets
             body = run(body, cloud, targets, pulled, terms)
@@ -156,9 +156,7 @@ def _add_trunk(model: StitchedPuppet, joints: NamedJoints) -> NamedJoints:
     if not all(name in joints for name in SHOULDERS):
         return joints
     template = dict(zip(model.joint_names, model.joints(model.vertices(model.rest_state())), strict=True))
-    found, mean = (
-        _stand_between(*(np.array(known[name][:3]) for name in SHOULDERS)) for known in (joints, template)
-    )
+    found, mean = (_stand_between(*(np.array(known[name][:3]) for name in SHOULDERS)) for known in (joints, template))
     sure = min(joints[name][3] for name in SHOULDERS)
     added = {}
     for name in ("neck", "pelvis"):

@@ -35,8 +35,8 @@ ACROSS_M, HIDDEN_ACROSS_M, ALONG_M = 0.02, 0.05, 0.03
 MIN_APART_M = 0.15
 """Between the joints of two poses that are refined."""
 JOINT_COST_M, FULL_COST_M, ALONG_SHARE = 0.01, 0.12, 0.3
-"""Cost of a certain joint that is as far as this from its ray, or farther, beside the cost of a body in a cloud; and the
-share that a gap along the ray counts."""
+"""Cost of a certain joint that is as far as this from its ray, or farther, beside the cost of a body in a cloud; and
+the share that a gap along the ray counts."""
 MAX_GAP_M, MAX_SEEN_GAP_M = 0.06, 0.12
 """Between a joint and its ray, and its place on a surface, beyond which a limb may be in a wrong place."""
 LOST_GAP_M, LOST_SEEN_GAP_M = 0.09, 0.15
@@ -220,7 +220,7 @@ def _measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F6
         gap = places[:, row] - joints.points[row]
         along = gap @ ray
         cost += confidence**2 * _saturate(np.linalg.norm(gap - along[:, None] * ray, axis=1))
-        choices = joints.choices.get(row)
+        choices = joints.choices.get(int(row))
         if choices is not None:
             surfaces = (choices.points[choices.seen] - joints.points[row]) @ ray
             off_surface = np.abs(along[:, None] - surfaces).min(axis=1)

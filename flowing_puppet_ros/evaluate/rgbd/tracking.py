@@ -69,7 +69,7 @@ class _Runner:
             joints = bodies[0].fit.joints[self._rows] + scene.to_world[:3, 3]
             error[seen.in_view] = np.linalg.norm(joints - frame.joints[0], axis=1)[seen.in_view]
         arms = np.array([name.endswith(("elbow", "wrist")) for name in LIMB_JOINTS]) & seen.visible
-        present = np.count_nonzero(seen.in_view) >= MIN_PUPPET_JOINTS
+        present = bool(np.count_nonzero(seen.in_view) >= MIN_PUPPET_JOINTS)
         self._errors.append(error)
         self._missing.append(present and not bodies)
         self._arms.append(present and (not bodies or bool((error[arms] > MIN_LOST_M).any())))
@@ -77,9 +77,7 @@ class _Runner:
     def finish(self) -> MotionScore:
         """Return the errors of all frames."""
         errors = np.stack(self._errors)
-        return MotionScore(
-            self.rate, errors, np.array(self._arms), np.array(self._missing), np.array(self._seconds)
-        )
+        return MotionScore(self.rate, errors, np.array(self._arms), np.array(self._missing), np.array(self._seconds))
 
 
 def track_motion(
