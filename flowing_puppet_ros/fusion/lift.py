@@ -79,6 +79,7 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
         usable: (N,) which points may be the person's.
     """
     rows = np.flatnonzero(cloud.seen & usable)
+    rows = rows[_find_near(puppet, cloud, rows)]
     offsets = np.array([BEHIND_SURFACE_M.get(_kind(name), 0.0) for name in model.joint_names])
     samples = _collect_samples(puppet, cloud, rows)
     trunk = trunk_rows(model)
@@ -96,6 +97,19 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
     found = np.isfinite(points).all(axis=1)
     hidden = puppet.hidden | _find_broken(model, puppet, cloud, rows, surface)
     return LiftedJoints(points, rays, np.where(found, puppet.confidence, 0.0), hidden, depth, cloud.camera.centre)
+
+
+def _find_near(puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray) -> Bools:
+    """Return which of the `rows` (N,) of a cloud may lie around a joint of a puppet, or on the way to one."""
+    if not puppet.known.any() or not len(rows):
+        return np.zeros(len(rows), dtype=bool)
+    known = puppet.pixels[puppet.known]
+    outside = np.maximum(known.min(axis=0) - cloud.pixels[rows], cloud.pixels[rows] - known.max(axis=0)).max(axis=1)
+    depth = np.maximum(cloud.depth[rows], 1e-3)
+    around = outside < np.maximum(MIN_RADIUS_PX, RADIUS_M * cloud.camera.focal / depth)
+    if not around.any():
+        return around
+    return around | (outside < PATH_RADIUS_M * cloud.camera.focal / depth[around].min() + MIN_RADIUS_PX)
 
 
 def _find_broken(
