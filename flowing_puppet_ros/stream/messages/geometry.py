@@ -80,7 +80,7 @@ def make_quaternion(factory: MessageFactory, rotation: Array) -> Any:
 
 
 def _to_quaternion(m: list[list[float]]) -> list[float]:
-    """Return w, x, y, z, w >= 0, of one rotation matrix, as `model.rotation.quaternion`, which is for many at a time."""
+    """Return w, x, y, z, w >= 0, of one rotation matrix; `model.rotation.quaternion` is for many at a time."""
     (a, b, c), (d, e, f), (g, h, i) = m
     rows = (
         (1 + a + e + i, h - f, c - g, d - b),
