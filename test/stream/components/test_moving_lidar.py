@@ -75,7 +75,7 @@ def scan(walkers: Walkers, frame: int, roll: float) -> np.ndarray:
 
 @dataclass
 class Drive:
-    """What came of a drive: (frame, id, hips in the map, velocity in the map), and how often nothing was fitted again."""
+    """What came of a drive: (frame, id, hips and velocity in the map), and how often nothing was fitted again."""
 
     found: list[tuple[int, str, np.ndarray, np.ndarray]]
     remembered: int
