@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes live: images of a drawn person and clouds of a walking body over loopback DDS, with timed results."""
+"""The nodes live over loopback DDS, timed: images of a drawn person, clouds of a body, RGB-D of two people."""
 
 from __future__ import annotations
 
@@ -17,13 +17,20 @@ import numpy as np
 
 from benchmarks.drawn_person import DrawnPerson
 from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.body.synthetic_scans import sample_surface
+from flowing_puppet_ros.evaluate.rgbd.depth_sensor import to_millimetres
+from flowing_puppet_ros.evaluate.rgbd.motions import pose_motion
+from flowing_puppet_ros.evaluate.rgbd.views import RgbdStudio, look_along
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 IMAGE_RATE_HZ, CLOUD_RATE_HZ = 30.0, 10.0
 IMAGE_COUNT, CLOUD_COUNT = 90, 40  # played back and forth
 CLOUD_POINTS, NOISE_M, STEP_M, TURN_RAD = 5000, 0.003, 0.03, 0.02  # noise is a deviation; step and turn are per cloud
+RGBD = "puppet_tracker, body_fitter"
+RGBD_COUNT = 45  # moments, played back and forth
 TARGETS = {
+    RGBD: "15 Hz, median 120 ms, first body 0.6 s",
     "puppet_tracker": "15 Hz, median 150 ms, lock-on 10 s",
     "body_fitter": "5 Hz, lock-on 10 s",
 }
@@ -56,6 +63,31 @@ def make_clouds(seed: int = 0) -> np.ndarray:
     return np.stack(found).astype(np.float32)
 
 
+def make_rgbd(seed: int = 0) -> dict[str, Any]:
+    """Draw colour and depth of somebody who waves and somebody who walks, and their keypoints with 5 px of noise.
+
+    The keypoint networks rarely find drawn people, so that the keypoints are published as detections.
+    """
+    source = BodySource()
+    rng = np.random.default_rng(seed)
+    places = {"waving": (np.array([0.2, 0.7, 0.0]), np.pi), "walking": (np.array([0.2, -0.5, 0.0]), 0.8 * np.pi)}
+    people = [
+        [body.translate(place) for body in pose_motion(source, name, rng, RGBD_COUNT, IMAGE_RATE_HZ, yaw)]
+        for name, (place, yaw) in places.items()
+    ]
+    studio = RgbdStudio(source)
+    cameras = studio.cameras.place(look_along(np.array([1.0, 0.0, 0.0]), 0.12), np.array([-3.2, 0.0, 1.3]))
+    room = studio.furnish(rng, [body for person in people for body in (person[0], person[-1])], cameras)
+    frames = [studio.look(rng, [person[number] for person in people], room, cameras) for number in range(RGBD_COUNT)]
+    keypoints = [[np.column_stack([seen.pixels, seen.confidence]) for seen in frame.keypoints] for frame in frames]
+    return {
+        "colour": np.stack([frame.rgb for frame in frames]),
+        "depth": np.stack([to_millimetres(frame.depth) for frame in frames]),
+        "keypoints": np.array(keypoints),
+        "matrix": cameras.depth.matrix,
+    }
+
+
 def run(seconds: float, seed: int = 0) -> list[dict[str, Any]]:
     """Measure each node for `seconds`; return one row per node. InputError if ROS is missing."""
     if importlib.util.find_spec("rclpy") is None:
@@ -69,19 +101,22 @@ def run(seconds: float, seed: int = 0) -> list[dict[str, Any]]:
         ):
             arrays: Any = {array: make_images() if array == "images" else make_clouds(seed)}
             np.savez(file, **arrays)
-            rows.append(_measure_node(node, file, rate, seconds) | {"target": TARGETS[node]})
+            command = ["benchmarks.live_node", node, str(file), "--rate", str(rate), "--seconds", str(seconds)]
+            rows.append(_measure([*command, "--", *_ARGUMENTS[node]]) | {"target": TARGETS[node]})
+        np.savez(file, **make_rgbd(seed))
+        command = ["benchmarks.live_rgbd", str(file), "--rate", str(IMAGE_RATE_HZ), "--seconds", str(seconds)]
+        rows.append({"node": RGBD} | _measure(command) | {"target": TARGETS[RGBD]})
     return rows
 
 
-def _measure_node(node: str, file: Path, rate: float, seconds: float) -> dict[str, Any]:
-    measure = [sys.executable, "-m", "benchmarks.live_node", node, str(file)]
-    command = [*measure, "--rate", str(rate), "--seconds", str(seconds), "--", *_ARGUMENTS[node]]
+def _measure(command: list[str]) -> dict[str, Any]:
+    """Return the figures that a module of the benchmarks prints."""
     # A domain of its own, on this machine only, so that other topics do not interfere.
     environment = os.environ | {
         "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }  # fmt: skip
     environment.pop(_BOOTSTRAP_GUARD, None)
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=environment)
+    done = subprocess.run([sys.executable, "-m", *command], stdout=subprocess.PIPE, text=True, env=environment)
     if done.returncode:
-        raise PuppetError(f"the live measurement of {node} failed; see above")
+        raise PuppetError(f"the live measurement {' '.join(command[:2])} failed; see above")
     return dict(json.loads(done.stdout))

@@ -17,10 +17,11 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
+from flowing_puppet_ros.annotate.store import FILE_NAME  # noqa: E402
 from flowing_puppet_ros.bag.reader import open_bag  # noqa: E402
 from flowing_puppet_ros.draw.pictures import save  # noqa: E402
 from flowing_puppet_ros.stream.messages.images import decode_image  # noqa: E402
-from flowing_puppet_ros.stream.messages.message_types import IMAGE  # noqa: E402
+from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, IMAGE  # noqa: E402
 from scripts.ensure_browser import NAMES  # noqa: E402
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 FOLDER = ROOT / "docs" / "drawn"
 RECORDING, REPORT = ROOT / "bags" / "cache" / "rgbd", ROOT / "out" / "rgbd.html"
 WIDE, HIGH = 1200, 860  # px, of the window
-WIDTH = 900  # px, of the pictures
+WIDTH = 760  # px, of the pictures
 DRAWN_IN_3D = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 PATIENCE_MS = 180_000
 
@@ -40,27 +41,31 @@ def photograph_report(browser: Browser) -> bytes:
     page.locator(".scrub input").evaluate(
         "slider => { slider.value = slider.max / 2; slider.dispatchEvent(new Event('input')) }"
     )
-    page.locator(".timeline").scroll_into_view_if_needed()
+    page.evaluate("document.querySelector('canvas').scrollIntoView({block: 'center'})")
     page.wait_for_timeout(3000)
     return page.screenshot()
 
 
 def photograph_annotation(browser: Browser) -> bytes:
-    """Return a picture of the annotation page on an image of the recording."""
-    with tempfile.TemporaryDirectory() as folder:
+    """Return a picture of the annotation page on an image of the recording, with the people that it finds."""
+    with tempfile.TemporaryDirectory() as parent:
+        folder = Path(parent) / "photos"
+        folder.mkdir()
         image = next(
             decode_image(record.message)
             for record in open_bag(RECORDING).messages()
-            if record.type == IMAGE and "color" in record.topic
+            if record.type in (IMAGE, COMPRESSED_IMAGE) and "color" in record.topic
         )
-        save(image, Path(folder) / "people.png")
-        command = [sys.executable, "-m", "flowing_puppet_ros", "annotate", folder, "--port", "0"]
+        save(image, folder / "people.png")
+        command = [sys.executable, "-m", "flowing_puppet_ros", "annotate", str(folder), "--port", "0"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as tool:
             assert tool.stdout is not None
             address = next(word for word in tool.stdout.readline().split() if word.startswith("http"))
             try:
                 page = open_page(browser, address, "body[data-ready]")
-                page.wait_for_timeout(3000)
+                page.get_by_text("Find people").click()
+                while not (folder / FILE_NAME).is_file():
+                    page.wait_for_timeout(1000)
                 return page.screenshot()
             finally:
                 tool.terminate()

@@ -61,9 +61,7 @@ def place_coarsely(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud
     return CoarsePerson(puppet.id, joints, np.where(puppet.known, COARSE_CONFIDENCE * puppet.confidence, 0.0))
 
 
-def place_others(
-    model: StitchedPuppet, puppets: Sequence[PuppetJoints], cloud: SeenCloud
-) -> list[CoarsePerson]:
+def place_others(model: StitchedPuppet, puppets: Sequence[PuppetJoints], cloud: SeenCloud) -> list[CoarsePerson]:
     """Return the people of the puppets with an id of whom there is no depth."""
     found = [place_coarsely(model, puppet, cloud) for puppet in puppets if puppet.id]
     return [person for person in found if person is not None]

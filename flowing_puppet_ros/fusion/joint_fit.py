@@ -8,6 +8,7 @@ the one that the cloud contradicts less is kept.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,13 +24,15 @@ from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
-from flowing_puppet_ros.fusion.limb_search import LimbSearcher
 from flowing_puppet_ros.fusion.lift import LiftedJoints
+from flowing_puppet_ros.fusion.limb_search import LimbSearcher
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-PULLED = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=20)
+PULLED = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=14)
 """With joints, from far away."""
+EXCHANGED = replace(PULLED, iterations=8, alternate=2)
+"""The same with left and right exchanged, enough to see whether it is worth more."""
 FREE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.06, sigma_end=0.03, iterations=8)
 """Without joints, at the end."""
 CLOSE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.08, sigma_end=0.04, iterations=6)
@@ -42,6 +45,8 @@ HIDDEN_SHARE = 0.25
 MIN_START_CONFIDENCE, MIN_LIMB_CONFIDENCE = 0.1, 0.3
 """In a start: what joints of trunk and head count at least, since a puppet places them as the rest of the body
 suggests, and below which those of limbs do not count, since a hanging arm is a better guess."""
+START_STEPS, FEW_STEPS = 15, 6
+"""Of Gauss-Newton from the joints alone, for a start and where the body only needs to be about right."""
 SHOULDERS = ("left_shoulder", "right_shoulder")
 
 type NamedJoints = dict[str, tuple[float, float, float, float]]
@@ -56,12 +61,12 @@ class JointFitter:
         self.fitter = fitter
         self.model = fitter.model
         self._strength = strength
-        self._limbs = LimbSearcher(fitter.hypotheses, fitter.model)
+        self.limbs = LimbSearcher(fitter.hypotheses, fitter.model)
         self._is_limb = np.ones(len(self.model.joint_names), dtype=bool)
         self._is_limb[trunk_rows(self.model)] = False
 
-    def start(self, joints: LiftedJoints) -> BodyState:
-        """Return the body that the joints describe; InputError when they describe none."""
+    def start(self, joints: LiftedJoints, steps: int = START_STEPS) -> BodyState:
+        """Return the body that the joints describe, after so many steps; InputError when they describe none."""
         floor = np.where(self._is_limb, 0.0, MIN_START_CONFIDENCE)
         weight = np.where(joints.found, np.sqrt(np.maximum(joints.confidence, floor)), 0.0)
         certain = np.where(joints.hidden, HIDDEN_SHARE * weight, weight)
@@ -69,7 +74,7 @@ class JointFitter:
             targets = make_joint_targets(self.model, self._name(joints, certain))
         except InputError:
             targets = make_joint_targets(self.model, _add_trunk(self.model, self._name(joints, weight)))
-        return body_from_joints(self.model, self.fitter.gauss_newton, targets)
+        return body_from_joints(self.model, self.fitter.gauss_newton, targets, steps)
 
     def _name(self, joints: LiftedJoints, weight: F64) -> NamedJoints:
         """Return the joints that have a weight (J,), as name -> (x, y, z, weight)."""
@@ -86,9 +91,7 @@ class JointFitter:
         points, rays = np.nan_to_num(joints.points), np.nan_to_num(joints.rays)
         return JointTargets(points, self._strength * weight, rays)
 
-    def make_cloud(
-        self, points: F64, field: SensorField | None, viewpoint: F64 | None = None
-    ) -> SingleViewCloud:
+    def make_cloud(self, points: F64, field: SensorField | None, viewpoint: F64 | None = None) -> SingleViewCloud:
         """Return the person's points (N, 3) m of a sensor, and what that can know of the person.
 
         The sensor is at `viewpoint` (3,) m, or at the origin.
@@ -103,26 +106,36 @@ class JointFitter:
         unknown = measure_unknown_share(self.model, start, cloud)
         pulled, close, free = (strengthen_priors(weights, unknown) for weights in (PULLED, CLOSE, FREE))
         terms, run = [cloud.free_space_term], self.fitter.gauss_newton.run
-        tried = []
-        for body, own in ((start, joints), (None, swap_lifted(self.model, joints))):
-            targets = self.make_targets(own)
-            found = run(self.start(own) if body is None else body, cloud, targets, pulled, terms)
-            tried.append((self.fitter.hypotheses.pose_bank.cost(found, coarse), found, own, targets))
-        _, body, joints, targets = tried[tried[1][0] < MAX_SWAP_RATIO * tried[0][0]]
-        body = self._limbs.improve(
-            body, coarse, joints, lambda tried: run(tried, cloud, targets, close, terms), np.random.default_rng(0)
-        )
+        targets, bank = self.make_targets(joints), self.fitter.hypotheses.pose_bank
+        body = run(start, cloud, targets, pulled, terms)
+        other = swap_lifted(self.model, joints)
+        other_targets, few = self.make_targets(other), strengthen_priors(EXCHANGED, unknown)
+        exchanged = run(self.start(other, FEW_STEPS), cloud, other_targets, few, terms)
+        if bank.cost(exchanged, coarse) < MAX_SWAP_RATIO * bank.cost(body, coarse):
+            body, joints, targets = exchanged, other, other_targets
+            body = run(body, cloud, targets, pulled, terms)
+        body = self.limbs.improve(
+            body, coarse, joints, self.limbs.find_doubtful(body, joints),
+            lambda tried: run(tried, cloud, targets, close, terms),
+        )  # fmt: skip
         held = self._hold_hidden(joints, targets)
         return self.fitter.assess(run(body, cloud, held, free, terms), cloud)
+
+    def hang_anew(
+        self, cloud: SingleViewCloud, body: BodyState, joints: LiftedJoints, limbs: Sequence[int]
+    ) -> BodyFit | None:
+        """Return the fit of a body with `limbs` hung anew, None where nothing better is found."""
+        unknown = measure_unknown_share(self.model, body, cloud)
+        close, targets = strengthen_priors(CLOSE, unknown), self.make_targets(joints)
+        found = self.limbs.improve(
+            body, CoarseCloud.of(cloud), joints, limbs,
+            lambda tried: self.fitter.gauss_newton.run(tried, cloud, targets, close, [cloud.free_space_term]),
+        )  # fmt: skip
+        return None if found is body else self.fitter.assess(found, cloud)
 
     def _hold_hidden(self, joints: LiftedJoints, targets: JointTargets) -> JointTargets:
         """Return the pull of the hidden joints alone, which nothing else would hold."""
         return replace(targets, weight=np.where(joints.hidden, targets.weight, 0.0))
-
-    def _swap(self, targets: JointTargets) -> JointTargets:
-        other = list(find_other_sides(self.model.joint_names))
-        rays = None if targets.rays is None else targets.rays[other]
-        return JointTargets(targets.points[other], targets.weight[other], rays)
 
 
 def swap_lifted(model: StitchedPuppet, joints: LiftedJoints) -> LiftedJoints:
@@ -143,9 +156,7 @@ def _add_trunk(model: StitchedPuppet, joints: NamedJoints) -> NamedJoints:
     if not all(name in joints for name in SHOULDERS):
         return joints
     template = dict(zip(model.joint_names, model.joints(model.vertices(model.rest_state())), strict=True))
-    found, mean = (
-        _stand_between(*(np.array(known[name][:3]) for name in SHOULDERS)) for known in (joints, template)
-    )
+    found, mean = (_stand_between(*(np.array(known[name][:3]) for name in SHOULDERS)) for known in (joints, template))
     sure = min(joints[name][3] for name in SHOULDERS)
     added = {}
     for name in ("neck", "pelvis"):

@@ -95,7 +95,8 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
         if len(near) < MIN_POINTS:
             continue
         if _kind(model.joint_names[joint]) not in CHOSEN:
-            points[joint] = cloud.camera.centre + rays[joint] * (np.median(near) / (rays[joint] @ axis) + offsets[joint])
+            along = np.median(near) / (rays[joint] @ axis) + offsets[joint]
+            points[joint] = cloud.camera.centre + rays[joint] * along
             continue
         choices[joint] = list_choices(
             rays[joint], axis, cloud.camera.centre, _find_surfaces(near), offsets[joint], depth,

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which depth each joint has: that of a surface at its pixel, or another, so that all bones have their lengths.
 
-At the pixel of a hidden joint the cloud shows what hides it, and at an inexact pixel it shows the wall behind or another
-limb. Each joint chooses among the surfaces at its pixel and a grid of other depths. A choice costs what the puppet's
-confidence makes it improbable, and two joints cost the gap between their distance and the length of the bone. The trunk's
-four joints are tried in all combinations, limbs by dynamic programming along them, both for people of several sizes.
+At the pixel of a hidden joint the cloud shows what hides it, and at an inexact pixel the wall behind or another limb.
+Each joint chooses among the surfaces at its pixel and a grid of other depths. A choice costs as much as the puppet's
+confidence makes it improbable, and two joints cost the gap between their distance and the length of the bone. The
+trunk's four joints are tried in all combinations, limbs by dynamic programming along them, both for people of several
+sizes.
 """
 
 from __future__ import annotations
@@ -140,7 +141,8 @@ def _fold(
     names: Sequence[str], choices: Mapping[str, DepthChoices], place: Mapping[str, F64], scale: float
 ) -> tuple[F64, list[np.ndarray]]:
     """Return the least cost (C,) of a limb for each choice of its first joint, and the way along it."""
-    cost, back = choices[names[-1]].cost, []
+    cost = choices[names[-1]].cost
+    back: list[np.ndarray] = []
     for near, far in zip(names[-2::-1], names[:0:-1], strict=True):
         length = scale * float(np.linalg.norm(place[near] - place[far]))
         step = _measure_pair_cost(choices[near], choices[far], length)
@@ -172,7 +174,7 @@ def _choose_corners(
     place: Mapping[str, F64],
     scale: float,
 ) -> tuple[float, dict[str, int]]:
-    """Return the least cost and what each of the trunk's `corners` takes; `own` are their costs (C,) with their limbs."""
+    """Return the least cost and what each of the trunk's `corners` takes; `own` are their costs (C,) with limbs."""
     if not corners:
         return 0.0, {}
     total = np.zeros([1] * len(corners))

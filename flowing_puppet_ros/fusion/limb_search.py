@@ -8,7 +8,7 @@ kept if the whole body then costs less.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -35,10 +35,12 @@ ACROSS_M, HIDDEN_ACROSS_M, ALONG_M = 0.02, 0.05, 0.03
 MIN_APART_M = 0.15
 """Between the joints of two poses that are refined."""
 JOINT_COST_M, FULL_COST_M, ALONG_SHARE = 0.01, 0.12, 0.3
-"""Cost of a certain joint that is as far as this from its ray, or farther, beside the cost of a body in a cloud; and the
-share that a gap along the ray counts."""
+"""Cost of a certain joint that is as far as this from its ray, or farther, beside the cost of a body in a cloud; and
+the share that a gap along the ray counts."""
 MAX_GAP_M, MAX_SEEN_GAP_M = 0.06, 0.12
 """Between a joint and its ray, and its place on a surface, beyond which a limb may be in a wrong place."""
+LOST_GAP_M, LOST_SEEN_GAP_M = 0.09, 0.15
+"""The same of a tracked body, beyond which its limb is lost."""
 MIN_SEEN_SHARE = 0.9  # probability that a joint is seen, below which its limb may be in a wrong place
 MIN_GAIN_M = 0.0005  # by which a body with a limb hung anew costs less
 MIN_CONFIDENCE = 0.2  # of joints that count
@@ -69,44 +71,50 @@ class LimbSearcher:
         body: BodyState,
         coarse: CoarseCloud,
         joints: LiftedJoints,
+        limbs: Sequence[int],
         refine: Callable[[BodyState], BodyState],
-        rng: np.random.Generator,
     ) -> BodyState:
-        """Return the body with the limbs that may be wrong hung anew, where that costs less after `refine`."""
+        """Return the body with `limbs` hung anew, each if the body costs less after `refine`."""
+        rng = np.random.default_rng(0)
         cost = self.measure_cost(body, coarse, joints)
-        for limb, rows in self._limbs:
-            if not self._may_be_wrong(body, rows, joints):
-                continue
-            for tried in self._sample(body, limb, rows, coarse, joints, rng):
+        for limb in limbs:
+            for tried in self._sample(body, *self._limbs[limb], coarse, joints, rng):
                 refined = refine(tried)
                 new_cost = self.measure_cost(refined, coarse, joints)
                 if new_cost < cost - MIN_GAIN_M:
                     body, cost = refined, new_cost
         return body
 
+    def list_parts(self, limb: int) -> tuple[int, ...]:
+        """Return the parts of a limb."""
+        return self._limbs[limb][0]
+
+    def find_doubtful(self, body: BodyState, joints: LiftedJoints) -> list[int]:
+        """Return the limbs of a fitted body that may be in a wrong place: joints left them open, or it is off them."""
+        doubtful = np.array([_is_doubtful(row, joints) for row in range(len(joints.points))])
+        across, gap = self._measure_gaps(body, joints)
+        return self._find_limbs(doubtful | (across > MAX_GAP_M) | (gap > MAX_SEEN_GAP_M), joints)
+
+    def find_lost(self, body: BodyState, joints: LiftedJoints) -> list[int]:
+        """Return the limbs of a tracked body of which a joint is certainly not where the puppet sees it."""
+        across, gap = self._measure_gaps(body, joints)
+        doubtful = np.array([_is_doubtful(row, joints) for row in range(len(joints.points))])
+        return self._find_limbs((across > LOST_GAP_M) | (~doubtful & (gap > LOST_SEEN_GAP_M)), joints)
+
+    def _measure_gaps(self, body: BodyState, joints: LiftedJoints) -> tuple[F64, F64]:
+        """Return the distances (J,) m of a body's joints from their rays, and from where they were lifted to."""
+        gap = self._model.joints(self._model.vertices(body)) - joints.points
+        along = (gap * joints.rays).sum(axis=1, keepdims=True) * joints.rays
+        return np.linalg.norm(gap - along, axis=1), np.linalg.norm(gap, axis=1)
+
+    def _find_limbs(self, wrong: Bools, joints: LiftedJoints) -> list[int]:
+        used = wrong & _can_count(joints)
+        return [number for number, (_, rows) in enumerate(self._limbs) if used[rows[1:]].any()]
+
     def measure_cost(self, body: BodyState, coarse: CoarseCloud, joints: LiftedJoints) -> float:
         """Return the cost of a body in a cloud plus that of its joints, metres."""
         places = self._model.joints(self._model.vertices(body))
         return self._bank.cost(body, coarse) + float(_measure_joint_cost(places[None], joints, _can_count(joints))[0])
-
-    def _may_be_wrong(self, body: BodyState, rows: np.ndarray, joints: LiftedJoints) -> bool:
-        rows = rows[1:]
-        gap = (self._model.joints(self._model.vertices(body)) - joints.points)[rows]
-        used = _can_count(joints)[rows]
-        if not used.any():
-            return False
-        ray = joints.rays[rows]
-        across = np.linalg.norm(gap - (gap * ray).sum(axis=1, keepdims=True) * ray, axis=1)
-        doubtful = np.array([self._is_doubtful(int(row), joints) for row in rows])
-        wrong = doubtful | (across > MAX_GAP_M) | (np.linalg.norm(gap, axis=1) > MAX_SEEN_GAP_M)
-        return bool((used & wrong).any())
-
-    @staticmethod
-    def _is_doubtful(row: int, joints: LiftedJoints) -> bool:
-        """Return whether a joint may well be elsewhere on its ray."""
-        choices = joints.choices.get(row)
-        several = choices is not None and np.count_nonzero(choices.seen) > 1
-        return joints.hidden[row] or several or measure_seen_share(joints.confidence[row], False) < MIN_SEEN_SHARE
 
     def _sample(
         self,
@@ -192,6 +200,14 @@ class LimbSearcher:
         return particles_to_state(self._model, groups, pick)
 
 
+def _is_doubtful(row: int, joints: LiftedJoints) -> bool:
+    """Return whether a joint may well be elsewhere on its ray."""
+    choices = joints.choices.get(row)
+    several = choices is not None and np.count_nonzero(choices.seen) > 1
+    sure = measure_seen_share(joints.confidence[row], False) >= MIN_SEEN_SHARE
+    return bool(joints.hidden[row] or several or not sure)
+
+
 def _can_count(joints: LiftedJoints) -> Bools:
     return np.asarray(joints.found & (joints.confidence >= MIN_CONFIDENCE))
 
@@ -204,7 +220,7 @@ def _measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F6
         gap = places[:, row] - joints.points[row]
         along = gap @ ray
         cost += confidence**2 * _saturate(np.linalg.norm(gap - along[:, None] * ray, axis=1))
-        choices = joints.choices.get(row)
+        choices = joints.choices.get(int(row))
         if choices is not None:
             surfaces = (choices.points[choices.seen] - joints.points[row]) @ ray
             off_surface = np.abs(along[:, None] - surfaces).min(axis=1)

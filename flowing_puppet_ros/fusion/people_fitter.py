@@ -16,7 +16,7 @@ from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache, find_planes, is_clear_of_planes
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
-from flowing_puppet_ros.fusion.joint_fit import HIDDEN_SHARE, MIN_LIMB_CONFIDENCE, JointFitter
+from flowing_puppet_ros.fusion.joint_fit import FEW_STEPS, HIDDEN_SHARE, MIN_LIMB_CONFIDENCE, JointFitter
 from flowing_puppet_ros.fusion.lift import LiftedJoints, lift_joints
 from flowing_puppet_ros.fusion.ownership import assign_points
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, trunk_rows
@@ -166,7 +166,7 @@ class PeopleFitter:
         """
         joints = lift_joints(self.model, puppet, cloud, usable)
         try:
-            return Claim(puppet, joints, self.joint_fitter.start(joints) if body is None else body, usable)
+            return Claim(puppet, joints, self.joint_fitter.start(joints, FEW_STEPS) if body is None else body, usable)
         except InputError:
             return None
 

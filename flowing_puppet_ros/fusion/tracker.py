@@ -34,18 +34,24 @@ from flowing_puppet_ros.threads import one_blas_thread, parallel_map
 
 REFIT_INTERVAL_NS = 1_000_000_000
 """From one fit of an unreliable body from its joints to the next."""
+LIMB_INTERVAL_NS = 250_000_000
+"""From one search for a lost limb to the next."""
 MAX_SAME_PERSON_M = 0.6
 """Between the trunks of a puppet without an id and of the known body that it is."""
 
 
 @dataclass(slots=True, eq=False)
 class _PuppetTrack:
-    """One person: the `stamp` ns of the last sign, that of the last fit from joints, whether it is `proven`."""
+    """One person: the `stamp` ns of the last sign, that of the last fit from joints, whether it is `proven`.
+
+    `searched` are the stamps at which each limb was last searched for.
+    """
 
     id: str
     tracker: BodyTracker
     stamp: int
     fitted: int = 0
+    searched: dict[int, int] = field(default_factory=dict)
     proven: bool = False
     motion: TorsoMotion = field(default_factory=TorsoMotion)
 
@@ -185,9 +191,29 @@ class FusedTracker:
                         tracker.start(job.person, fresh)
                     return fresh
                 tracker.accept()
+            fit = self._find_lost_limbs(job, fit, claim, stamp)
         except InputError as error:
             return error
         return fit
+
+    def _find_lost_limbs(self, job: _TrackJob, fit: BodyFit, claim: Claim, stamp: int) -> BodyFit:
+        """Return the body with the limbs hung anew that the puppet sees elsewhere."""
+        track, fitter = job.track, self._people.joint_fitter
+        lost = [
+            limb
+            for limb in fitter.limbs.find_lost(fit.state, claim.joints)
+            if stamp - track.searched.get(limb, -LIMB_INTERVAL_NS) >= LIMB_INTERVAL_NS
+        ]
+        if not lost or track.tracker.hidden:
+            return fit
+        track.searched.update(dict.fromkeys(lost, stamp))
+        cloud = fitter.make_cloud(job.person.points, job.person.field)
+        found = fitter.hang_anew(cloud, fit.state, claim.joints, lost)
+        if found is None:
+            return fit
+        track.tracker.correct(found, [part for limb in lost for part in fitter.limbs.list_parts(limb)])
+        self._report.counters["limbs found again"] += 1
+        return found
 
     def _make_targets(self, claim: Claim, body: BodyState | None) -> JointTargets:
         """Return the joints' pull; those without a depth are at the predicted body's, since only their rays count."""

@@ -101,7 +101,9 @@ class SensorPlaces:
         if pose is None:
             self._missed = True
             alone = self._anchor is not None or self._frames.is_connected(frame, self._fixed)
-            rest = "what has no place in fixed_frame is fitted by itself" if alone else "people are tracked in the former"
+            rest = (
+                "what has no place in fixed_frame is fitted by itself" if alone else "people are tracked in the former"
+            )
             self._report.warn(f"{self._frames.describe_missing(frame, self._fixed, stamp)}: {rest}")
             self._report.counters["clouds without fixed_frame"] += 1
             return None if alone else place

@@ -71,14 +71,35 @@ def test_what_lies_far_behind_the_trunk_is_not_the_person(model: StitchedPuppet)
     assert not lifted.found[model.joint_names.index("left_wrist")]
 
 
-def test_a_limb_whose_surface_falls_back_has_missed_it_and_one_that_comes_nearer_has_not(model: StitchedPuppet) -> None:
-    behind = np.concatenate([wall(2.5, -1.5, 0.36), wall(2.75, 0.41, 1.5)])
-    before = np.concatenate([wall(2.5, -1.5, 0.36), wall(2.2, 0.36, 1.5)])
+def test_a_joint_is_not_on_a_surface_that_no_bone_reaches(model: StitchedPuppet) -> None:
+    behind = np.concatenate([wall(2.5, -1.5, 0.36), wall(3.0, 0.41, 1.5)])
+    before = np.concatenate([wall(2.5, -1.5, 0.36), wall(2.4, 0.36, 1.5)])
     row = model.joint_names.index("left_wrist")
     for cloud, expected in ((behind, True), (before, False), (wall(2.5), False)):
         lifted = lift_joints(model, puppet(model), SeenCloud.of(cloud, camera()), np.full(len(cloud), True))
         assert lifted.hidden[row] == expected
         assert not lifted.hidden[model.joint_names.index("right_wrist")]
+
+
+@pytest.mark.parametrize(("confidence", "hidden"), [(0.9, False), (0.3, True)])
+def test_a_wrist_before_the_belly_is_behind_it_if_the_puppet_is_unsure(
+    model: StitchedPuppet, confidence: float, hidden: bool
+) -> None:
+    person = puppet(model, left_elbow=(375, 220), left_wrist=(345, 240))
+    row = model.joint_names.index("left_wrist")
+    person.confidence[row] = confidence
+    seen = SeenCloud.of(wall(2.5), camera())
+    lifted = lift_joints(model, person, seen, np.ones(len(seen.points), dtype=bool))
+    assert lifted.hidden[row] == hidden
+    assert (lifted.points[row, 2] > 2.55) == hidden
+
+
+def test_of_two_surfaces_at_a_pixel_the_bones_choose(model: StitchedPuppet) -> None:
+    # At the wrist's pixel an edge: half of the points are those of a wall, in the reach of no arm.
+    cloud = np.concatenate([wall(2.5, -1.5, 0.395), wall(3.1, 0.5, 2.5)])
+    lifted = lift_joints(model, puppet(model), SeenCloud.of(cloud, camera()), np.full(len(cloud), True))
+    row = model.joint_names.index("left_wrist")
+    assert lifted.points[row, 2] == pytest.approx(2.5, abs=0.1)
 
 
 def test_nothing_is_found_in_no_points(model: StitchedPuppet) -> None:

@@ -103,6 +103,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "body.track",
         "evaluate",
         "evaluate.body",
+        "evaluate.moving",
         "evaluate.rgbd",
         "evaluate.scene",
         "image.networks",

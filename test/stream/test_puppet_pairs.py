@@ -99,7 +99,9 @@ def test_the_camera_stands_where_tf_puts_it_in_the_frame_with_z_up(model: Stitch
 
 
 def test_puppets_of_rectified_images_take_the_projection_matrix(model: StitchedPuppet) -> None:
-    camera = pairs(model, puppets(SECOND, 100), rectified=True).find(header(SECOND), SECOND, np.eye(3), np.zeros(3)).camera
+    camera = (
+        pairs(model, puppets(SECOND, 100), rectified=True).find(header(SECOND), SECOND, np.eye(3), np.zeros(3)).camera
+    )
     np.testing.assert_allclose(camera.project([0.5, 0.25, 1.0])[0], [500, 300])
 
 

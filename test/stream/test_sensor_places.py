@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test.stream.messages.test_frame_tree import FACTORY, SECOND, link, message, robot, turned
 
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header, make_transform
 from flowing_puppet_ros.stream.sensor_places import ANCHOR_GRID_M, SensorPlaces
+from test.stream.messages.test_frame_tree import FACTORY, SECOND, link, message, robot, turned
 
 POINTS = np.array([[2.0, 0.3, -0.4], [3.0, -1.0, 0.5]])
 
@@ -60,10 +60,8 @@ def test_frames_that_nothing_connects_are_one_sentence_and_the_sensors_frame_is_
         assert not place.is_fixed
         np.testing.assert_allclose(place.put(POINTS), POINTS)
     (said,) = report.drain_warnings()
-    assert said == (
-        "/tf and /tf_static do not connect 'camera' with 'odom'; publish or record the transform: people are tracked in "
-        "the former"
-    )
+    missing = "/tf and /tf_static do not connect 'camera' with 'odom'; publish or record the transform"
+    assert said == f"{missing}: people are tracked in the former"
     assert not made.is_awaited("camera", 11 * SECOND)  # given up
 
 

@@ -204,10 +204,8 @@ def measure_distances(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarr
         faces: (F, 3), outward.
         cloud: the cloud.
     """
-    corners = vertices[faces]
-    surface = np.concatenate([vertices, corners.mean(axis=1)])
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    seen = cloud.sees(surface, np.concatenate([normals, face_normals]))
+    surface, directions = _add_faces(np.ascontiguousarray(vertices), normals, faces)
+    seen = cloud.sees(surface, directions)
     count = int(np.count_nonzero(seen[: len(vertices)]))
     first, rows = cloud.nearest.query(surface[seen][:count])
     # A face's centre is near what its first corner is near.
@@ -217,9 +215,24 @@ def measure_distances(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarr
     to_cloud, nearest = np.concatenate([first, rest]), np.concatenate([rows, others])
     to_body, place = NearestPoints(surface).query(cloud.points)
     to_vertex, at_face = to_body.copy(), np.flatnonzero(place >= len(vertices))
-    gaps = corners[place[at_face] - len(vertices)] - cloud.points[at_face][:, None]
+    gaps = vertices[faces[place[at_face] - len(vertices)]] - cloud.points[at_face][:, None]
     to_vertex[at_face] = np.sqrt((gaps**2).sum(axis=2).min(axis=1))
     return SurfaceDistances(seen, to_cloud, nearest, to_body, to_vertex)
+
+
+@njit(cache=True, nogil=True)
+def _add_faces(vertices: np.ndarray, normals: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and then centres of faces (V + F, 3), and the directions (V + F, 3) that they face."""
+    count = len(vertices)
+    places, directions = np.empty((count + len(faces), 3)), np.empty((count + len(faces), 3))
+    places[:count], directions[:count] = vertices, normals
+    for face in range(len(faces)):
+        a, b, c = vertices[faces[face, 0]], vertices[faces[face, 1]], vertices[faces[face, 2]]
+        for axis in range(3):
+            places[count + face, axis] = (a[axis] + b[axis] + c[axis]) / 3
+            i, j = (axis + 1) % 3, (axis + 2) % 3
+            directions[count + face, axis] = (b[i] - a[i]) * (c[j] - a[j]) - (b[j] - a[j]) * (c[i] - a[i])
+    return places, directions
 
 
 def two_way_distance(vertices: np.ndarray, faces: np.ndarray, cloud: Cloud) -> float:

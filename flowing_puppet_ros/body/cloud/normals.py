@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from flowing_puppet_ros.body.cloud.mesh_geometry import sum_groups
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours, fit_normals
@@ -35,15 +35,43 @@ def downsample(points: np.ndarray, normals: np.ndarray | None, max_points: int) 
     kept = points if normals is None else np.concatenate([points, normals], axis=1)
     size, weight = float(np.ptp(points, axis=0).max()) / 400, np.ones(len(points))
     while len(kept) > max_points:
-        cells = np.floor((kept[:, :3] - kept[:, :3].min(axis=0)) / size).astype(np.int64)
-        _, group = np.unique(np.ravel_multi_index(tuple(cells.T), tuple(cells.max(axis=0) + 1)), return_inverse=True)
-        total = np.bincount(group, weight)
-        kept, weight = sum_groups(kept * weight[:, None], group) / total[:, None], total
+        kept, weight = _merge_cells(np.ascontiguousarray(kept), weight, size)
         size *= max(1.05, np.sqrt(len(kept) / max_points))
     if normals is None:
         return kept, None
     length = np.linalg.norm(kept[:, 3:], axis=1, keepdims=True)
     return np.ascontiguousarray(kept[:, :3]), kept[:, 3:] / np.where(length > 1e-9, length, 1)
+
+
+@njit(cache=True, nogil=True)
+def _merge_cells(values: np.ndarray, weight: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the weighted means (M, K) of the rows (N, K) in each voxel, in the order of the voxels, and their weights.
+
+    The first three columns are the places, and `size` is the voxels' edge in their unit.
+    """
+    low, cells = values[0, :3].copy(), np.empty((len(values), 3), np.int64)
+    for row in range(1, len(values)):
+        for axis in range(3):
+            low[axis] = min(low[axis], values[row, axis])
+    top = np.zeros(3, np.int64)
+    for row in range(len(values)):
+        for axis in range(3):
+            cells[row, axis] = int(np.floor((values[row, axis] - low[axis]) / size))
+            top[axis] = max(top[axis], cells[row, axis])
+    flat = (cells[:, 0] * (top[1] + 1) + cells[:, 1]) * (top[2] + 1) + cells[:, 2]
+    order = np.argsort(flat, kind="mergesort")
+    means, total, last = np.zeros_like(values), np.zeros(len(values)), -1
+    for place in range(len(order)):
+        row = order[place]
+        if place == 0 or flat[row] != flat[order[place - 1]]:
+            last += 1
+        total[last] += weight[row]
+        for column in range(values.shape[1]):
+            means[last, column] += values[row, column] * weight[row]
+    for row in range(last + 1):
+        for column in range(values.shape[1]):
+            means[row, column] /= total[row]
+    return means[: last + 1], total[: last + 1]
 
 
 def estimate_normals(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -69,8 +70,10 @@ def make_joint_targets(model: StitchedPuppet, initial: Mapping[str, tuple[float,
     return JointTargets(points, weight)
 
 
-def body_from_joints(model: StitchedPuppet, refiner: GaussNewton, targets: JointTargets) -> BodyState:
-    """Place all parts so that the model's joints lie on the targets.
+def body_from_joints(
+    model: StitchedPuppet, refiner: GaussNewton, targets: JointTargets, steps: int = JOINTS_ONLY.iterations
+) -> BodyState:
+    """Place all parts so that the model's joints lie on the targets, in so many `steps` of Gauss-Newton.
 
     The trunk is aligned by Procrustes, every other part takes the shortest rotation towards its far joint, and
     Gauss-Newton without a cloud adjusts lengths, twists and bends. Parts without targets follow their parents.
@@ -80,7 +83,7 @@ def body_from_joints(model: StitchedPuppet, refiner: GaussNewton, targets: Joint
     start = _align_trunk(model, rest, template, targets)
     for part in range(1, len(model.tree)):
         _attach(model, start, part, rest, template, targets)
-    return refiner.run(start, None, targets.scale(START_WEIGHT), JOINTS_ONLY)
+    return refiner.run(start, None, targets.scale(START_WEIGHT), replace(JOINTS_ONLY, iterations=steps))
 
 
 def _span_a_plane(points: np.ndarray) -> bool:

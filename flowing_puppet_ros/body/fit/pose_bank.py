@@ -99,7 +99,7 @@ class PoseBank:
         costs, _ = self._judge_bank(rough, POSES, self._rough_columns)
         poses = np.argsort(costs, axis=1, kind="stable")[:, :FINE_POSES]
         rows = (np.arange(YAWS)[:, None] * POSES + poses).reshape(-1)
-        bodies = self._move_to_cloud([group.take(rows) for group in make_bank(self._model)], coarse)
+        bodies = self._move_to_cloud(_take_bodies(self._model, rows), coarse)
         cost = self.coverage_cost(bodies, coarse, range(len(bodies))).cost.reshape(YAWS, FINE_POSES)
         yaws = np.argsort(cost.min(axis=1), kind="stable")[:count]
         best = [yaw * FINE_POSES + int(cost[yaw].argmin()) for yaw in yaws]
@@ -111,7 +111,7 @@ class PoseBank:
         states = []
         for yaw in np.argsort(costs.min(axis=1), kind="stable")[:count]:
             pose = int(costs[yaw].argmin())
-            groups = [group.take(np.array([yaw * POSES + pose])) for group in make_bank(self._model)]
+            groups = _take_bodies(self._model, np.array([yaw * POSES + pose]))
             body = particles_to_state(self._model, groups, np.zeros(len(groups), dtype=np.int64))
             states.append(replace(body, center=body.center + shift[yaw, pose]))
         return states
@@ -146,7 +146,7 @@ class PoseBank:
     @cached_property
     def _bank_surface(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Surface points and normals (POSES, K, 3) and joint priors (POSES,) of the bank's bodies in the first yaw."""
-        bodies = [group.take(np.arange(POSES)) for group in make_bank(self._model)]
+        bodies = make_bank(self._model)
         return *self._pose_surface(bodies, range(len(bodies))), self._joint_prior(bodies, range(len(bodies)))
 
     def cost(self, body: BodyState, coarse: CoarseCloud) -> float:
@@ -207,10 +207,10 @@ class PoseBank:
 
 @lru_cache(maxsize=3)
 def make_bank(model: StitchedPuppet) -> list[Particles]:
-    """Sample the bank: the particles of each part in every yaw and pose; made once for a model."""
+    """Sample the bank: the particles of each part in every pose, in the first yaw; made once for a model."""
     rng = np.random.default_rng(0)
     bodies = model.sample_many(rng, POSES, shape_scale=0.0)
-    bank = [
+    return [
         Particles(
             bodies.center[:, part],
             bodies.rotation[:, part],
@@ -219,7 +219,16 @@ def make_bank(model: StitchedPuppet) -> list[Particles]:
         )
         for part in range(len(model.tree))
     ]
-    return [Particles.join([_rotate(group, yaw) for yaw in _list_yaws()]) for group in bank]
+
+
+def _take_bodies(model: StitchedPuppet, rows: np.ndarray) -> list[Particles]:
+    """Return the particles of bodies of the bank; row = yaw * POSES + pose."""
+    turns = _list_yaws()[rows // POSES]
+    taken = [group.take(rows % POSES) for group in make_bank(model)]
+    return [
+        Particles((turns @ group.center[:, :, None])[:, :, 0], turns @ group.rotation, group.pose, group.shape)
+        for group in taken
+    ]
 
 
 def _list_yaws() -> np.ndarray:
@@ -258,7 +267,3 @@ def _find_same_height(height: np.ndarray, coarse: CoarseCloud) -> np.ndarray:
 
 def _take_first(points: PointSet, count: int) -> PointSet:
     return PointSet(points.mean[:count], points.pose_basis[:count], points.shape_basis[:count])
-
-
-def _rotate(group: Particles, rotation: np.ndarray) -> Particles:
-    return Particles(group.center @ rotation.T, rotation @ group.rotation, group.pose, group.shape)

@@ -137,7 +137,8 @@ class Proposer:
         weight = self._model.interfaces[part - 1].weight
         near = np.average(points.interfaces[part - 1].to_world(particles), axis=1, weights=weight)
         number = int(np.flatnonzero(points.joint_index == joint)[0])
-        turn = _turn_between(points.joints.to_world(particles)[:, number] - near, np.where(known[:, None], target, 0) - near)
+        far, aim = points.joints.to_world(particles)[:, number], np.where(known[:, None], target, 0.0)
+        turn = _turn_between(far - near, aim - near)
         turn[~known] = np.eye(3)
         center = near + (turn @ (particles.center - near)[:, :, None])[:, :, 0]
         return Particles(center, turn @ particles.rotation, particles.pose, particles.shape)
@@ -181,7 +182,7 @@ class Proposer:
 
 
 def _turn_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the rotations (P, 3, 3) by the smallest angles that take the directions of a (P, 3) to those of b (P, 3)."""
+    """Return the smallest rotations (P, 3, 3) that take the directions of a (P, 3) to those of b (P, 3)."""
     a, b = (side / np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-12) for side in (a, b))
     axis = np.cross(a, b)
     sine = np.linalg.norm(axis, axis=1)

@@ -52,6 +52,12 @@ class Candidate:
     top: float
     whole: bool
 
+    @classmethod
+    def of(cls, scene: SceneHeights, rows: np.ndarray) -> Candidate:
+        """Make a candidate of what was found otherwise: rows (N,) of a scene, ascending, N > 0."""
+        middle = _find_middle(scene.points, rows)
+        return cls(rows, middle, scene.floor.locate(*middle), float(scene.height[rows].max()), True)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneHeights:

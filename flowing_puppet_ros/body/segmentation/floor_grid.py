@@ -20,6 +20,9 @@ MAX_BELOW_PLANE_M = 1.0  # a cell that is lower shows a reflection or a shaft
 PLANE_STEPS, PLANE_WIDTH_M = 12, 0.12  # of the robust fit; above the plane, cells count less beyond this width
 MAX_PLANE_SLOPE = 0.25
 BLUR_CELLS = 0.7
+FLOOR_THICKNESS_M, MIN_FLOOR_SHARE, MAX_CEILING_SHARE = 0.1, 0.25, 0.08
+"""Distance from the floor up to which points are on it, the share of a scan's points that are on it at least, and the
+share that may be on what is lowest in a scan that is upside down."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +55,15 @@ class FloorGrid:
     def locate(self, x: float, y: float) -> float:
         """Return z of the floor at a place, metres."""
         return -float(self.height(np.array([[x, y, 0.0]]))[0])
+
+
+def looks_upside_down(points: np.ndarray) -> bool:
+    """Return whether a scene (N, 3) m with N > 0 has its floor above everything else: its sensor hangs head first."""
+    below, above = (
+        float((np.abs(FloorGrid.find(each).height(each)) < FLOOR_THICKNESS_M).mean())
+        for each in (points, points * np.array([1.0, 1.0, -1.0]))
+    )
+    return above > MIN_FLOOR_SHARE and below < MAX_CEILING_SHARE
 
 
 def _find_lowest(points: np.ndarray, low: np.ndarray, shape: np.ndarray) -> np.ndarray:

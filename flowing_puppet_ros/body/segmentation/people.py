@@ -133,7 +133,12 @@ def assign_to_known(centres: np.ndarray, label: np.ndarray, known: Sequence[np.n
     body.
     """
     trees = [cKDTree(points) for points in known]
-    distance = np.stack([tree.query(centres)[0] for tree in trees])
+    distance = np.full((len(known), len(centres)), np.inf)
+    for own, tree in zip(distance, trees, strict=True):
+        if tree.n:
+            inside = (centres > tree.mins - MAX_OWN_DISTANCE_M) & (centres < tree.maxes + MAX_OWN_DISTANCE_M)
+            near = np.flatnonzero(inside.all(axis=1))
+            own[near] = tree.query(centres[near])[0]
     nearest, closest = distance.argmin(axis=0), distance.min(axis=0)
     assigned, first = label.copy(), int(label.max()) + 1
     for number, group in _group_by_label(label):
@@ -143,7 +148,8 @@ def assign_to_known(centres: np.ndarray, label: np.ndarray, known: Sequence[np.n
         if not len(owners):
             continue
         taken = group if share.sum() > MIN_WHOLE_SHARE or number in whole else near
-        assigned[taken] = first + owners[distance[np.ix_(owners, taken)].argmin(axis=0)]
+        away = np.stack([trees[owner].query(centres[taken])[0] for owner in owners])
+        assigned[taken] = first + owners[away.argmin(axis=0)]
     return assigned
 
 

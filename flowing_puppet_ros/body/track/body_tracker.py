@@ -8,6 +8,7 @@ body and cloud tells when the track is lost.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -24,7 +25,13 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, ch
 from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.upright.upright_fit import FEW_POINTS, MIN_MANY_POINTS, UprightFitter, floor_term
+from flowing_puppet_ros.body.upright.upright_fit import (
+    FEW_POINTS,
+    MIN_MANY_POINTS,
+    UprightFitter,
+    floor_term,
+    keep_place_only,
+)
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
@@ -39,6 +46,9 @@ MAX_SHAPE_FRAMES = 30  # that count for the shape: with more, a first mistake wo
 MIN_VISIBLE = 0.4  # visible fraction, relative to normal, below which the person counts as occluded ...
 MIN_VISIBLE_OF_FEW = 0.75  # ... and where few points show the person, and half of them bends the body more
 VISIBLE_HALF_LIFE_S = 2.0  # in which the normal visible surface falls to half where less is seen
+MAX_TURNED_RATIO = 1.25
+"""Two-way distance of a body that walks ahead, relative to that of one that walks backwards, up to which it is taken:
+few points hardly tell front from back, and hardly anybody walks backwards."""
 MAX_STRETCH = 2.0  # frames by which a motion is extrapolated at most
 
 
@@ -151,6 +161,38 @@ class BodyTracker:
         seen = _Observation(fit, person.stamp, person.points.mean(axis=0))
         self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
 
+    def correct(self, fit: BodyFit, parts: Sequence[int]) -> None:
+        """Take another body for the last cloud, of which `parts` are elsewhere; they are not taken to have moved."""
+        last, before = self._state.last, self._state.before
+        if last is None:
+            return
+        if before is not None:
+            earlier, new, rows = before.fit.state, fit.state, list(parts)
+            turn = earlier.rotation[0] @ new.rotation[0].T
+            center, rotated = earlier.center.copy(), earlier.rotation.copy()
+            center[rows] = earlier.center[0] + (new.center[rows] - new.center[0]) @ turn.T
+            rotated[rows] = turn @ new.rotation[rows]
+            moved = replace(earlier, center=center, rotation=rotated)
+            before = replace(before, fit=replace(before.fit, state=moved))
+        self._state = replace(self._state, before=before, last=replace(last, fit=fit), lost=False)
+
+    def turn_round(self, person: PersonCloud) -> BodyFit | None:
+        """Turn the last body, who walks backwards, if one that walks ahead explains the cloud nearly as well.
+
+        Returns:
+            The turned body; None where it stays as it is.
+        """
+        last, floor, viewpoint = self._state.last, person.floor, person.viewpoint
+        if last is None or floor is None or viewpoint is None:
+            return None
+        with one_blas_thread():
+            cloud = self._upright.make_cloud(person.points, viewpoint, None, person.field)
+            turned = self._upright.turn_round(last.fit.state, cloud, floor).fit
+        if turned.two_way_distance > MAX_TURNED_RATIO * last.fit.two_way_distance:
+            return None
+        self.start(person, turned)
+        return turned
+
     @property
     def hidden(self) -> bool:
         """Whether much less of the person was seen in the last cloud than normally."""
@@ -243,6 +285,8 @@ class BodyTracker:
 
     def _record(self, fit: BodyFit, lost: bool, prepared: _Prepared) -> BodyFit:
         state = self._state
+        if prepared.floor is not None:
+            fit = keep_place_only(self._fitter.model, fit, len(prepared.cloud.points))
         seen = _Observation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
         best = state.best if lost or prepared.occluded else min(state.best, fit.two_way_distance)
         frames = state.frames + (not prepared.occluded)
@@ -336,9 +380,11 @@ class BodyTracker:
             terms.append(lambda vertices, _: floor_term(vertices, floor))
         learned = SHAPE_WEIGHT_PER_FRAME * min(self._state.frames, MAX_SHAPE_FRAMES)
         weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
-        # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden.
+        # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden. Where
+        # joints say where it is, it does not lag, and one that is hidden is not drawn to what hides it.
         facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint, cloud.field)
-        body = self._fitter.gauss_newton.run(start, facing, prepared.targets, weights, terms)
+        seen = facing if prepared.targets.rays is None else cloud
+        body = self._fitter.gauss_newton.run(start, seen, prepared.targets, weights, terms)
         # A limb that left the view stays in its last pose: its motion would go on for ever.
         last = start if self._state.last is None else self._state.last.fit.state
         body = hang_unseen_parts(self._fitter.model, (last, body), cloud, prepared.targets)

@@ -8,9 +8,9 @@ full fit in the cloud that shows them first.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -21,6 +21,7 @@ from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCloud
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
+from flowing_puppet_ros.body.track.person_belief import PersonBelief
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
@@ -35,7 +36,11 @@ OWNED_FACTOR = 0.3  # of the distance where the track's body lies in the cloud
 VELOCITY_GAIN = 0.5  # fraction of a new velocity that is taken
 MAX_VELOCITY_GAP_NS = 1_000_000_000  # between clouds that give a velocity
 REFIT_INTERVAL_NS = 5_000_000_000  # from one full fit of an unreliable body to the next
+TURN_INTERVAL_NS = 1_000_000_000  # between attempts to turn a body round that walks backwards
 BODY_STRIDE = 8  # every so many vertices stand for a body
+
+Judge = Callable[[PersonCloud, BodyFit], tuple[float, float]]
+"""What a scan says about a body: the probability that it is a person, and that it is one and close."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,8 @@ class _BodyTrack:
     """One person.
 
     The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, its `motion`, the number
-    of full fits and the stamp of the last, and whether it is `proven` to be a person.
+    of full fits and the stamp of the last, that of the last attempt to turn it round, whether it is `proven` to be a
+    person, and what scans said about that.
     """
 
     id: str
@@ -62,7 +68,9 @@ class _BodyTrack:
     motion: TorsoMotion = field(default_factory=TorsoMotion)
     fits: int = 0
     fitted: int = 0
+    turned: int = -TURN_INTERVAL_NS
     proven: bool = True
+    belief: PersonBelief | None = None
 
     def predict_middle(self, stamp: int) -> F64:
         """Return where the middle should be at a later time in nanoseconds."""
@@ -71,7 +79,15 @@ class _BodyTrack:
     def prove(self, fit: BodyFit) -> bool:
         """Return whether it is known to be a person, as a reliable body shows from then on."""
         self.proven = self.proven or fit.reliable
-        return self.proven
+        return self.proven and (self.belief is None or self.belief.decide())
+
+    def weigh(self, person: PersonCloud, fit: BodyFit, judge: Judge) -> None:
+        """Ask a scan whether it is a person, unless that was asked lately or too little is seen."""
+        if self.belief is None:
+            self.belief = PersonBelief(person.middle[:2])
+        self.belief.visit(person.middle)
+        if self.belief.is_due(self.stamp) and not self.tracker.hidden:
+            self.belief.add(*judge(person, fit), self.stamp)
 
     def begin(self, person: PersonCloud, fit: BodyFit | None) -> BodyFit | None:
         """Return the body as the first of a new person; a doubtful one has its full fit as soon as may be."""
@@ -83,6 +99,8 @@ class _BodyTrack:
 
     def show(self, fit: BodyFit) -> TrackedBody:
         """Return its body at the time of the last cloud, with what is known of its motion."""
+        if self.belief is not None and self.belief.confidence is not None:
+            fit = replace(fit, confidence=self.belief.confidence)
         return self.motion.add(self.id, self.stamp, fit, self.tracker.hidden)
 
     def update(self, middle: F64, stamp: int) -> None:
@@ -147,6 +165,7 @@ class MultiBodyTracker:
         seed: int,
         executor: Executor | None = None,
         first: Mapping[int, BodyFit] = MappingProxyType({}),
+        judge: Judge | None = None,
     ) -> list[TrackedBody]:
         """Track everybody to the people of the next cloud.
 
@@ -157,6 +176,7 @@ class MultiBodyTracker:
             executor: where full fits run; None: in line.
             first: bodies of new people that are known already, by their index in `people`: on an executor they are
                 shown at once, in line a full fit is made at once.
+            judge: tells whether a body is a person; who is none is not shown, and forgotten in the end.
 
         Returns:
             The bodies of everybody who is seen and has one, in the order of their ids.
@@ -168,7 +188,7 @@ class MultiBodyTracker:
         matched = self._associate(people, stamp)
         known = {} if executor is None else {id(people[index]): fit for index, fit in first.items()}
         fitted = parallel_map(
-            lambda pair: pair[0].begin(pair[1], known.get(id(pair[1]))) or _track((pair[0].tracker, pair[1])),
+            lambda pair: pair[0].begin(pair[1], known.get(id(pair[1]))) or _track(pair),
             matched,
             self._threads,
         )
@@ -178,6 +198,8 @@ class MultiBodyTracker:
             if isinstance(fit, InputError):
                 self._report.count_unusable(fit)
                 continue
+            if judge is not None and fit is not None:
+                track.weigh(person, fit, judge)
             if fit is not None and track.prove(fit):
                 bodies.append(track.show(fit))
             # A full fit to the little that is seen of a hidden person would bend the body.
@@ -278,13 +300,19 @@ class MultiBodyTracker:
         self._report.counters["lost people"] += sum(track.tracker.last is not None for track in self._tracks) - sum(
             track.tracker.last is not None for track in kept
         )
-        self._tracks = kept
+        self._tracks = [track for track in kept if track.belief is None or not track.belief.is_hopeless]
 
 
-def _track(pair: tuple[BodyTracker, PersonCloud]) -> BodyFit | InputError | None:
-    tracker, person = pair
+def _track(pair: tuple[_BodyTrack, PersonCloud]) -> BodyFit | InputError | None:
+    track, person = pair
     try:
-        return tracker.track(person)
+        if person.stamp - track.turned >= TURN_INTERVAL_NS and track.motion.walks_backwards():
+            track.turned = person.stamp
+            turned = track.tracker.turn_round(person)
+            if turned is not None:
+                track.motion.allow_turn()
+                return turned
+        return track.tracker.track(person)
     except InputError as error:
         return error
 

@@ -15,6 +15,7 @@ from flowing_puppet_ros.body.cloud.coverage import is_single_view
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
+from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
@@ -30,9 +31,11 @@ _MAX_COORDINATE = 10_000.0
 MAX_HEIGHT_M = 2.6
 """A cloud that is no wider is a person, when nobody can be told from their surroundings in it."""
 _NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
-MAX_NEW_PEOPLE = 3
-"""New people whose bodies are fitted in a cloud of a live stream; the others come with the next. In a recording, which
-waits, so many in a row have to be nobody."""
+MAX_NEW_FITS = 8
+"""Candidates to which bodies are fitted in a cloud of a live stream, the likeliest first; the others come with the
+next. In a recording, which waits, so many in a row have to be nobody."""
+MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
+_UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
 MIN_DECIDING_POINTS = 60
 """Points of a person from which on they tell whether people are seen from one side."""
 ONLY_ID = "b1"
@@ -157,6 +160,9 @@ class SceneTracker:
         self._single_view: bool | None = None
         self._planes = PlaneCache()
         self._finder = PersonFinder(fitter, settings.people)
+        self._searched = np.empty(0, dtype=np.int64)
+        self._was_searched = False
+        self._report = report or Report()
 
     def warm_up(self) -> None:
         """Do beforehand what the first cloud would wait for."""
@@ -171,6 +177,7 @@ class SceneTracker:
         self._single_view = None
         self._planes = PlaneCache()
         self._finder.reset()
+        self._was_searched = False
 
     def step(
         self, cloud: SceneCloud, seed: int, executor: Executor | None = None
@@ -203,7 +210,8 @@ class SceneTracker:
                 return [TrackedBody(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
             first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
             seen = [body.person for body in found]
-            return self._tracker.step(seen, cloud.stamp, seed, executor, first), self._tracker.occluded_ids
+            bodies = self._tracker.step(seen, cloud.stamp, seed, executor, first, self._judge)
+            return bodies, self._tracker.occluded_ids
         people = self._with_viewpoint(cloud, self._segment(cloud, known, self._planes))
         if settings.track:
             return self._tracker.step(people, cloud.stamp, seed, executor), self._tracker.occluded_ids
@@ -227,7 +235,8 @@ class SceneTracker:
         if self._settings.scene and self.is_one_sided_scene(cloud):
             proven = self.fit_found(self.find_once(cloud), seed, progress)
             if not proven:
-                raise InputError(_NOBODY.format(len(cloud.points)))
+                down = looks_upside_down(self._in_range(cloud)[1])
+                raise InputError(_NOBODY.format(len(cloud.points)) + (f"; {_UPSIDE_DOWN}" if down else ""))
             return [TrackedBody(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
         people = self._segment(cloud) if self._settings.scene else []
         if not people and (not self._settings.scene or extent <= MAX_HEIGHT_M):
@@ -276,11 +285,18 @@ class SceneTracker:
         """Return the rows of the points that are finite and in range of the sensor, and the points."""
         near = cloud.distance < self._settings.segmentation.max_range
         rows = np.flatnonzero(near)
+        if len(rows) > MAX_SCENE_POINTS:
+            rows = rows[np.linspace(0, len(rows) - 1, MAX_SCENE_POINTS).astype(np.int64)]
         return rows, np.asarray(cloud.points[rows], dtype=np.float64)
 
     def _find(self, cloud: SceneCloud, known: Sequence[F64], remember: bool, live: bool = False) -> list[FoundBody]:
         """Find the people of a single view; the known ones first. All, or of a tracked stream the likeliest."""
         rows, points = self._in_range(cloud)
+        self._searched = rows
+        if not self._was_searched and len(points):
+            self._was_searched = True
+            if looks_upside_down(points):
+                self._report.warn(_UPSIDE_DOWN)
         normals = None if cloud.normals is None else cloud.normals[rows]
         found = self._finder.find(
             points,
@@ -288,13 +304,18 @@ class SceneTracker:
             cloud.viewpoint,
             cloud.stamp,
             known,
-            MAX_NEW_PEOPLE if live else None,
-            MAX_NEW_PEOPLE if remember else None,
+            MAX_NEW_FITS if live else None,
+            MAX_NEW_FITS if remember else None,
             remember,
         )
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
+
+    def _judge(self, person: PersonCloud, fit: BodyFit) -> tuple[float, float]:
+        """Return what the cloud that was searched last says about a body: see `PersonFinder.judge`."""
+        assert person.rows is not None
+        return self._finder.judge(person, np.searchsorted(self._searched, np.sort(person.rows)), fit)
 
     def _improve(
         self, person: PersonCloud, fit: BodyFit | None, seed: int, progress: Progress | None = None
@@ -355,4 +376,6 @@ class SceneTracker:
             single = is_single_view(people[0].points - cloud.viewpoint)
             if remember:
                 self._single_view = single
-        return cloud.with_fields([replace(person, viewpoint=cloud.viewpoint) for person in people]) if single else people
+        return (
+            cloud.with_fields([replace(person, viewpoint=cloud.viewpoint) for person in people]) if single else people
+        )

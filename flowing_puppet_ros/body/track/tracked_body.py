@@ -21,6 +21,8 @@ MAX_TURN_RAD_PER_S, MAX_SPEED_M_PER_S = 10.0, 12.0
 """Of a torso: somebody who turns on the spot takes half a second for it; a sprinter runs with 12 m/s."""
 MAX_TURN_ERROR_RAD, MAX_PLACE_ERROR_M = 1.0, 0.3
 """By which a torso's pose may be wrong without being a jump."""
+MIN_WALK_NS, MIN_WALK_M_PER_S, MAX_BACKWARD_COSINE = 300_000_000, 0.5, -0.5
+"""Time and speed from which somebody walks, and cosine between where they go and face below which it is backwards."""
 JUMP_CONFIDENCE = 0.3
 """Maximum confidence of a body that is where the person cannot have got since the body before."""
 
@@ -83,6 +85,19 @@ class TorsoMotion:
         self._places.append((stamp, fit.state.center[0].copy()))
         status = TrackStatus.HIDDEN if hidden else TrackStatus.TRACKED if known else TrackStatus.NEW
         return TrackedBody(identity, fit, status, self._measure_velocity())
+
+    def walks_backwards(self) -> bool:
+        """Return whether the torso has moved fast enough, for long enough, to where its back is."""
+        if self._last is None or len(self._places) < 2:
+            return False
+        velocity, facing = self._measure_velocity()[:2], self._last.state.rotation[0, :2, 0]
+        speed = float(np.linalg.norm(velocity))
+        lasted = self._places[-1][0] - self._places[0][0] >= MIN_WALK_NS
+        return lasted and speed > MIN_WALK_M_PER_S and bool(velocity @ facing < MAX_BACKWARD_COSINE * speed)
+
+    def allow_turn(self) -> None:
+        """Take the next body as it is, however much it is turned."""
+        self._last = None
 
     def _measure_velocity(self) -> F64:
         if len(self._places) < 2:

@@ -30,13 +30,13 @@ class DecisionTrees:
     value: np.ndarray
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> DecisionTrees:
-        """Take the arrays that are named as the attributes."""
-        return cls(*(np.ascontiguousarray(arrays[f"trees_{name}"]) for name in cls.__slots__))
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray], forest: str) -> DecisionTrees:
+        """Take the arrays of a `forest`, which are named as the attributes."""
+        return cls(*(np.ascontiguousarray(arrays[f"{forest}_{name}"]) for name in cls.__slots__))
 
-    def to_arrays(self) -> dict[str, np.ndarray]:
+    def to_arrays(self, forest: str) -> dict[str, np.ndarray]:
         """Return what `from_arrays` takes."""
-        return {f"trees_{name}": getattr(self, name) for name in self.__slots__}
+        return {f"{forest}_{name}": getattr(self, name) for name in self.__slots__}
 
     def predict(self, features: np.ndarray) -> np.ndarray:
         """Return the mean probability (C,) of the trees for features (C, F)."""

@@ -3,29 +3,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights, find_candidates
 from flowing_puppet_ros.body.segmentation.people import person_score
 from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
-from flowing_puppet_ros.body.upright.decision_trees import DecisionTrees
+from flowing_puppet_ros.body.upright.person_model import PersonModel
 from flowing_puppet_ros.body.upright.rejected_places import RejectedPlaces
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
 from flowing_puppet_ros.body.upright.upright_fit import UprightFit, UprightFitter
-from flowing_puppet_ros.body.upright.verification import FitEvidence, weigh_fit
+from flowing_puppet_ros.body.upright.verification import weigh_fit
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.settings import Settings, setting
 
-MODEL = "clouds"  # name of the learned filter
-SHAPE_SHARE = 0.5  # of the filter's log odds that count beside the fit's
-MIN_ODDS, MAX_ODDS = 0.02, 0.98  # of the filter
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
 """Points, probability by shape, and score of what a full search is made for though no upright body explains it."""
 MIN_WORTHWHILE = 0.15
@@ -38,7 +35,7 @@ class PersonFinderSettings(Settings):
     """Settings of `PersonFinder`."""
 
     min_points: int = setting(25, "minimum number of points of a person", low=15, high=100000)
-    min_probability: float = setting(0.5, "minimum probability of a body to be a person", low=0.0, high=1.0)
+    min_probability: float = setting(0.35, "minimum probability of a body to be a person", low=0.0, high=1.0)
     min_filter: float = setting(
         0.3, "minimum probability, by its shape alone, of what is fitted", low=0.0, high=1.0, advanced=True
     )
@@ -54,45 +51,20 @@ class PersonFinderSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PersonModel:
-    """What was learned.
-
-    Attributes:
-        trees: of the filter.
-        mean, scale: (7,) of the fit's evidence.
-        weight: (8,) of the evidence less `mean`, over `scale`, and a constant, in log odds of a person.
-    """
-
-    trees: DecisionTrees
-    mean: np.ndarray
-    scale: np.ndarray
-    weight: np.ndarray
-
-    @classmethod
-    @lru_cache(maxsize=1)
-    def load(cls) -> PersonModel:
-        """Load the shipped model."""
-        return cls.from_arrays(weights.load("people", MODEL))
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PersonModel:
-        """Take the arrays of a file."""
-        return cls(DecisionTrees.from_arrays(arrays), *(arrays[f"fit_{name}"] for name in ("mean", "scale", "weight")))
-
-    def combine(self, shape_probability: float, evidence: FitEvidence) -> float:
-        """Return the probability of a person by the filter and the fit's evidence."""
-        scaled = (evidence.to_array() - self.mean) / self.scale
-        odds = np.clip(shape_probability, MIN_ODDS, MAX_ODDS)
-        total = SHAPE_SHARE * np.log(odds / (1 - odds)) + self.weight[:-1] @ scaled + self.weight[-1]
-        return float(1 / (1 + np.exp(-total)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class FoundBody:
     """A person and the first body; without one, a person who is known already."""
 
     person: PersonCloud
     fit: BodyFit | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedFit:
+    """A body: the `probability` that it is a person, and the `confidence` that it is one and close."""
+
+    probability: float
+    confidence: float
+    fit: BodyFit
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,6 +86,7 @@ class PersonFinder:
         self.upright = UprightFitter(fitter)
         self._rejected = RejectedPlaces(settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
+        self._scan: tuple[SceneHeights, ScanRays] | None = None
 
     def warm_up(self) -> None:
         """Do beforehand what the first scan would wait for."""
@@ -123,6 +96,7 @@ class PersonFinder:
     def reset(self) -> None:
         """Forget what was no person."""
         self._rejected.clear()
+        self._scan = None
 
     def find(
         self,
@@ -148,6 +122,7 @@ class PersonFinder:
             remember: whether what is no person is remembered, and what was none is left out.
         """
         self.last_rejected = []
+        self._scan = None
         if len(points) < self._settings.min_points:
             return []
         scene = SceneHeights.of(points)
@@ -160,11 +135,10 @@ class PersonFinder:
         ]
         probability = PersonModel.load().trees.predict(describe_candidates(candidates, scene, viewpoint))
         chosen = self._choose(candidates, probability, stamp, remember)
-        if not chosen:
-            return people
-        rays = ScanRays.of(points, viewpoint)
+        self._scan = scene, ScanRays.of(points, viewpoint)
+        rays = self._scan[1]
         taken = [np.asarray(body)[:, :2].mean(axis=0) for body in known if len(body)]
-        found: list[tuple[float, Candidate, UprightFit]] = []
+        found: list[tuple[JudgedFit, Candidate]] = []
         bent: list[Candidate] = []
         limit, misses = self._settings.max_fits if max_fits is None else max_fits, 0
         for number in chosen[:limit]:
@@ -175,24 +149,63 @@ class PersonFinder:
             misses += 1
             if judged is None:
                 continue
-            if judged[0] >= self._settings.min_probability:
-                found.append((judged[0], candidate, judged[1]))
+            if judged.probability >= self._settings.min_probability:
+                found.append((judged, candidate))
                 misses = 0
                 continue
-            self._reject(candidate, judged[0], "no upright body explains it", stamp, remember)
+            self._reject(candidate, judged.probability, "no upright body explains it", stamp, remember)
             if self._may_be_bent(candidate, scene, float(probability[number])):
                 bent.append(candidate)
-        for likely, candidate, upright in sorted(found, key=lambda each: -each[0]):
-            middle = upright.fit.vertices[:, :2].mean(axis=0)
+        for judged, candidate in sorted(found, key=lambda each: -each[0].probability):
+            middle = judged.fit.vertices[:, :2].mean(axis=0)
             if all(np.hypot(*(middle - other)) > SAME_PERSON_M for other in taken):
                 taken.append(middle)
-                person = make(candidate.rows, score=likely)
-                people.append(FoundBody(person, replace(upright.fit, confidence=likely)))
+                person = make(candidate.rows, score=judged.probability)
+                people.append(FoundBody(person, replace(judged.fit, confidence=judged.confidence)))
         for candidate in bent:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
                 taken.append(candidate.middle)
                 people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
         return people
+
+    def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> tuple[float, float]:
+        """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
+
+        Returns:
+            The probability that it is a person, and that it is one whose joints are within 10 cm. What is rejected is
+            remembered as by `find`.
+        """
+        if self._scan is None or not len(rows):
+            return 0.0, 0.0
+        scene, rays = self._scan
+        candidate = Candidate.of(scene, rows)
+        window = rays.find_window(person.points)
+        probability = float(
+            PersonModel.load().trees.predict(describe_candidates([candidate], scene, rays.viewpoint))[0]
+        )
+        try:
+            cloud = self.upright.make_cloud(person.points, rays.viewpoint, rays.find_unknown(person.points, window))
+        except InputError:  # the sensor stands in it
+            return 0.0, 0.0
+        judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, scene, rays, window)
+        if judged.probability < self._settings.min_probability / 2:
+            self._rejected.add(candidate, person.stamp)
+        return judged.probability, judged.confidence
+
+    def _weigh(
+        self,
+        found: UprightFit,
+        cloud: SingleViewCloud,
+        candidate: Candidate,
+        probability: float,
+        scene: SceneHeights,
+        rays: ScanRays,
+        window: np.ndarray,
+    ) -> JudgedFit:
+        evidence = weigh_fit(found, cloud, candidate.rows, scene, rays, window, self._fitter.model)
+        model = PersonModel.load()
+        likely = 0.0 if evidence.between_others else model.combine(probability, evidence)
+        return JudgedFit(likely, model.rate(likely, evidence), found.fit)
 
     def _may_be_bent(self, candidate: Candidate, scene: SceneHeights, probability: float) -> bool:
         """Return whether a candidate may be a person who sits, bends or lifts the arms, for a full search to show."""
@@ -215,10 +228,8 @@ class PersonFinder:
                 chosen.append(int(number))
         return chosen
 
-    def _judge(
-        self, candidate: Candidate, probability: float, scene: SceneHeights, rays: ScanRays
-    ) -> tuple[float, UprightFit] | None:
-        """Return the probability of a person and the body; None where no body can be fitted."""
+    def _judge(self, candidate: Candidate, probability: float, scene: SceneHeights, rays: ScanRays) -> JudgedFit | None:
+        """Return the body and how likely it is a person; None where no body can be fitted."""
         points = scene.points[candidate.rows]
         window = rays.find_window(points)
         try:
@@ -226,18 +237,17 @@ class PersonFinder:
         except InputError:  # the sensor stands in it
             return None
 
-        def weigh(found: UprightFit) -> float:
-            evidence = weigh_fit(found, candidate, scene, rays, window, self._fitter.model.faces)
-            return 0.0 if evidence.between_others else PersonModel.load().combine(probability, evidence)
+        def weigh(found: UprightFit) -> JudgedFit:
+            return self._weigh(found, cloud, candidate, probability, scene, rays, window)
 
         starts = self.upright.find_rough(cloud, candidate.floor)
-        upright = self.upright.refine(starts[:1], cloud, candidate.floor)
-        likely = weigh(upright)
-        if likely >= MIN_WORTHWHILE and len(starts) > 1:
+        first = self.upright.refine(starts[:1], cloud, candidate.floor)
+        judged = weigh(first)
+        if judged.probability >= MIN_WORTHWHILE and len(starts) > 1:
             others = self.upright.refine(starts[1:], cloud, candidate.floor)
-            if others.cost < upright.cost:
-                upright, likely = others, weigh(others)
-        return likely, upright
+            if others.cost < first.cost:
+                judged = weigh(others)
+        return judged
 
     def _reject(self, candidate: Candidate, probability: float, reason: str, stamp: int, remember: bool) -> None:
         self.last_rejected.append(_describe_rejected(candidate, probability, reason))

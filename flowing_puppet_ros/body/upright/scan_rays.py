@@ -17,21 +17,23 @@ MAX_HIDING_POINTS = 3000
 MIN_CELL_RAD, CELL_M = np.radians(0.15), 0.025  # of the image of a body as the sensor would see it
 OUTLINE_CELLS, OUTLINE_M = 6, 0.25
 """Cells to either side of a body, and distance behind it, in which rays that pass it show its outline."""
+BAND_EDGES = (0.45, 0.8)  # shares of a body's height at which legs, trunk, and head and shoulders meet
+BANDS = len(BAND_EDGES) + 1
 SUPPORT_M = 0.12  # between a body and the end of a ray that confirms it
 
 
 class RayCount(NamedTuple):
-    """Numbers of rays by where they end.
+    """Numbers (BANDS,) of rays by where they end, for the legs, the trunk, and head and shoulders of a body.
 
-    `on` a body, `behind` it though it is in the way, `before` it; and of those that pass `beside` it, to its left and
+    `on` the body, `behind` it though it is in the way, `before` it; and of those that pass `beside` it, to its left and
     right, the `free` ones, which end behind it.
     """
 
-    on: int
-    behind: int
-    before: int
-    free: int
-    beside: int
+    on: np.ndarray
+    behind: np.ndarray
+    before: np.ndarray
+    free: np.ndarray
+    beside: np.ndarray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,14 +122,16 @@ class ScanRays:
         local = vertices[facing] - self.viewpoint
         reach = np.linalg.norm(local, axis=1)
         if not len(local):
-            return RayCount(0, 0, 0, 0, 0)
+            return RayCount(*np.zeros((5, BANDS), np.int64))
         middle = float(np.arctan2(local[:, 1].mean(), local[:, 0].mean()))
         azimuth = (np.arctan2(local[:, 1], local[:, 0]) - middle + np.pi) % (2 * np.pi) - np.pi
         elevation = np.arctan2(local[:, 2], np.hypot(local[:, 0], local[:, 1]))
         ray_azimuth = (self.azimuth[window] - middle + np.pi) % (2 * np.pi) - np.pi
         cell = max(MIN_CELL_RAD, CELL_M / float(np.median(reach)))
         own = self.elevation[window], self.range[window]
-        return RayCount(*_compare_rays(azimuth, elevation, reach, ray_azimuth, *own, cell))
+        share = (vertices[facing, 2] - vertices[:, 2].min()) / max(float(np.ptp(vertices[:, 2])), 1e-6)
+        band = np.searchsorted(BAND_EDGES, share)
+        return RayCount(*_compare_rays(azimuth, elevation, reach, band, ray_azimuth, *own, cell))
 
 
 def _bin_of(azimuth: np.ndarray) -> np.ndarray:
@@ -135,34 +139,32 @@ def _bin_of(azimuth: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def _compare_rays(azimuth, elevation, reach, ray_azimuth, ray_elevation, ray_range, cell):  # type: ignore[no-untyped-def]
+def _compare_rays(azimuth, elevation, reach, band, ray_azimuth, ray_elevation, ray_range, cell):  # type: ignore[no-untyped-def]
     """Draw a body's facing vertices into an image of ranges and look the rays up in it; see `RayCount`."""
     left, low = azimuth.min(), elevation.min()
     width, height = int((azimuth.max() - left) / cell) + 1, int((elevation.max() - low) / cell) + 1
-    image = np.full((width, height), np.inf)
+    image, bands, row_bands = np.full((width, height), np.inf), np.zeros((width, height), np.int64), np.zeros(height)
     for k in range(len(azimuth)):
         i, j = int((azimuth[k] - left) / cell), int((elevation[k] - low) / cell)
-        image[i, j] = min(image[i, j], reach[k])
+        if reach[k] < image[i, j]:
+            image[i, j], bands[i, j] = reach[k], band[k]
     first, last, nearest = np.full(height, width), np.full(height, -1), np.full(height, np.inf)
     for i in range(width):
         for j in range(height):
             if image[i, j] < np.inf:
-                first[j], last[j], nearest[j] = min(first[j], i), max(last[j], i), min(nearest[j], image[i, j])
-    on, through, blocked, free, beside = 0, 0, 0, 0, 0
+                first[j], last[j] = min(first[j], i), max(last[j], i)
+                if image[i, j] < nearest[j]:
+                    nearest[j], row_bands[j] = image[i, j], bands[i, j]
+    count = np.zeros((5, BANDS), np.int64)
     for k in range(len(ray_azimuth)):
         i, j = int(np.floor((ray_azimuth[k] - left) / cell)), int(np.floor((ray_elevation[k] - low) / cell))
         if j < 0 or j >= height:
             continue
         if last[j] < i <= last[j] + OUTLINE_CELLS or first[j] - OUTLINE_CELLS <= i < first[j]:
-            free += ray_range[k] > nearest[j] + OUTLINE_M
-            beside += 1
+            count[3, int(row_bands[j])] += ray_range[k] > nearest[j] + OUTLINE_M
+            count[4, int(row_bands[j])] += 1
         if i < 0 or i >= width or np.isinf(image[i, j]):
             continue
         gap = ray_range[k] - image[i, j]
-        if gap > SUPPORT_M:
-            through += 1
-        elif gap < -SUPPORT_M:
-            blocked += 1
-        else:
-            on += 1
-    return on, through, blocked, free, beside
+        count[1 if gap > SUPPORT_M else 2 if gap < -SUPPORT_M else 0, bands[i, j]] += 1
+    return count

@@ -29,7 +29,8 @@ MEAN_STATURE_M, STATURE_DEVIATION_M, STATURE_COST_M = 1.72, 0.1, 0.002
 """Statures of people, and the mean distance that one squared deviation from them is worth."""
 ROUGH_POINTS, FINE_POINTS = 90, 300  # surface points of a body
 ROUGH_TARGETS, FINE_TARGETS = 60, 250  # of the cloud
-FINE_BODIES, MAX_SAME_YAW = 64, 2
+FINE_BODIES, MAX_SAME_YAW = 96, 2
+TURNED = 2  # of the best bodies, that face the other way than the best
 SEEN_MARGIN_M = 0.08  # above and below a cloud within which a body's surface is taken for seen
 
 
@@ -52,23 +53,27 @@ class UprightBank:
     stature: np.ndarray
 
     def find_best(self, cloud: SingleViewCloud, floor: float, count: int) -> list[tuple[float, BodyState]]:
-        """Return the `count` best bodies on a cloud with their costs in metres, at most two of a yaw.
+        """Return the best bodies on a cloud with their costs in metres, at most two of a yaw and `count` of all.
 
-        `floor` is z of the floor, metres.
+        A few of them face the other way than the best: few points hardly tell front from back, and only the refined
+        bodies show which it is. `floor` is z of the floor, metres.
         """
         rows = np.arange(len(self.points))
         targets = cloud.points[farthest_points(cloud.points, FINE_TARGETS)]
         rough, _ = self._judge(cloud, floor, rows, targets[:ROUGH_TARGETS], ROUGH_POINTS)
         rows = np.argsort(rough, kind="stable")[:FINE_BODIES]
         cost, shift = self._judge(cloud, floor, rows, targets, FINE_POINTS)
-        best: list[tuple[float, BodyState]] = []
-        yaws: list[int] = []
-        for k in np.argsort(cost, kind="stable"):
-            yaw, pose = divmod(int(rows[k]), POSES)
-            if yaws.count(yaw) < MAX_SAME_YAW and len(best) < count:
-                yaws.append(yaw)
-                best.append((float(cost[k]), _place(self.states[pose], self.turns[yaw], shift[k])))
-        return best
+        order = np.argsort(cost, kind="stable")
+        yaw = rows // POSES
+        apart = np.abs((yaw - yaw[order[0]] + YAWS // 2) % YAWS - YAWS // 2) * (2 * np.pi / YAWS)
+        first = _take_of_each_yaw(order, yaw, count - TURNED)
+        turned = [k for k in first if apart[k] > np.pi / 2]
+        others = [k for k in order if apart[k] > np.pi / 2 and k not in first]
+        chosen = [*first, *_take_of_each_yaw(np.array(others, dtype=np.int64), yaw, max(TURNED - len(turned), 0))]
+        return [
+            (float(cost[k]), _place(self.states[rows[k] % POSES], self.turns[yaw[k]], shift[k]))
+            for k in sorted(chosen, key=lambda k: float(cost[k]))
+        ]
 
     def _judge(
         self, cloud: SingleViewCloud, floor: float, rows: np.ndarray, targets: np.ndarray, surface: int
@@ -85,6 +90,15 @@ class UprightBank:
         misfit, facing = cloud.view.misfit(moved, normals)
         cost = distances(targets, moved, facing).mean(axis=1) + misfit
         return cost + stature_cost(self.stature)[rows % POSES], shift
+
+
+def _take_of_each_yaw(order: np.ndarray, yaw: np.ndarray, count: int) -> list[int]:
+    """Return the first of an order (K,), at most `count`, and two of a yaw."""
+    chosen: list[int] = []
+    for k in order:
+        if len(chosen) < count and sum(yaw[other] == yaw[k] for other in chosen) < MAX_SAME_YAW:
+            chosen.append(int(k))
+    return chosen
 
 
 def stature_cost(stature: np.ndarray) -> np.ndarray:

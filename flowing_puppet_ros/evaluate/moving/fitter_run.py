@@ -90,11 +90,9 @@ def list_messages(
     first = moments[0].frame.cameras
     between = first.colour.rotation @ first.depth.rotation.T
     beside = first.colour.translation - between @ first.depth.translation
-    static = make_transform(
-        FACTORY, make_header(FACTORY, 0, DEPTH_FRAME), COLOUR_FRAME, -between.T @ beside, between.T
-    )
+    static = make_transform(FACTORY, make_header(FACTORY, 0, DEPTH_FRAME), COLOUR_FRAME, -between.T @ beside, between.T)
     found: list[tuple[int, int, str, Any]] = [(0, 0, "/tf_static", FACTORY.make(TRANSFORMS, transforms=[static]))]
-    for number in range(round((moments[-1].seconds + 0.1) * TRANSFORM_RATE_HZ)):
+    for number in range(round((moments[-1].seconds + 0.3) * TRANSFORM_RATE_HZ)):
         seconds = (number + 0.3) / TRANSFORM_RATE_HZ - 0.1  # never at the stamp of an image
         found.append((to_ns(seconds), 0, "/tf", _make_moving(view, sensing, seconds)))
     for moment in moments:
@@ -129,7 +127,7 @@ def _make_moving(view: RobotView, sensing: Sensing, seconds: float) -> Any:
 
 
 def _make_info(header: Any, camera: Camera) -> Any:
-    return make_camera_info(FACTORY, header, camera.size, camera.matrix.ravel(), camera.distortion)
+    return make_camera_info(FACTORY, header, camera.size, camera.matrix, camera.distortion)
 
 
 def _make_puppet(identity: str, seen: SeenKeypoints) -> Any:
@@ -145,9 +143,7 @@ def _make_puppet(identity: str, seen: SeenKeypoints) -> Any:
     places |= {"neck": shoulders, "belly": hips + BELLY_SHARE * (shoulders - hips)}
     certain |= {"neck": min(certain["left_shoulder"], certain["right_shoulder"]), "belly": certain["left_hip"]}
     joints = [
-        FACTORY.make(
-            "flowing_puppet_msgs/msg/PuppetJoint", name=name, x=x, y=y, confidence=certain[name]
-        )  # fmt: skip
+        FACTORY.make("flowing_puppet_msgs/msg/PuppetJoint", name=name, x=x, y=y, confidence=certain[name])
         for name, (x, y) in places.items()
         if np.isfinite(x)
     ]

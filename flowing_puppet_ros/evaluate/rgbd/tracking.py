@@ -17,7 +17,7 @@ from flowing_puppet_ros.evaluate.rgbd.scores import MIN_LOST_M
 from flowing_puppet_ros.evaluate.rgbd.sequences import FAST_M, draw_moving
 from flowing_puppet_ros.evaluate.rgbd.views import RgbdFrame, RgbdStudio
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
-from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, carry_puppets
+from flowing_puppet_ros.fusion.puppet_joints import MIN_PUPPET_JOINTS, PuppetJoints, carry_puppets
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.fusion.tracker import FusedTracker
 
@@ -32,7 +32,7 @@ class MotionScore:
         rate: Hz.
         errors: (T, 12) m of LIMB_JOINTS in the world, NaN for those that are not in view or without a body.
         arms: (T,) bool, whether a seen elbow or wrist is off by more than 15 cm, or the body is missing.
-        missing: (T,) bool, frames without a body.
+        missing: (T,) bool, frames without a body of somebody of whom enough joints for a puppet are in view.
         seconds: (T,) processor time of every frame.
     """
 
@@ -52,6 +52,7 @@ class _Runner:
         self._tracker = FusedTracker(PeopleFitter(fitter, FusionSettings()), BodyTrackerSettings(), HOLD_S)
         self._errors: list[np.ndarray] = []
         self._arms: list[bool] = []
+        self._missing: list[bool] = []
         self._seconds: list[float] = []
 
     def add(self, frame: RgbdFrame, seconds: float, later: Sequence[tuple[float, PuppetJoints]]) -> None:
@@ -68,15 +69,15 @@ class _Runner:
             joints = bodies[0].fit.joints[self._rows] + scene.to_world[:3, 3]
             error[seen.in_view] = np.linalg.norm(joints - frame.joints[0], axis=1)[seen.in_view]
         arms = np.array([name.endswith(("elbow", "wrist")) for name in LIMB_JOINTS]) & seen.visible
+        present = bool(np.count_nonzero(seen.in_view) >= MIN_PUPPET_JOINTS)
         self._errors.append(error)
-        self._arms.append(not bodies or bool((error[arms] > MIN_LOST_M).any()))
+        self._missing.append(present and not bodies)
+        self._arms.append(present and (not bodies or bool((error[arms] > MIN_LOST_M).any())))
 
     def finish(self) -> MotionScore:
         """Return the errors of all frames."""
         errors = np.stack(self._errors)
-        return MotionScore(
-            self.rate, errors, np.array(self._arms), np.isnan(errors).all(axis=1), np.array(self._seconds)
-        )
+        return MotionScore(self.rate, errors, np.array(self._arms), np.array(self._missing), np.array(self._seconds))
 
 
 def track_motion(

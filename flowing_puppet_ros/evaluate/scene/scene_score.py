@@ -44,6 +44,7 @@ class PersonScore:
     top_error: float
     joint_error: float
     flipped: bool
+    confidence: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,7 @@ def _score_person(
     name: str, row: int, person: LabelledPerson, away: float, counts: bool, body: ReportedPerson | None, gap: float
 ) -> PersonScore:
     if body is None:
-        nothing = (gap, np.nan, np.nan, np.nan, False)
+        nothing = (gap, np.nan, np.nan, np.nan, False, np.nan)
         return PersonScore(name, row, person.points, away, counts, False, "", *nothing)
     top = float(body.vertices[:, 2].max()) - person.floor
     error, flipped = np.nan, False
@@ -113,7 +114,7 @@ def _score_person(
         flipped = turned < error
     return PersonScore(
         name, row, person.points, away, counts, True, body.identity, gap, body.stature - person.stature,
-        top - person.top, error, flipped,
+        top - person.top, error, flipped, body.confidence,
     )  # fmt: skip
 
 
@@ -170,13 +171,17 @@ def tabulate_bins(people: Sequence[PersonScore]) -> list[dict[str, float | str]]
 
 
 def count_id_switches(people: Sequence[PersonScore]) -> int:
-    """Count how often a labelled person, known by their number through the scans, is found under another id."""
-    last: dict[int, str] = {}
+    """Count how often a labelled person, known by their number through the scans, is found under another id.
+
+    Scans whose names differ in what follows the last hyphen are of one sequence.
+    """
+    last: dict[tuple[str, int], str] = {}
     switches = 0
     for person in people:
         if person.found:
-            switches += last.get(person.person, person.identity) != person.identity
-            last[person.person] = person.identity
+            who = person.scan.rpartition("-")[0], person.person
+            switches += last.get(who, person.identity) != person.identity
+            last[who] = person.identity
     return switches
 
 

@@ -83,21 +83,24 @@ def place_people(
 
 def draw_upright(source: BodySource, rng: np.random.Generator) -> TrueBody:
     """Draw a person who stands or walks, hips at x = y = 0."""
-    names = list(source.joint_names)
     while True:
         body = source.draw_body(rng, hard=False)
-        joint = dict(zip(names, body.joints, strict=True))
-        hips = (joint["left_hip"] + joint["right_hip"]) / 2
-        neck = (joint["left_shoulder"] + joint["right_shoulder"]) / 2
-        trunk = neck - hips
-        legs = [
-            np.linalg.norm(joint[f"{side}_hip"] - joint[f"{side}_knee"])
-            + np.linalg.norm(joint[f"{side}_knee"] - joint[f"{side}_ankle"])
-            for side in ("left", "right")
-        ]
-        stretched = (hips[2] - min(joint["left_ankle"][2], joint["right_ankle"][2])) / max(legs)
-        if trunk[2] / np.linalg.norm(trunk) > np.cos(MAX_TRUNK_TILT_RAD) and stretched > MIN_UPRIGHT_SHARE:
+        if is_upright(body, source.joint_names):
             return body
+
+
+def is_upright(body: TrueBody, names: Sequence[str]) -> bool:
+    """Return whether somebody whose joints have these names stands or walks."""
+    joint = dict(zip(names, body.joints, strict=True))
+    hips = (joint["left_hip"] + joint["right_hip"]) / 2
+    trunk = (joint["left_shoulder"] + joint["right_shoulder"]) / 2 - hips
+    legs = [
+        np.linalg.norm(joint[f"{side}_hip"] - joint[f"{side}_knee"])
+        + np.linalg.norm(joint[f"{side}_knee"] - joint[f"{side}_ankle"])
+        for side in ("left", "right")
+    ]
+    stretched = (hips[2] - min(joint["left_ankle"][2], joint["right_ankle"][2])) / max(legs)
+    return bool(trunk[2] / np.linalg.norm(trunk) > np.cos(MAX_TRUNK_TILT_RAD) and stretched > MIN_UPRIGHT_SHARE)
 
 
 def scan_scene(

@@ -10,7 +10,7 @@ import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES, parse_axis, rotation_to_z_up
-from flowing_puppet_ros.body.upright.person_finder import MODEL, PersonModel
+from flowing_puppet_ros.body.upright.person_model import MODEL, PersonModel
 from flowing_puppet_ros.learn.people.examples import CandidateExamples, collect_examples, read_scenes
 from flowing_puppet_ros.learn.people.forest import learn_model
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -23,7 +23,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scenes", nargs="+", type=Path, help="folders with scans and labels.json; scans without labels show nobody"
     )
     parser.add_argument("--up", choices=UP_AXES, default="z", help="axis that points up in scans without labels [z]")
-    parser.add_argument("--max-fits", type=int, default=10, help="bodies fitted to what is no person, a scan [10]")
+    parser.add_argument(
+        "--max-fits", type=int, default=10, help="bodies fitted to what looks like a person, a scan [10]"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of all random draws [0]")
     parser.add_argument("--out", type=Path, required=True, help=f"folder for people_{MODEL}.npz and its model card")
 
@@ -36,8 +38,7 @@ def run(arguments: argparse.Namespace) -> int:
     examples = collect_examples(fitter, scenes, arguments.max_fits, arguments.seed)
     model = learn_model(examples, arguments.seed)
     path = arguments.out / f"people_{MODEL}.npz"
-    fit = {f"fit_{name}": getattr(model, name) for name in ("mean", "scale", "weight")}
-    np.savez_compressed(path, **model.trees.to_arrays(), **fit)  # type: ignore[arg-type]
+    np.savez_compressed(path, **model.to_arrays())  # type: ignore[arg-type]
     path.with_suffix(".md").write_text(format_card(examples, model, arguments), encoding="utf-8")
     print(path)
     return 0
@@ -50,8 +51,8 @@ def format_card(examples: CandidateExamples, model: PersonModel, arguments: argp
         scans=len(np.unique(examples.scan)),
         people=int(examples.is_person.sum()),
         others=int((examples.is_person == 0).sum()),
-        fits=int(np.isfinite(examples.evidence).all(axis=1).sum()),
-        nodes=len(model.trees.feature),
+        fits=int(examples.fitted.sum()),
+        nodes=len(model.trees.feature) + len(model.judge.feature),
         trees=len(model.trees.roots),
         seed=arguments.seed,
     )
@@ -59,8 +60,10 @@ def format_card(examples: CandidateExamples, model: PersonModel, arguments: argp
 
 _CARD = """# People in scans of scenes
 
-Tells people from what is none: a forest of {trees} trees ({nodes} nodes) over the shape and surroundings of a
-candidate, and a logistic regression over what the rays of the scan say about the upright body that was fitted to it.
+Tells people from what is none: a forest of {trees} trees over the shape and surroundings of a candidate, and one over
+what the rays of the scan say about the upright body that was fitted to it ({nodes} nodes in all). Their log odds are
+joined, and a logistic regression says how likely the joints are within 10 cm; both by what forests say about scans
+that they have not learned from.
 
 - Learned by `flowing-puppet learn people` from {folders} folders with {scans} scans that have candidates: {people}
   people and {others} other things; {fits} of all were fitted; seed {seed}.

@@ -3,27 +3,31 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from tqdm import tqdm
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
 from flowing_puppet_ros.body.scans.scene_labels import LabelledScene, label_scene, read_labels
 from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights, find_candidates
-from flowing_puppet_ros.body.upright.candidate_shape import SHAPE_NAMES, describe_candidates
+from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
 from flowing_puppet_ros.body.upright.upright_fit import UprightFitter
-from flowing_puppet_ros.body.upright.verification import FitEvidence, weigh_fit
+from flowing_puppet_ros.body.upright.verification import EVIDENCE_NAMES, weigh_fit
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.learn.people.unseen import predict_unseen
 
 MIN_POINTS, MAX_RANGE_M = 25, 30.0
 PERSON_M, NOBODY_M = 0.35, 0.7
 """Distance of a candidate from the next person up to which it is that person, and from which on it is none."""
 MIN_PERSON_SHARE = 0.4  # of a person's points that a candidate must have to be that person
-EVIDENCE = len(FitEvidence.__dataclass_fields__) - 1  # all but the outline
+MIN_ALIKE = 0.1
+"""Probability of a person, by its shape, from which on something else is worth a fit."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,15 +36,22 @@ class CandidateExamples:
 
     Attributes:
         shape: (N, len(SHAPE_NAMES)).
-        evidence: (N, 7) of the fits, NaN where none was made.
+        evidence: (N, len(EVIDENCE_NAMES)) of the fits, NaN where none was made.
         is_person: (N,) 1 for a person, 0 for none.
         scan: (N,) number of the scan.
+        joint_error: (N,) metres, mean error of the joints, NaN where none was fitted or nothing is known.
     """
 
     shape: np.ndarray
     evidence: np.ndarray
     is_person: np.ndarray
     scan: np.ndarray
+    joint_error: np.ndarray
+
+    @property
+    def fitted(self) -> np.ndarray:
+        """Which (N,) have a fit."""
+        return np.asarray(np.isfinite(self.evidence).all(axis=1))
 
 
 def read_scenes(folders: list[Path], turn: np.ndarray) -> Iterator[tuple[np.ndarray, LabelledScene]]:
@@ -63,32 +74,70 @@ def read_scenes(folders: list[Path], turn: np.ndarray) -> Iterator[tuple[np.ndar
 def collect_examples(
     fitter: BodyFitter, scenes: Iterator[tuple[np.ndarray, LabelledScene]], max_fits: int, seed: int
 ) -> CandidateExamples:
-    """Make the examples of scans; of each, at most `max_fits` candidates that are no people are fitted."""
-    upright, rng = UprightFitter(fitter), np.random.default_rng(seed)
-    shapes, evidences, labels, scans = [], [], [], []
-    for number, (points, truth) in enumerate(scenes):
+    """Make the examples of scans; of each, people are fitted, and at most `max_fits` others that look like people.
+
+    How much something looks like a person is what forests say that have not seen its scan.
+    """
+    upright = UprightFitter(fitter)
+    seen: list[_SeenScan] = [_SeenScan.of(points, truth) for points, truth in scenes]
+    shape = np.concatenate([scan.shape for scan in seen])
+    own = np.concatenate([scan.own for scan in seen])
+    number = np.repeat(np.arange(len(seen)), [len(scan.own) for scan in seen])
+    clear = np.flatnonzero(own >= 0)
+    alike = np.zeros(len(own))
+    alike[clear] = predict_unseen(shape[clear], own[clear], number[clear], seed)
+    evidence, joint_error = np.full((len(own), len(EVIDENCE_NAMES)), np.nan), np.full(len(own), np.nan)
+    first = 0
+    for scan in tqdm(seen, desc="fits", unit="scan", file=sys.stderr):
+        rows = first + np.arange(len(scan.own))
+        first += len(rows)
+        others = rows[(own[rows] == 0) & (alike[rows] > MIN_ALIKE)]
+        others = others[np.argsort(-alike[others], kind="stable")][:max_fits]
+        for row in np.sort(np.concatenate([rows[own[rows] == 1], others])):
+            evidence[row], joint_error[row] = scan.weigh(upright, fitter, int(row - rows[0]))
+    return CandidateExamples(shape[clear], evidence[clear], own[clear], number[clear], joint_error[clear])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _SeenScan:
+    """The candidates of a scan, whether each is a person (1, 0, or -1 for what is neither clearly), and its shape."""
+
+    scene: SceneHeights
+    rays: ScanRays
+    truth: LabelledScene
+    candidates: list[Candidate]
+    own: np.ndarray
+    shape: np.ndarray
+
+    @classmethod
+    def of(cls, points: np.ndarray, truth: LabelledScene) -> _SeenScan:
         points = points - truth.sensor
         points = points[np.linalg.norm(points, axis=1) < MAX_RANGE_M]
         scene, viewpoint = SceneHeights.of(points), np.zeros(3)
         candidates, _ = find_candidates(scene, viewpoint, MIN_POINTS)
-        own = np.array([_label(candidate, truth) for candidate in candidates])
-        fitted = set(np.flatnonzero(own == 1)) | set(rng.permutation(np.flatnonzero(own == 0))[:max_fits])
-        rays = ScanRays.of(points, viewpoint)
+        own = np.array([_label(candidate, truth) for candidate in candidates], dtype=np.int64)
         shape = describe_candidates(candidates, scene, viewpoint)
-        for row in np.flatnonzero(own >= 0):
-            evidence = np.full(EVIDENCE, np.nan)
-            if row in fitted:
-                evidence = _weigh(upright, fitter, candidates[row], scene, rays)
-            shapes.append(shape[row])
-            evidences.append(evidence)
-            labels.append(own[row])
-            scans.append(number)
-    return CandidateExamples(
-        np.array(shapes).reshape(-1, len(SHAPE_NAMES)),
-        np.array(evidences).reshape(-1, EVIDENCE),
-        np.array(labels),
-        np.array(scans),
-    )
+        return cls(scene, ScanRays.of(points, viewpoint), truth, candidates, own, shape)
+
+    def weigh(self, upright: UprightFitter, fitter: BodyFitter, number: int) -> tuple[np.ndarray, float]:
+        """Return the evidence of a candidate's fit and the mean error of its joints, NaN where there is none."""
+        candidate = self.candidates[number]
+        points = self.scene.points[candidate.rows]
+        window = self.rays.find_window(points)
+        try:
+            cloud = upright.make_cloud(points, self.rays.viewpoint, self.rays.find_unknown(points, window))
+        except InputError:
+            return np.full(len(EVIDENCE_NAMES), np.nan), np.nan
+        found = upright.fit(cloud, candidate.floor)
+        evidence = weigh_fit(found, cloud, candidate.rows, self.scene, self.rays, window, fitter.model)
+        error = np.nan
+        if self.own[number] == 1:
+            away = [np.hypot(*(p.middle - self.truth.sensor[:2] - candidate.middle)) for p in self.truth.people]
+            person = self.truth.people[int(np.argmin(away))]
+            places = dict(zip(fitter.model.joint_names, found.fit.joints + self.truth.sensor, strict=True))
+            gaps = [np.linalg.norm(places[name] - place) for name, place in person.joints.items() if name in places]
+            error = float(np.mean(gaps)) if gaps else np.nan
+        return evidence.values, error
 
 
 def _label(candidate: Candidate, truth: LabelledScene) -> int:
@@ -99,16 +148,3 @@ def _label(candidate: Candidate, truth: LabelledScene) -> int:
         return 0
     enough = len(candidate.rows) > MIN_PERSON_SHARE * truth.people[nearest].points
     return 1 if away[nearest] < PERSON_M and enough else -1
-
-
-def _weigh(
-    upright: UprightFitter, fitter: BodyFitter, candidate: Candidate, scene: SceneHeights, rays: ScanRays
-) -> np.ndarray:
-    points = scene.points[candidate.rows]
-    window = rays.find_window(points)
-    try:
-        cloud = upright.make_cloud(points, rays.viewpoint, rays.find_unknown(points, window))
-    except InputError:
-        return np.full(EVIDENCE, np.nan)
-    found = upright.fit(cloud, candidate.floor)
-    return weigh_fit(found, candidate, scene, rays, window, fitter.model.faces).to_array()

@@ -6,32 +6,47 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize
 
 from flowing_puppet_ros.body.upright.decision_trees import DecisionTrees
-from flowing_puppet_ros.body.upright.person_finder import PersonModel
+from flowing_puppet_ros.body.upright.person_model import PersonModel, log_odds, select_accuracy, weigh_odds
 from flowing_puppet_ros.learn.people.examples import CandidateExamples
+from flowing_puppet_ros.learn.people.unseen import make_forest, predict_unseen
 
-TREES, MAX_DEPTH, MIN_LEAF_EXAMPLES = 80, 9, 3
+CLOSE_M = 0.10  # mean error of the joints of a body that is close
 REGULARISATION = 1.0  # of the logistic regression
 
 
 def learn_model(examples: CandidateExamples, seed: int) -> PersonModel:
     """Learn from examples; the same examples and seed give the same model."""
-    from sklearn.ensemble import ExtraTreesClassifier
     from sklearn.linear_model import LogisticRegression
 
-    forest = ExtraTreesClassifier(
-        TREES,
-        max_depth=MAX_DEPTH,
-        min_samples_leaf=MIN_LEAF_EXAMPLES,
-        class_weight="balanced",
-        random_state=seed,
-    ).fit(examples.shape, examples.is_person)
-    fitted = np.isfinite(examples.evidence).all(axis=1)
-    evidence, truth = examples.evidence[fitted], examples.is_person[fitted]
-    mean, scale = evidence.mean(axis=0), np.maximum(evidence.std(axis=0), 1e-9)
-    judge = LogisticRegression(C=REGULARISATION, class_weight="balanced").fit((evidence - mean) / scale, truth)
-    return PersonModel(_flatten(forest), mean, scale, np.append(judge.coef_[0], judge.intercept_))
+    fitted = examples.fitted
+    evidence, truth, scan = examples.evidence[fitted], examples.is_person[fitted], examples.scan[fitted]
+    shape = log_odds(predict_unseen(examples.shape, examples.is_person, examples.scan, seed)[fitted])
+    judged = log_odds(predict_unseen(evidence, truth, scan, seed))
+    fusion = _fit_fusion(shape, judged, truth)
+    known = np.isfinite(examples.joint_error[fitted])
+    inputs, close = select_accuracy(evidence[known]), examples.joint_error[fitted][known] < CLOSE_M
+    mean, scale = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-9)
+    accuracy = LogisticRegression(C=REGULARISATION).fit((inputs - mean) / scale, close)
+    weight = accuracy.coef_[0] / scale
+    return PersonModel(
+        _flatten(make_forest(seed).fit(examples.shape, examples.is_person)),
+        _flatten(make_forest(seed).fit(evidence, truth)),
+        fusion,
+        np.append(weight, accuracy.intercept_[0] - weight @ mean),
+    )
+
+
+def _fit_fusion(shape: np.ndarray, judged: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the weight of the judge's log odds (N,) and the constant under which people (N,) are likeliest."""
+
+    def cost(fusion: np.ndarray) -> float:
+        odds = weigh_odds(shape, judged, fusion)
+        return float(np.logaddexp(0.0, np.where(truth == 1, -odds, odds)).mean())
+
+    return np.asarray(minimize(cost, np.array([1.0, 0.0]), method="Nelder-Mead").x)
 
 
 def _flatten(forest: Any) -> DecisionTrees:

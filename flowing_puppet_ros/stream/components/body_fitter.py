@@ -70,8 +70,8 @@ class BodyFitterSettings(SceneSettings):
     )
     fixed_frame: str = setting(
         "",
-        "frame with z up that stands still (map, odom), in which people are tracked while the sensor moves or is tilted;"
-        " empty: the cloud's, as `up` says",
+        "frame with z up that stands still (map, odom), in which people are tracked where the sensor moves or is"
+        " tilted; empty: the cloud's, as `up` says",
     )
     sensor_frame: str = setting(
         "",
@@ -130,9 +130,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         )
         self._frames = FrameTree()
         self._puppets = PuppetPairs(self._model, settings.fusion, self._frames)
-        self._places = SensorPlaces(
-            self._frames, settings.up, settings.fixed_frame, settings.sensor_frame, self.report
-        )
+        self._places = SensorPlaces(self._frames, settings.up, settings.fixed_frame, settings.sensor_frame, self.report)
         self._is_fixed = False
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
         self._depth = DepthPairs(self.report)

@@ -130,7 +130,9 @@ class BodyOutputs:
             messages[person.id] = make_coarse_body(
                 factory, self._model.joint_names, person.id, person.joints, person.confidence
             )
-        ordered = [messages[identity] for identity in sorted(messages, key=id_sort_key)] if coarse else [*messages.values()]
+        ordered = (
+            [messages[identity] for identity in sorted(messages, key=id_sort_key)] if coarse else [*messages.values()]
+        )
         outputs: Output = [("bodies", make_bodies(factory, header, ordered))]
         if fits and not self._topology_sent:
             self._topology_sent = True

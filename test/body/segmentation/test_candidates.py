@@ -4,6 +4,7 @@
 import numpy as np
 
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
+from flowing_puppet_ros.body.segmentation.column_index import ColumnIndex
 from flowing_puppet_ros.body.segmentation.floor_grid import FloorGrid
 from flowing_puppet_ros.body.segmentation.linkage import link_points
 
@@ -80,3 +81,25 @@ def test_known_people_keep_their_points_and_are_no_candidates() -> None:
 def test_no_points_above_the_floor_give_no_candidates() -> None:
     scene = SceneHeights.of(ground(np.random.default_rng(4), 2000))
     assert find_candidates(scene, SENSOR, 25) == ([], {})
+
+
+def test_the_linkage_joins_what_chains_of_near_points_join() -> None:
+    points = np.random.default_rng(5).uniform(0, 3, (400, 3)) * [1, 1, 0.7]
+    distance = np.full(400, 6.0)  # a gap of 0.172 m, and 0.43 m upwards
+    scaled = points * [1, 1, 0.4]
+    near = np.linalg.norm(scaled[:, None] - scaled[None], axis=2) < 0.172
+    for _ in range(9):  # chains of up to 2 ** 9 points
+        near = near.astype(float) @ near > 0
+    label = link_points(points, distance)
+    assert 10 < label.max() < 390
+    np.testing.assert_array_equal(label[:, None] == label[None], near)
+
+
+def test_points_near_a_place_are_those_that_all_distances_give() -> None:
+    points = np.random.default_rng(6).normal(0, 3, (2000, 3))
+    index = ColumnIndex.of(points)
+    for place in (np.zeros(2), np.array([4.0, -3.0]), np.array([30.0, 0.0])):
+        rows, away = index.find_near(points, place, 1.3)
+        every = np.hypot(*(points[:, :2] - place).T)
+        assert set(rows) == set(np.flatnonzero(every <= 1.3)) and len(set(rows)) == len(rows)
+        np.testing.assert_allclose(away, every[rows])

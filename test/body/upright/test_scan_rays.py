@@ -21,13 +21,15 @@ def test_rays_end_on_before_and_behind_a_body() -> None:
     scan = np.concatenate([sheet(5.05, (-0.3, 0.0), (-1, 0.6)), sheet(8.0, (0.05, 1.0), (-1.6, 0.9))])
     rays = ScanRays.of(scan, np.zeros(3))
     count = rays.compare(np.arange(len(scan)), body, np.tile([-1.0, 0, 0], (len(body), 1)))
-    assert count.on > 0.95 * 15 * 80 and count.behind > 0.3 * count.on and count.before == 0
-    assert count.free == count.beside > 50  # to the right, where the sheet behind goes on
+    on, behind, before, free, beside = (each.sum() for each in count)
+    assert on > 0.95 * 15 * 80 and behind > 0.3 * on and before == 0
+    assert free == beside > 50  # to the right, where the sheet behind goes on
+    np.testing.assert_allclose(count.on / on, [0.45, 0.35, 0.2], atol=0.03)  # the bands' shares of the height
     nearer = ScanRays.of(sheet(3.0, (-0.3, 0.3), (-1, 0.6)), np.zeros(3))
     window = np.arange(len(nearer.points))
     count = nearer.compare(window, body, np.tile([-1.0, 0, 0], (len(body), 1)))
-    assert count.on == count.behind == 0 and count.before > 100
-    assert count.free == 0 and count.beside > 50
+    assert count.on.sum() == count.behind.sum() == 0 and count.before.sum() > 100
+    assert count.free.sum() == 0 and count.beside.sum() > 50
 
 
 def test_what_stands_before_a_candidate_and_below_all_rays_is_unknown() -> None:
@@ -74,5 +76,5 @@ def test_trees_follow_their_branches() -> None:
     )
     np.testing.assert_allclose(trees.predict(np.array([[0.0, 9], [2, 5], [2, 6]])), [0.4, 0.5, 0.8])
     assert len(trees.predict(np.empty((0, 2)))) == 0
-    again = DecisionTrees.from_arrays(trees.to_arrays())
+    again = DecisionTrees.from_arrays(trees.to_arrays("filter"), "filter")
     np.testing.assert_array_equal(again.threshold, trees.threshold)

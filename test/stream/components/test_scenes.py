@@ -73,7 +73,7 @@ class Stage:
     def cloud(self, *places: Place) -> Any:
         self.tenths += 1
         points = np.concatenate([self.floor, *(self.person + np.array([x, y, 0.0]) for x, y in places)])
-        return make_cloud(FACTORY, make_header(FACTORY, self.tenths * TENTH, "map"), points)
+        return make_cloud(FACTORY, make_header(FACTORY, self.tenths * TENTH, "lidar"), points)
 
     def show(self, *places: Place) -> dict[Place, str]:
         """Return the id of the body at each place."""
@@ -252,7 +252,7 @@ def test_goals_fit_everybody_and_touch_no_track(person: np.ndarray, floor: np.nd
     message, found = stage.component.fit(stage.cloud((0, 0), (2, 1)), None, seed=0)
     assert [body.id for body in message.bodies] == ["b1", "b2"] == [body.id for body in found]
     assert stage.show((0, 0)) == {(0, 0): "b1"}
-    alone = make_cloud(FACTORY, make_header(FACTORY, 1, "map"), person[person[:, 2] > 1.2])
+    alone = make_cloud(FACTORY, make_header(FACTORY, 1, "lidar"), person[person[:, 2] > 1.2])
     assert len(stage.component.fit(alone, None, seed=0)[1]) == 1, "a cloud of a person's size is one"
     with pytest.raises(InputError, match="there is nobody in the cloud"):
         stage.component.fit(stage.cloud(), None, seed=0)
@@ -265,7 +265,7 @@ def test_clouds_that_cannot_show_people_are_one_sentence(person: np.ndarray) -> 
         (1, millimetres, "beyond the segmentation.max_range of 30 m; check the unit"),
         (2, person[:0], "no finite"),
     ):
-        made = dict(component.handle("points", make_cloud(FACTORY, make_header(FACTORY, stamp, "map"), points)))
+        made = dict(component.handle("points", make_cloud(FACTORY, make_header(FACTORY, stamp, "lidar"), points)))
         assert made["bodies"].bodies == []
         (warning,) = component.report.drain_warnings()
         assert sentence in warning

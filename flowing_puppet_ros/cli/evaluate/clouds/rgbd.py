@@ -7,6 +7,7 @@ import argparse
 import sys
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
@@ -14,6 +15,8 @@ from tqdm import tqdm
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
+from flowing_puppet_ros.evaluate.moving.fitter_run import run_fitter
+from flowing_puppet_ros.evaluate.moving.robot_view import SENSINGS, RobotView
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
 from flowing_puppet_ros.evaluate.rgbd.methods import FusionMethod, RgbdMethod, SearchMethod
 from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summarise_rgbd
@@ -60,6 +63,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--lag", type=float, default=0.0, help="by which colour is later than depth in motions, seconds [%(default)s]"
     )
+    parser.add_argument(
+        "--robot", type=float, metavar="SECONDS", help="feed body_fitter with what a robot sees instead, which stands,"
+        " drives and nods, hangs upside down, or whose colour and depth stand apart or are not of one time; no --mocap",
+    )  # fmt: skip
     parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture that the poses are from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for rgbd.csv and rgbd.json")
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
@@ -68,6 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit the people of every frame, print the figures and return the exit status."""
+    if arguments.robot is not None:
+        ways = _see_from_robot(arguments)
+        print(format_json({"robot": ways}) if arguments.json else format_table(ways))
+        return 0
     if arguments.mocap is None:
         raise InputError("drawn people stand and walk as motion capture does; give --mocap expmap_20hz.npz")
     if arguments.count < 1 or arguments.people < 1 or arguments.people_seed < 0 or not 0 <= arguments.noise <= 100:
@@ -114,6 +125,15 @@ def _track_motions(arguments: argparse.Namespace, fitter: BodyFitter, studio: Rg
         for each, score in zip(scores, found, strict=True):
             each.append(score)
     return [summarise_motions(each) for each in reversed(scores)]
+
+
+def _see_from_robot(arguments: argparse.Namespace) -> list[dict[str, Any]]:
+    """Return the figures of every way in which a robot sees the same people."""
+    if not 1 <= arguments.robot <= 60 or arguments.people_seed < 0:
+        raise InputError("--robot is between 1 and 60 s and --people-seed at least 0")
+    view = RobotView(BodySource(), arguments.people_seed, arguments.robot)
+    ways = tqdm(list(SENSINGS), file=sys.stderr, disable=arguments.json)
+    return [run_fitter(view, SENSINGS[name]).summarise(name) for name in ways]
 
 
 def _make_method(name: str, fitter: BodyFitter) -> RgbdMethod:

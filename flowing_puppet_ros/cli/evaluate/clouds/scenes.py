@@ -27,6 +27,7 @@ from flowing_puppet_ros.body.track.scene_tracker import SceneCloud, SceneSetting
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
+from flowing_puppet_ros.evaluate.scene.reliability import tabulate_reliability
 from flowing_puppet_ros.evaluate.scene.scene_score import (
     GhostScore,
     PersonScore,
@@ -35,6 +36,7 @@ from flowing_puppet_ros.evaluate.scene.scene_score import (
     summarise_scenes,
     tabulate_bins,
 )
+from flowing_puppet_ros.evaluate.scene.scene_sequences import draw_sequence
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import PLACES, SCANNERS, SyntheticScene, draw_scene
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -63,6 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--min-labelled-points", type=int, default=50, help="points of people who count [%(default)s]")
     parser.add_argument(
         "--sequence", action="store_true", help="the scans follow each other by 0.1 s: track the people"
+    )
+    parser.add_argument(
+        "--length", type=int, default=1, help="scans of a synthetic sequence, whose people are tracked [%(default)s]"
     )
     parser.add_argument("--count", type=int, default=12, help="synthetic scenes [%(default)s]")
     parser.add_argument("--places", nargs="+", choices=PLACES, default=PLACES, help="of synthetic scenes [all]")
@@ -93,9 +98,12 @@ def run(arguments: argparse.Namespace) -> int:
     people: list[PersonScore] = []
     ghosts: list[GhostScore] = []
     seconds = []
+    sequence = arguments.sequence or arguments.length > 1
     for number, scan in enumerate(tqdm(scans, file=sys.stderr, disable=arguments.json)):
+        if not arguments.scans and number % arguments.length == 0:
+            tracker.reset()
         started = time.process_time()
-        bodies = _find(tracker, scan, number, arguments.sequence)
+        bodies = _find(tracker, scan, number, sequence)
         seconds.append(time.process_time() - started)
         found = [_describe(model, body, scan.truth.sensor) for body in bodies]
         scored = score_scene(scan.name, scan.truth, found, arguments.min_labelled_points, np.radians(arguments.sector))
@@ -103,16 +111,19 @@ def run(arguments: argparse.Namespace) -> int:
         ghosts += scored[1]
     figures = summarise_scenes(people, ghosts, len(scans)) | {"seconds_per_scan": float(np.mean(seconds))}
     bins = tabulate_bins(people)
+    reliability = tabulate_reliability(people, ghosts)
     if arguments.out is not None:
         for name, rows in (("people", people), ("ghosts", ghosts)):
             if rows:
                 write_csv(arguments.out / f"{name}.csv", [asdict(row) for row in rows])
-        write_json(arguments.out / "scenes.json", {"summary": figures, "bins": bins})
+        write_json(arguments.out / "scenes.json", {"summary": figures, "bins": bins, "reliability": reliability})
     if arguments.json:
-        print(format_json(figures | {"bins": bins}))
+        print(format_json(figures | {"bins": bins, "reliability": reliability}))
     else:
         print(format_table([figures]))
         print(format_table(bins) if bins else "nobody is labelled")
+        if reliability:
+            print(format_table(reliability))
     return 0
 
 
@@ -155,7 +166,14 @@ def _draw(arguments: argparse.Namespace) -> Iterator[tuple[str, SyntheticScene, 
         place = arguments.places[number % len(arguments.places)]
         scanner = arguments.scanners[(number // len(arguments.places)) % len(arguments.scanners)]
         rng = np.random.default_rng([arguments.scene_seed, number])
-        yield f"{number:03d}-{place}-{scanner}", draw_scene(source, rng, place, scanner, arguments.people), source
+        drawn = (
+            draw_sequence(source, rng, place, scanner, arguments.people, arguments.length)
+            if arguments.length > 1
+            else [draw_scene(source, rng, place, scanner, arguments.people)]
+        )
+        for step, scene in enumerate(drawn):
+            suffix = f"-{step:03d}" if arguments.length > 1 else ""
+            yield f"{number:03d}-{place}-{scanner}{suffix}", scene, source
 
 
 def _as_scan(name: str, scene: SyntheticScene, source: BodySource) -> _Scan:

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was learned about people in scans: a filter of candidates, a judge of fits, and how sure both can be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from flowing_puppet_ros.body.upright.decision_trees import DecisionTrees
+from flowing_puppet_ros.body.upright.verification import EVIDENCE_NAMES, FitEvidence
+from flowing_puppet_ros.model import weights
+
+MODEL = "clouds"  # name of the shipped file
+SHAPE_SHARE = 0.5
+"""Share of the filter's log odds that counts beside the judge's: in the places where both were learned the filter
+looks better than it is elsewhere."""
+MIN_ODDS, MAX_ODDS = 0.02, 0.98  # of each forest
+ACCURACY_NAMES = ("cost", "distance", "supported", "explained", "hidden", "log_points", "confidence", "stature")
+"""Evidence that tells how close the joints are."""
+_ACCURACY_COLUMNS = [EVIDENCE_NAMES.index(name) for name in ACCURACY_NAMES]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PersonModel:
+    """What was learned.
+
+    Attributes:
+        trees: of the filter, over what a candidate looks like.
+        judge: trees over the evidence of a fit.
+        fusion: (2,) by which the judge's log odds count, and a constant.
+        accuracy: (len(ACCURACY_NAMES) + 1,) weights of evidence, and a constant: log odds that the joints of a person
+            are within 10 cm in the mean.
+    """
+
+    trees: DecisionTrees
+    judge: DecisionTrees
+    fusion: np.ndarray
+    accuracy: np.ndarray
+
+    @classmethod
+    @lru_cache(maxsize=1)
+    def load(cls) -> PersonModel:
+        """Load the shipped model."""
+        return cls.from_arrays(weights.load("people", MODEL))
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PersonModel:
+        """Take the arrays of a file."""
+        filters, judge = (DecisionTrees.from_arrays(arrays, name) for name in ("trees", "judge"))
+        return cls(filters, judge, arrays["fusion"], arrays["accuracy"])
+
+    def to_arrays(self) -> dict[str, np.ndarray]:
+        """Return what `from_arrays` takes."""
+        return (
+            self.trees.to_arrays("trees")
+            | self.judge.to_arrays("judge")
+            | {"fusion": self.fusion, "accuracy": self.accuracy}
+        )
+
+    def combine(self, shape_probability: float, evidence: FitEvidence) -> float:
+        """Return the probability of a person by the filter and the fit's evidence."""
+        judged = log_odds(self.judge.predict(evidence.values[None])[0])
+        return float(_logistic(weigh_odds(log_odds(shape_probability), judged, self.fusion)))
+
+    def rate(self, probability: float, evidence: FitEvidence) -> float:
+        """Return the probability that a body is a person whose joints are within 10 cm in the mean."""
+        return probability * float(_logistic(select_accuracy(evidence.values) @ self.accuracy[:-1] + self.accuracy[-1]))
+
+
+def log_odds(probability: np.ndarray | float) -> np.ndarray:
+    """Return the log odds of a forest's probabilities, which are never quite sure."""
+    odds = np.clip(probability, MIN_ODDS, MAX_ODDS)
+    return np.asarray(np.log(odds / (1 - odds)))
+
+
+def weigh_odds(shape: np.ndarray, judged: np.ndarray, fusion: np.ndarray) -> np.ndarray:
+    """Return the log odds of a person by those of the filter and of the judge."""
+    return np.asarray(SHAPE_SHARE * shape + fusion[0] * judged + fusion[1])
+
+
+def select_accuracy(evidence: np.ndarray) -> np.ndarray:
+    """Return the evidence (..., len(ACCURACY_NAMES)) that tells about the joints."""
+    return evidence[..., _ACCURACY_COLUMNS]
+
+
+def _logistic(odds: np.ndarray | float) -> np.ndarray:
+    return np.asarray(1 / (1 + np.exp(-odds)))

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sequences of synthetic scenes: people who walk as motion capture does, and people who stand still."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
+from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, MAKERS, Disc
+from flowing_puppet_ros.evaluate.scene.synthetic_scenes import (
+    MAX_BEARING_RAD,
+    SENSOR_HEIGHT_M,
+    SyntheticScene,
+    is_upright,
+    place_people,
+    scan_scene,
+)
+
+RATE_HZ = 10.0
+WALKING_SHARE = 0.6
+MIN_WALK_M = 0.02  # mean motion of a joint in a frame of motion capture
+MAX_TRIES = 8  # of motions for a walking person
+BODY_RADIUS_M = 0.3
+
+
+def draw_sequence(
+    source: BodySource, rng: np.random.Generator, place: str, scanner: str, people: int, scans: int
+) -> Iterator[SyntheticScene]:
+    """Draw `scans` scans, 0.1 s apart, of one place with people of whom most walk; the sensor stands still."""
+    height = float(rng.uniform(*SENSOR_HEIGHT_M[place]))
+    meshes, blocked = MAKERS[place](rng)
+    view = np.pi if scanner.startswith("spinning") else MAX_BEARING_RAD
+    standing = place_people(source, rng, place, people, blocked, view)
+    motions: list[list[TrueBody]] = []
+    for body in standing:
+        walked = _draw_walk(source, rng, place, body, blocked, scans) if rng.random() < WALKING_SHARE else None
+        motions.append(walked or [body] * scans)
+    down = np.array([0.0, 0.0, -height])
+    for number in range(scans):
+        bodies = [motion[number] for motion in motions]
+        visible = [(body.vertices, source.triangles) for body in bodies]
+        points, owner = scan_scene(meshes, visible, rng, scanner, height)
+        yield SyntheticScene(points, owner, [body.translate(down) for body in bodies], -height)
+
+
+def _draw_walk(
+    source: BodySource,
+    rng: np.random.Generator,
+    place: str,
+    start: TrueBody,
+    blocked: Sequence[Disc],
+    scans: int,
+) -> list[TrueBody] | None:
+    """Return a walk from where somebody stands, upright all the way and through nothing; None where none is found."""
+    half = HALF_SIZE_M[place]
+    for _ in range(MAX_TRIES):
+        motion = source.draw_motion(rng, scans, RATE_HZ, MIN_WALK_M)
+        step = start.joints.mean(axis=0) - motion[0].joints.mean(axis=0)
+        moved = [body.translate(np.array([step[0], step[1], 0.0])) for body in motion]
+        middles = np.array([body.joints.mean(axis=0)[:2] for body in moved])
+        inside = bool((np.abs(middles) < np.array(half) - BODY_RADIUS_M).all()) and np.hypot(*middles.T).min() > 1.2
+        free = all(np.hypot(*(middles - [x, y]).T).min() > r + BODY_RADIUS_M - 0.35 for x, y, r in blocked)
+        if inside and free and all(is_upright(body, source.joint_names) for body in moved):
+            return moved
+    return None

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is tracked is shown once scans agree that it is a person, and forgotten once they agree that it is none."""
+
+import numpy as np
+
+from flowing_puppet_ros.body.track.person_belief import PersonBelief
+
+TENTH = 100_000_000
+
+
+def tell(belief: PersonBelief, *probabilities: float) -> list[bool]:
+    """Ask scans 0.1 s apart, and return after each whether it is taken for a person."""
+    shown = []
+    for probability in probabilities:
+        belief.add(probability, 0.5, belief.asked + TENTH)
+        shown.append(belief.decide())
+    return shown
+
+
+def test_a_sure_scan_is_enough_and_a_doubtful_one_is_not() -> None:
+    assert tell(PersonBelief(np.zeros(2)), 0.95) == [True]
+    assert tell(PersonBelief(np.zeros(2)), 0.7, 0.7) == [False, True]
+    assert not any(tell(PersonBelief(np.zeros(2)), *[0.5] * 10))
+
+
+def test_what_moved_needs_less_and_the_noise_of_a_place_is_no_motion() -> None:
+    belief = PersonBelief(np.zeros(2))
+    belief.visit(np.array([0.2, -0.2, 1.0]))
+    assert not any(tell(belief, 0.5, 0.5, 0.5))
+    belief.visit(np.array([0.4, 0.4, 1.0]))
+    assert tell(belief, 0.5) == [True]
+
+
+def test_who_was_shown_stays_through_doubtful_scans_and_not_through_many_bad_ones() -> None:
+    belief = PersonBelief(np.zeros(2))
+    assert all(tell(belief, 0.95, 0.95, 0.4, 0.4, 0.4))
+    assert not belief.is_hopeless
+    assert not tell(belief, *[0.03] * 20)[-1]
+    assert belief.is_hopeless
+
+
+def test_later_scans_are_asked_once_a_second() -> None:
+    belief = PersonBelief(np.zeros(2))
+    tell(belief, *[0.9] * 8)
+    assert not belief.is_due(belief.asked + 5 * TENTH)
+    assert belief.is_due(belief.asked + 10 * TENTH)
