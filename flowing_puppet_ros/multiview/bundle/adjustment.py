@@ -19,7 +19,7 @@ from flowing_puppet_ros.multiview.bundle.joint_tracks import PeopleTracks
 from flowing_puppet_ros.multiview.camera import Camera
 
 _MAX_INSTANTS = 60
-_SCALES_PX = (20.0, 10.0, 6.0, *[5.0] * 9)  # of the robust loss, round by round, at 1000 px focal length
+_SCALES_PX = (60.0, 30.0, 20.0, 10.0, 6.0, *[5.0] * 8)  # of the robust loss, round by round, at 1000 px focal length
 _TRIANGULATION_STEPS = 4
 _MEDIAN_STEPS = 12
 _MIN_DEPTH_M = 0.1  # of a joint in front of a camera

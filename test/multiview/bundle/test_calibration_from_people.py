@@ -10,11 +10,14 @@ from walkers import NAMES, photograph, ring, walker  # type: ignore[import-not-f
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.multiview.bundle.adjustment import Freedom
+from flowing_puppet_ros.multiview.association.settings import AssociationSettings
+from flowing_puppet_ros.multiview.association.view import PersonInView
+from flowing_puppet_ros.multiview.bundle.adjustment import Freedom, adjust
 from flowing_puppet_ros.multiview.bundle.calibrate import RefinedRig, Scale, refine_rig
 from flowing_puppet_ros.multiview.bundle.clocks import find_coarse_offsets
-from flowing_puppet_ros.multiview.bundle.joint_tracks import CameraFrames
+from flowing_puppet_ros.multiview.bundle.joint_tracks import CameraFrames, associate_tracks
 from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
 
 RATE = 30.0
 CAMERAS = ring()
@@ -93,6 +96,27 @@ def test_scale_by_a_distance_or_a_height() -> None:
     assert next(iter(by_height.heights.values())) == pytest.approx(1.0)
     with pytest.raises(InputError, match="there is no camera 'cam9'"):
         refine_rig(NAMES, CAMERAS, frames, freedom, Scale(("cam1", "cam9"), 1.0))
+
+
+@pytest.mark.slow
+def test_a_camera_that_was_turned_before_somebody_on_one_spot_stays_where_it_stood() -> None:
+    """A network's joints are off the same way in all images, and one spot hardly tells turn from move."""
+    random = np.random.default_rng(8)
+    people = [{"ann": walker((0.1, 0.0), 0.5, 6 * k / RATE)} for k in range(60)]
+    bias = {name: random.normal(0, 4, (len(NAMES), 2)) for name in CAMERAS}
+    frames: dict[str, list[tuple[float, list[PersonInView]]]] = {name: [] for name in CAMERAS}
+    for k, each in enumerate(people):
+        for name, group in photograph(CAMERAS, each, 2.0, random).items():
+            frames[name].append((k / RATE, [replace(p, joints=p.joints + bias[name]) for p in group]))
+    tracks = associate_tracks(NAMES, CAMERAS, frames, {}, AssociationSettings(), TriangulationSettings())
+    turned = CAMERAS | {"cam2": turn(CAMERAS["cam2"], 2.0, (0.6, 0.8, 0.0))}
+    start = dict.fromkeys(CAMERAS, 0.0)
+    found = {
+        case: adjust(former, start, former, tracks, Freedom(clocks=False)).cameras["cam2"]
+        for case, former in (("right", CAMERAS), ("turned", turned))
+    }
+    assert angle(found["turned"], found["right"]) < 0.2
+    assert np.linalg.norm(found["turned"].centre - CAMERAS["cam2"].centre) < 0.02
 
 
 def test_clocks_that_differ_by_half_a_second_are_found_to_an_image() -> None:

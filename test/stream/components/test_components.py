@@ -2,40 +2,35 @@
 """Components: what waits for what, the same answer in any order of arrival, restarts, lazy outputs, bad input."""
 
 from copy import deepcopy
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from golden_streams import (  # type: ignore[import-not-found]
+    FACTORY,
+    Stream,
+    drive,
+    hull_stream,
+    interleaved,
+    read_golden,
+    tracker,
+)
 
-from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
+from flowing_puppet_ros.bag.typestore import typestore
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import FlowSettings
-from flowing_puppet_ros.multiview.bundle import rig_check
-from flowing_puppet_ros.stream.component import Component
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
-from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent, VisualHullSettings
-from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform, stamp_ns
+from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_flow, decode_image, make_image
-from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, PUPPETS, TRANSFORMS
+from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, PUPPETS
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
-
-GOLDEN = Path(__file__).resolve().parents[3] / "bags" / "golden" / "golden.mcap"
-FACTORY = BagMessageFactory()
-Stream = list[tuple[str, Any]]
 
 
 @pytest.fixture(scope="module")
 def recorded() -> dict[str, list[Any]]:
-    """Messages of the golden bag by topic."""
-    found: dict[str, list[Any]] = {}
-    with open_bag(GOLDEN) as bag:
-        for record in bag.messages():
-            found.setdefault(record.topic, []).append(record.message)
-    return found
+    return read_golden()
 
 
 @pytest.fixture(scope="module")
@@ -48,32 +43,12 @@ def detections(recorded: dict[str, list[Any]]) -> dict[int, Any]:
     return {stamp_ns(message): message for message in recorded["/cam1/detections"]}
 
 
-def tracker(**settings: Any) -> PuppetTrackerComponent:
-    return PuppetTrackerComponent(PuppetTrackerSettings.from_mapping(settings), FACTORY)
-
-
-def drive(component: Component[Any], stream: Stream) -> Stream:
-    """Return everything that comes out, to the end."""
-    found = [made for port, message in stream for made in component.handle(port, message)]
-    return found + component.flush()
-
-
 def puppets(found: Stream) -> list[bytes]:
     return [bytes(typestore().serialize_cdr(message, PUPPETS)) for port, message in found if port == "puppets"]
 
 
 def stamps(found: Stream, port: str) -> list[int]:
     return [stamp_ns(message) for name, message in found if name == port]
-
-
-def interleaved(images: list[Any], detections: dict[int, Any], first: str) -> Stream:
-    stream: Stream = []
-    for image in images:
-        pair: Stream = [("image", image)]
-        if stamp_ns(image) in detections:
-            pair.insert(0 if first == "detections" else 1, ("detections", detections[stamp_ns(image)]))
-        stream += pair
-    return stream
 
 
 def test_the_order_of_image_and_detection_does_not_matter(images: list[Any], detections: dict[int, Any]) -> None:
@@ -210,21 +185,6 @@ def test_a_hull_needs_two_names(names: str) -> None:
         VisualHullComponent(VisualHullSettings(cameras=names), FACTORY)
 
 
-def hull_stream(recorded: dict[str, list[Any]], skip: tuple[str, ...] = ()) -> Stream:
-    """What two cameras' trackers and drivers send to the hull."""
-    stream: Stream = [("/tf_static", message) for message in recorded["/tf_static"]]
-    for name in ("cam1", "cam2"):
-        component = tracker()
-        component.set_subscribed("part_labels", True)
-        stream += [(f"{name}/camera_info", message) for message in recorded[f"/{name}/camera_info"][:1]]
-        by_stamp = {stamp_ns(message): message for message in recorded[f"/{name}/detections"]}
-        seen = recorded[f"/{name}/image/compressed"][:2]
-        stream += [(f"{name}/image", message) for message in seen]
-        made = drive(component, interleaved(seen, by_stamp, "detections"))
-        stream += [(f"{name}/{port}", message) for port, message in made]
-    return [item for item in stream if not item[0].endswith(skip)] if skip else stream
-
-
 @pytest.mark.slow
 def test_the_order_of_the_inputs_of_a_hull_does_not_matter(recorded: dict[str, list[Any]]) -> None:
     stream = hull_stream(recorded)
@@ -268,55 +228,6 @@ def test_frames_that_come_after_the_first_images_place_the_hull(recorded: dict[s
     assert drive(component, [item for item in stream if item[0] != "/tf_static"]) == []
     component.reset()
     assert {message.header.frame_id for _, message in drive(component, stream)} == {"world"}
-
-
-def test_a_hull_says_that_people_would_be_giants(
-    recorded: dict[str, list[Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The poses are in millimetres: nobody is found, and nothing else would say why."""
-    monkeypatch.setattr(rig_check, "_SETS", 2)
-    stream = deepcopy(hull_stream(recorded))
-    for item in stream[0][1].transforms:
-        for axis in "xyz":
-            setattr(item.transform.translation, axis, 1000 * getattr(item.transform.translation, axis))
-    component = VisualHullComponent(VisualHullSettings(cameras="cam1,cam2", hull_every=1), FACTORY)
-    assert drive(component, stream) == []
-    (sentence,) = component.report.drain_warnings()
-    tall = float(sentence.split("would be ")[1].split(" m tall")[0])
-    assert 1300 < tall < 2200 and "in mm" in sentence and "--unit" in sentence
-
-
-def move_rig(stream: Stream, speed: np.ndarray, late: bool) -> Stream:
-    """The same stream from a rig that drives: its root frame moves on /tf, told between the stamps of the images.
-
-    `late` transforms but the first come after all images that they are needed for.
-    """
-    stamps = sorted({stamp_ns(message) for port, message in stream if port.endswith("/image")})
-    start, half = stamps[0], (stamps[1] - stamps[0]) // 2
-    moving: Stream = []
-    for stamp in (start - half, start + half, stamps[-1] + half):
-        header = make_header(FACTORY, stamp, "odom")
-        pose = make_transform(FACTORY, header, "world", speed * (stamp - start) * 1e-9, np.eye(3))
-        moving.append(("/tf", FACTORY.make(TRANSFORMS, transforms=[pose])))
-    early = moving[:1] if late else moving
-    return stream[:1] + early + stream[1:] + moving[len(early) :]
-
-
-@pytest.mark.parametrize("late", [False, True])
-def test_cameras_that_move_are_taken_where_they_were(recorded: dict[str, list[Any]], late: bool) -> None:
-    stream, speed = hull_stream(recorded), np.array([0.9, -0.4, 0.1])
-    settings = VisualHullSettings(cameras="cam1,cam2", hull_every=1)
-    still = [m for port, m in drive(VisualHullComponent(settings, FACTORY), stream) if port == "hull/joints"]
-    component = VisualHullComponent(settings, FACTORY)
-    driven = [m for port, m in drive(component, move_rig(stream, speed, late)) if port == "hull/joints"]
-    assert [m.header.frame_id for m in driven] == ["odom"] * 2 and component.report.drain_warnings() == []
-    for one, other in zip(still, driven, strict=True):
-        moved = speed * (stamp_ns(one) - stamp_ns(still[0])) * 1e-9
-        before, after = (decode_body_joints(m.bodies[0]) for m in (one, other))
-        assert before.keys() == after.keys()
-        for name, joint in before.items():
-            np.testing.assert_allclose(after[name][:3], joint[:3] + moved, atol=1e-3)
-    assert np.linalg.norm(moved) > 0.01
 
 
 def test_silhouettes_go_on_without_a_camera_that_is_dead_or_not_calibrated(recorded: dict[str, list[Any]]) -> None:
