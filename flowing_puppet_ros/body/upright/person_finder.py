@@ -35,7 +35,7 @@ class PersonFinderSettings(Settings):
     """Settings of `PersonFinder`."""
 
     min_points: int = setting(25, "minimum number of points of a person", low=15, high=100000)
-    min_probability: float = setting(0.35, "minimum probability of a body to be a person", low=0.0, high=1.0)
+    min_probability: float = setting(0.3, "minimum probability of a body to be a person", low=0.0, high=1.0)
     min_filter: float = setting(
         0.3, "minimum probability, by its shape alone, of what is fitted", low=0.0, high=1.0, advanced=True
     )
