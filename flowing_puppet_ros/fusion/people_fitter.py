@@ -53,6 +53,7 @@ class FusionSettings(Settings):
         True,
         "publish whom the camera sees where there is no depth: joints alone, as far away as their size says, never"
         " reliable",
+        advanced=True,
     )
     rectified: bool = setting(
         False, "puppets are those of a rectified image, as P of puppets/camera_info says, not K and D", advanced=True

@@ -58,8 +58,11 @@ class SensorPlace:
 class SensorPlaces:
     """Finds where the sensor of some data is, by the frames received on /tf and /tf_static."""
 
-    def __init__(self, frames: FrameTree, up: str, fixed_frame: str, sensor_frame: str, report: Report) -> None:
+    def __init__(
+        self, frames: FrameTree, up: str, fixed_frame: str, sensor_frame: str, report: Report, view: str = "auto"
+    ) -> None:
         """Look frames up in `frames`; the others are the settings of these names of the body fitter."""
+        self._view = view
         self._frames = frames
         self._up = up
         self._fixed, self._sensor = fixed_frame.lstrip("/"), sensor_frame.lstrip("/")
@@ -130,7 +133,8 @@ class SensorPlaces:
                 return here
             own = rotation_to_z_up(parse_axis("-y" if OPTICAL.search(self._sensor) else "z"))
             return SensorPlace(to_z_up, np.zeros(3), to_z_up @ found[0], own @ found[1].T @ to_z_up.T)
-        if frame and (frame == self._fixed or frame in NO_SENSOR_FRAMES):
+        one_sided = self._view == "single" and frame in NO_SENSOR_FRAMES
+        if one_sided or (self._view != "full" and frame and frame == self._fixed):
             self._report.warn(
                 f"the clouds are in the frame {frame!r}, and where their sensor is in it is not known: it is taken to "
                 "be at the origin, where it is probably not; set sensor_frame to the sensor's own frame"

@@ -160,7 +160,7 @@ def warnings_of(folder: Path, *messages: tuple[str, str, Any]) -> tuple[list[str
 
 
 def test_depth_images_named_as_pictures_are_no_camera(tmp_path: Path) -> None:
-    picture = make_image(FACTORY, make_header(FACTORY, 0, "eye"), np.zeros((32, 32, 3), np.uint8), "rgb8")
+    picture = make_image(FACTORY, make_header(FACTORY, 0, "eye"), np.full((32, 32, 3), 90, np.uint8), "rgb8")
     said, made = warnings_of(
         tmp_path,
         ("/rgb/image_raw", IMAGE, picture),

@@ -14,9 +14,11 @@ from test.stream.messages.test_frame_tree import FACTORY, SECOND, link, message,
 POINTS = np.array([[2.0, 0.3, -0.4], [3.0, -1.0, 0.5]])
 
 
-def places(frames: FrameTree, fixed: str = "map", sensor: str = "", up: str = "auto") -> tuple[SensorPlaces, Report]:
+def places(
+    frames: FrameTree, fixed: str = "map", sensor: str = "", up: str = "auto", view: str = "auto"
+) -> tuple[SensorPlaces, Report]:
     report = Report()
-    return SensorPlaces(frames, up, fixed, sensor, report), report
+    return SensorPlaces(frames, up, fixed, sensor, report, view), report
 
 
 def find(made: SensorPlaces, frame: str, seconds: float) -> Any:
@@ -76,14 +78,14 @@ def test_a_late_transform_is_waited_for_and_then_one_sentence() -> None:
     assert made.is_awaited("camera", round(11.3 * SECOND))
 
 
-@pytest.mark.parametrize("fixed", ["map", ""])
-def test_clouds_in_the_maps_frame_need_the_sensors(fixed: str) -> None:
-    made, report = places(robot(), fixed=fixed)
+@pytest.mark.parametrize(("fixed", "view"), [("map", "auto"), ("", "single")])
+def test_clouds_in_the_maps_frame_need_the_sensors(fixed: str, view: str) -> None:
+    made, report = places(robot(), fixed=fixed, view=view)
     np.testing.assert_allclose(find(made, "map", 10.5).viewpoint, np.zeros(3))
     (said,) = report.drain_warnings()
     assert "where their sensor is in it is not known" in said
     assert "set sensor_frame" in said
-    known, report = places(robot(), fixed=fixed, sensor="base")
+    known, report = places(robot(), fixed=fixed, sensor="base", view=view)
     place = find(known, "map", 10.5)
     np.testing.assert_allclose(place.viewpoint, [2.0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(place.to_sensor, turned(45.0).T, atol=1e-12)

@@ -56,7 +56,7 @@ class SegmentationSettings(Settings):
         advanced=True,
     )
     min_points: int = setting(60, "minimum number of points of a person", low=50, high=100000, advanced=True)
-    min_score: float = setting(0.5, "minimum score of a cluster to count as a person", low=0.0, high=1.0)
+    min_score: float = setting(0.5, "minimum score of a cluster to count as a person", low=0.0, high=1.0, advanced=True)
 
 
 def segment_people(

@@ -130,7 +130,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         )
         self._frames = FrameTree()
         self._puppets = PuppetPairs(self._model, settings.fusion, self._frames)
-        self._places = SensorPlaces(self._frames, settings.up, settings.fixed_frame, settings.sensor_frame, self.report)
+        self._places = SensorPlaces(
+            self._frames, settings.up, settings.fixed_frame, settings.sensor_frame, self.report, settings.view
+        )
         self._is_fixed = False
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
         self._depth = DepthPairs(self.report)

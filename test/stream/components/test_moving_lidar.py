@@ -68,8 +68,8 @@ def scan(walkers: Walkers, frame: int, roll: float) -> np.ndarray:
         make_box(np.array([3.0, 3.2, 0.8]), np.array([0.4, 0.45, 1.6]), EYE),
     ]
     people = [(bodies[frame].vertices, walkers.source.triangles) for bodies in walkers.people]
-    local = [[((vertices - place) @ turn, triangles) for vertices, triangles in each] for each in (boxes, people)]
-    points, _ = scan_scene(*local, np.random.default_rng(frame), "spinning-32", 0.0)
+    room, crowd = ([((vertices - place) @ turn, faces) for vertices, faces in each] for each in (boxes, people))
+    points, _ = scan_scene(room, crowd, np.random.default_rng(frame), "spinning-32", 0.0)
     return points
 
 
