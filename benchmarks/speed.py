@@ -141,7 +141,7 @@ class Bench:
         return rows
 
     def measure_stages(self) -> list[Row]:
-        """Measure milliseconds of each stage of a tracked cloud without normals and of a whole fit to 10,000 points."""
+        """Measure milliseconds of each stage of tracked clouds without normals, and of whole and one-sided fits."""
         rows = []
         for sides in ("all", "one"):
             tracker, runs = BodyTracker(self._fitter, BodyTrackerSettings(max_points=TRACKED_POINTS)), []
@@ -154,13 +154,19 @@ class Bench:
                 runs.append(spent)
             # The first cloud is searched, the second may compile.
             rows += stages.make_rows(f"tracked, {sides} side{'s' if sides == 'all' else ''}", runs[2:])
-        cloud, runs = self._sample_cloud(10000), []
         fitter = BodyFitter(self._model, FitterSettings(threads=1))
-        for _ in range(STAGE_FITS):
-            with stages.measure_stages(stages.SEARCH) as spent:
-                fitter.fit(*cloud)
-            runs.append(spent)
-        return rows + stages.make_rows("whole fit", runs[1:])
+        seen = self._sample_sensed_cloud(self._body, "one", 0)
+        for path, functions, cloud in (
+            ("whole fit", stages.SEARCH, (*self._sample_cloud(10000), None)),
+            ("one-sided fit", stages.ONE_SIDED_SEARCH, seen),
+        ):
+            runs = []
+            for _ in range(STAGE_FITS):
+                with stages.measure_stages(functions) as spent:
+                    fitter.fit(*cloud[:2], viewpoint=cloud[2])
+                runs.append(spent)
+            rows += stages.make_rows(path, runs[1:])
+        return rows
 
     def measure_fits(self) -> list[Row]:
         """Measure seconds of whole fits to 10,000 points: the defaults, and the thesis's particles and iterations."""

@@ -17,6 +17,8 @@ from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit import fitter as fitting
 from flowing_puppet_ros.body.fit import hypotheses
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.fit.pose_bank import PoseBank
+from flowing_puppet_ros.body.fit.single_view_search import SingleViewSearch
 from flowing_puppet_ros.body.refine import gauss_newton
 from flowing_puppet_ros.body.refine.normal_equations import NormalEquations
 from flowing_puppet_ros.body.search import dpmp
@@ -42,6 +44,7 @@ REFINEMENT: dict[str, list[tuple[Any, str]]] = {
         (one_sided, "find_neighbours"),
         (single_view, "find_neighbours"),
         (OneSidedView, "compare"),
+        (OneSidedView, "find_hidden"),
         (SingleViewCloud, "free_space_term"),
         (SingleViewCloud, "sees"),
     ],
@@ -66,6 +69,11 @@ SEARCH: dict[str, list[tuple[Any, str]]] = {
     "hypotheses": [(hypotheses.BodyHypotheses, "evaluate")],
 }
 """Functions of each stage of a whole fit, besides the search for nearest points and Gauss-Newton."""
+ONE_SIDED_SEARCH: dict[str, list[tuple[Any, str]]] = REFINEMENT | {
+    "bank of poses": [(PoseBank, "find_best")],
+    "limbs sampled again": [(SingleViewSearch, "_resample_limb")],
+}
+"""Functions of each stage of a fit to one side."""
 
 
 @contextmanager

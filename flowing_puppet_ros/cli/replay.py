@@ -64,6 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--topic-map", action="append", default=[], metavar="OLD:=NEW", help="rename a topic of the input (repeatable)"
     )
     parser.add_argument("--params", type=Path, help="YAML file with the parameters of the nodes")
+    parser.add_argument(
+        "--fixed-frame", default="", metavar="FRAME", help="map or odom: track people in it where the sensor moves"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random [0]")
     parser.add_argument("--salvage", action="store_true", help="read what is whole of a truncated or damaged .mcap")
     parser.add_argument(
@@ -86,10 +89,13 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--playback-duration is {arguments.playback_duration:g}: give seconds, more than 0")
     if arguments.seed < 0:
         raise InputError(f"--seed is {arguments.seed}: give 0 or a positive number")
+    settings = read_params(arguments.params) if arguments.params else {}
+    if arguments.fixed_frame:
+        settings["body_fitter"] = {**settings.get("body_fitter", {}), "fixed_frame": arguments.fixed_frame}
     options = ReplayOptions(
         rate=arguments.rate,
         topic_map=parse_topic_map(arguments.topic_map),
-        settings=read_params(arguments.params) if arguments.params else {},
+        settings=settings,
         seed=arguments.seed,
         start_offset=arguments.start_offset,
         playback_duration=arguments.playback_duration,

@@ -119,7 +119,8 @@ class JointFitter:
             lambda tried: run(tried, cloud, targets, close, terms),
         )  # fmt: skip
         held = self._hold_hidden(joints, targets)
-        return self.fitter.assess(run(body, cloud, held, free, terms), cloud)
+        fit = self.fitter.assess(run(body, cloud, held, free, terms), cloud)
+        return replace(fit, reliable=fit.reliable and not self.limbs.contradicts(fit.state, joints))
 
     def hang_anew(
         self, cloud: SingleViewCloud, body: BodyState, joints: LiftedJoints, limbs: Sequence[int]

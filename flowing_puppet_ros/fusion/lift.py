@@ -81,6 +81,7 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
         usable: (N,) which points may be the person's.
     """
     rows = np.flatnonzero(cloud.seen & usable)
+    rows = rows[_find_near(puppet, cloud, rows)]
     offsets = np.array([BEHIND_SURFACE_M.get(_kind(name), 0.0) for name in model.joint_names])
     samples = _collect_samples(puppet, cloud, rows)
     trunk = trunk_rows(model)
@@ -109,6 +110,16 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
     found = np.isfinite(points).all(axis=1)
     confidence = np.where(found, puppet.confidence, 0.0)
     return LiftedJoints(points, rays, confidence, hidden, depth, cloud.camera.centre, choices)
+
+
+def _find_near(puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray) -> Bools:
+    """Return which of the `rows` (N,) of a cloud may lie around a joint of a puppet."""
+    if not puppet.known.any() or not len(rows):
+        return np.zeros(len(rows), dtype=bool)
+    known = puppet.pixels[puppet.known]
+    outside = np.maximum(known.min(axis=0) - cloud.pixels[rows], cloud.pixels[rows] - known.max(axis=0)).max(axis=1)
+    depth = np.maximum(cloud.depth[rows], 1e-3)
+    return np.asarray(outside < np.maximum(MIN_RADIUS_PX, RADIUS_M * cloud.camera.focal / depth))
 
 
 def _find_surfaces(depth: F64) -> F64:

@@ -41,6 +41,8 @@ MAX_GAP_M, MAX_SEEN_GAP_M = 0.06, 0.12
 """Between a joint and its ray, and its place on a surface, beyond which a limb may be in a wrong place."""
 LOST_GAP_M, LOST_SEEN_GAP_M = 0.09, 0.15
 """The same of a tracked body, beyond which its limb is lost."""
+WRONG_GAP_M, WRONG_SEEN_GAP_M = 0.12, 0.2
+"""The same, beyond which a body cannot be relied on."""
 MIN_SEEN_SHARE = 0.9  # probability that a joint is seen, below which its limb may be in a wrong place
 MIN_GAIN_M = 0.0005  # by which a body with a limb hung anew costs less
 MIN_CONFIDENCE = 0.2  # of joints that count
@@ -100,6 +102,12 @@ class LimbSearcher:
         across, gap = self._measure_gaps(body, joints)
         doubtful = np.array([_is_doubtful(row, joints) for row in range(len(joints.points))])
         return self._find_limbs((across > LOST_GAP_M) | (~doubtful & (gap > LOST_SEEN_GAP_M)), joints)
+
+    def contradicts(self, body: BodyState, joints: LiftedJoints) -> bool:
+        """Return whether a joint of a limb is far from where the puppet surely sees it."""
+        across, gap = self._measure_gaps(body, joints)
+        sure = ~np.array([_is_doubtful(row, joints) for row in range(len(joints.points))])
+        return bool(self._find_limbs(sure & ((across > WRONG_GAP_M) | (gap > WRONG_SEEN_GAP_M)), joints))
 
     def _measure_gaps(self, body: BodyState, joints: LiftedJoints) -> tuple[F64, F64]:
         """Return the distances (J,) m of a body's joints from their rays, and from where they were lifted to."""

@@ -76,7 +76,7 @@ def test_the_stages_of_a_tracked_cloud_and_of_a_fit_make_up_their_time(monkeypat
     query = NearestPoints.query
     rows = speed.Bench().measure_stages()
     assert NearestPoints.query is query, "what was measured is as it was"
-    for path in ("tracked, all sides", "tracked, one side", "whole fit"):
+    for path in ("tracked, all sides", "tracked, one side", "whole fit", "one-sided fit"):
         own = [row for row in rows if row["path"] == path]
         assert sum(row["percent"] for row in own) == pytest.approx(100)
         assert {"normal equations", "hands"} & {row["stage"] for row in own}

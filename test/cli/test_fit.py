@@ -37,7 +37,8 @@ def test_every_field_of_the_contract(
     with np.load(summary["output"]) as archive:
         fit = {key: archive[key] for key in archive.files}
     shapes = {
-        "vertices": (count, 3), "part_of_vertex": (count,), "part_names": (16,), "part_rotation": (16, 3, 3),
+        "vertices": (count, 3), "body_vertices": (count, 3), "surface_to_body": (16,),
+        "part_of_vertex": (count,), "part_names": (16,), "part_rotation": (16, 3, 3),
         "part_center": (16, 3), "joint_names": (len(model.joint_names),), "joints": (len(model.joint_names), 3),
         "shape_coefficients": (16, 4), "pose_coefficients": (16, 12), "energy": (), "seconds": (), "confidence": (),
         "reliable": (),
@@ -55,6 +56,13 @@ def test_every_field_of_the_contract(
     np.testing.assert_allclose(squares, np.tile(np.eye(3), (16, 1, 1)), atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(fit["part_rotation"]), 1, atol=1e-5)
     _in_the_input_frame(fit, points)
+    # The joints are those of the body beneath the surface, of one shape, a little way from it.
+    assert np.ptp(fit["all_shape_coefficients"], axis=0).max() == 0
+    apart = np.linalg.norm(fit["vertices"] - fit["body_vertices"], axis=1)
+    assert 0.001 * apart.mean() < 0.03
+    assert summary["surface_to_body_m"] <= 0.001 * apart.mean()
+    assert np.abs(fit["surface_to_body"]).max() <= apart.max()
+    np.testing.assert_allclose(model.joints(fit["body_vertices"]), fit["joints"], atol=0.5)
     assert fit["seconds"] == pytest.approx(summary["seconds"]) and fit["energy"] == summary["energy"]
     assert bool(fit["reliable"]) is summary["reliable"]
     mesh = read_scan(tmp_path / "o" / "a.ply")

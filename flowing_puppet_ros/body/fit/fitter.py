@@ -17,6 +17,7 @@ from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.quality import assess_fit
 from flowing_puppet_ros.body.fit.visibility import BodyVisibility, judge_visibility
+from flowing_puppet_ros.body.refine.body_beneath import BodyBeneath
 from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton
 from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
 from flowing_puppet_ros.body.refine.nonrigid import NonRigidRefinement, NonRigidWeights
@@ -43,9 +44,9 @@ class BodyFit:
     """A fitted body.
 
     Attributes:
-        state: the model's variables.
+        state: the model's variables; of the body beneath the garments where a whole cloud is dense.
         vertices: (V, 3) metres, in the cloud's frame; refined beyond the model's surface where a whole cloud is dense.
-        joints: (J, 3) metres, in the order of the model's `joint_names`.
+        joints: (J, 3) metres, of `state`, in the order of the model's `joint_names`.
         energy: Eq. 50 of the body, lower is better.
         part_confidence: (16,) 0 to 1, how much of each part lies on the cloud.
         confidence: 0 to 1, from the parts on the cloud and the cloud on the body.
@@ -73,6 +74,7 @@ class BodyFitter:
         self.settings = settings
         self.hypotheses = BodyHypotheses(model, settings)
         self._nonrigid = NonRigidRefinement(model.faces, len(model.part_of_vertex), NonRigidWeights())
+        self._beneath = BodyBeneath(model, self.gauss_newton)
 
     @property
     def gauss_newton(self) -> GaussNewton:
@@ -105,7 +107,7 @@ class BodyFitter:
             initial joints, `field`: the same without the search, which would draw what is out of sight to the cloud.
             single view, or sparse: the best of the hypotheses (cases in `BodyHypotheses.search`), with Gauss-Newton.
             dense whole cloud: the same, then the hand poses.
-            dense whole cloud, `nonrigid`: the same, then every vertex by itself.
+            dense whole cloud, `nonrigid`: the same, then every vertex by itself, and the body beneath the garments.
 
         Args:
             points: (N, 3) metres, z up, one person.
@@ -136,7 +138,7 @@ class BodyFitter:
                 return self.assess(state, cloud)
             state = refine_hand_pose(self.model, self.gauss_newton, state, cloud)
             fit = self.assess(state, cloud)
-            return self._refine_nonrigid(fit, cloud) if nonrigid else fit
+            return self._find_beneath(self._refine_nonrigid(fit, cloud), cloud) if nonrigid else fit
 
     def prepare_cloud(
         self,
@@ -246,6 +248,11 @@ class BodyFitter:
         vertices = self._nonrigid.run(self.model.vertices(loose), cloud)
         distance = two_way_distance(vertices, self.model.faces, cloud)
         return replace(fit, vertices=vertices, two_way_distance=distance)
+
+    def _find_beneath(self, fit: BodyFit, cloud: Cloud) -> BodyFit:
+        """Return the fit with the state and joints of the body beneath what is worn; the surface stays."""
+        state = self._beneath.find(fit.state, cloud)
+        return replace(fit, state=state, joints=self.model.joints(self.model.vertices(state)))
 
     def assess_surface(self, state: BodyState, cloud: Cloud) -> BodyFit:
         """Return the fit of a body to a cloud, with refined vertices where the cloud is dense and whole."""

@@ -54,6 +54,8 @@ ROUGH = RefineWeights(sigma_start=0.2, sigma_end=0.08, iterations=8)
 # Share of the particles and rounds in a search for the warm-up.
 RESTART_SHARE = 2.0  # of particles and iterations, in a search after the first
 WARM_UP_SHARE = 0.1
+# Cost up to which a body is not wrong as a whole: without its feet, one that faces backwards may cost twice as much.
+SURE_COST_M = 0.01
 # Cost of a body turned to the other heading, in costs of the body itself, from which on no search around it helps.
 MAX_TURNED_RATIO = 1.3
 
@@ -154,10 +156,12 @@ class BodyHypotheses:
             candidates = self._search_both_headings(cloud, grid, rng, shown, RESTART_SHARE if number else 1.0)
             if quick and self._is_close(candidates[0]):
                 return self.refine(candidates[0].state, cloud, none, steps)
+            turned_is_near = candidates[1].cost < MAX_TURNED_RATIO * candidates[0].cost
             for candidate in candidates:
                 tried.append(self.repair_limbs(candidate, cloud, grid, rng))
                 best = min(tried, key=lambda candidate: candidate.cost)
-                if self._is_close(best) and best.quality.reliable:
+                contested = candidate is candidates[0] and best.cost > SURE_COST_M and turned_is_near
+                if self._is_close(best) and best.quality.reliable and not contested:
                     return self.refine(best.state, cloud, none, steps)
         return self.refine(best.state, cloud, none, steps)
 

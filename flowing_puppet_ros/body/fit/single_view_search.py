@@ -28,7 +28,7 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import parallel_map
 
 STARTS, KEPT_STARTS = 16, 12  # bodies of the bank that are refined, and those of them that are refined further
-KEPT, FINISHED = (8, 4, 2), 2  # bodies whose limbs are sampled again in each round, and those that are finished
+KEPT, FINISHED = (8, 6, 4), 3  # bodies whose limbs are sampled again in each round, and those that are finished
 LIMB_SAMPLES = 600  # poses sampled for each limb in a round
 # Parts of an arm and of a leg from the trunk outwards, without the side.
 LIMB_CHAINS = (("shoulder", "upper_arm", "lower_arm", "hand"), ("upper_leg", "lower_leg", "foot"))

@@ -32,11 +32,13 @@ class ColumnIndex:
         """Sort points (N, 3) m, N > 0, into cells."""
         low = np.maximum(points[:, :2].min(axis=0), np.median(points[:, :2], axis=0) - CELL_M * MAX_CELLS / 2)
         shape = np.minimum(((points[:, :2].max(axis=0) - low) / CELL_M).astype(np.int64) + 1, MAX_CELLS)
-        return cls(*sort_into_cells(points, low, shape, CELL_M), low, shape)
+        order, first = sort_into_cells(points, low, shape, CELL_M)
+        return cls(order, first, low, shape)
 
     def find_near(self, points: np.ndarray, place: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
         """Return the indices (K,) of the points (N, 3) m within `radius` of a place (2,) m, and how far they are."""
-        return _find_near(points, self.order, self.first, self.low, self.shape, place[0], place[1], radius)
+        rows, away = _find_near(points, self.order, self.first, self.low, self.shape, place[0], place[1], radius)
+        return rows, away
 
 
 @njit(cache=True, nogil=True)

@@ -23,6 +23,7 @@ from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCl
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.body.track.person_belief import PersonBelief
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
+from flowing_puppet_ros.body.upright.person_finder import JudgedFit
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.reporting import Report
@@ -39,8 +40,8 @@ REFIT_INTERVAL_NS = 5_000_000_000  # from one full fit of an unreliable body to 
 TURN_INTERVAL_NS = 1_000_000_000  # between attempts to turn a body round that walks backwards
 BODY_STRIDE = 8  # every so many vertices stand for a body
 
-Judge = Callable[[PersonCloud, BodyFit], tuple[float, float]]
-"""What a scan says about a body: the probability that it is a person, and that it is one and close."""
+Judge = Callable[[PersonCloud, BodyFit], JudgedFit]
+"""What a scan says about a body, or about a better one that it has instead."""
 
 
 @dataclass(frozen=True)
@@ -81,20 +82,25 @@ class _BodyTrack:
         self.proven = self.proven or fit.reliable
         return self.proven and (self.belief is None or self.belief.decide())
 
-    def weigh(self, person: PersonCloud, fit: BodyFit, judge: Judge) -> None:
-        """Ask a scan whether it is a person, unless that was asked lately or too little is seen."""
+    def start(self, person: PersonCloud, fit: BodyFit) -> None:
+        """Start with a body that was found in the person's cloud, and what was said about it there."""
+        self.tracker.start(person, fit)
+        self.fitted = person.stamp
+        if person.proven:
+            self.belief = PersonBelief(person.middle[:2])
+            self.belief.add(person.score, fit.confidence, self.stamp)
+
+    def weigh(self, person: PersonCloud, fit: BodyFit, judge: Judge) -> BodyFit:
+        """Ask a scan whether it is a person, unless that was asked lately or too little is seen; return its body."""
         if self.belief is None:
             self.belief = PersonBelief(person.middle[:2])
         self.belief.visit(person.middle)
         if self.belief.is_due(self.stamp) and not self.tracker.hidden:
-            self.belief.add(*judge(person, fit), self.stamp)
-
-    def begin(self, person: PersonCloud, fit: BodyFit | None) -> BodyFit | None:
-        """Return the body as the first of a new person; a doubtful one has its full fit as soon as may be."""
-        if fit is None or self.tracker.last is not None:
-            return None
-        self.tracker.start(person, fit)
-        self.fitted = person.stamp - (0 if fit.reliable else REFIT_INTERVAL_NS)
+            judged = judge(person, fit)
+            self.belief.add(judged.probability, judged.confidence, self.stamp)
+            if judged.fit is not fit:
+                self.tracker.start(person, judged.fit)
+            return judged.fit
         return fit
 
     def show(self, fit: BodyFit) -> TrackedBody:
@@ -174,8 +180,7 @@ class MultiBodyTracker:
             stamp: of the cloud in nanoseconds; one before the last restarts the tracker.
             seed: of what is random in this cloud.
             executor: where full fits run; None: in line.
-            first: bodies of new people that are known already, by their index in `people`: on an executor they are
-                shown at once, in line a full fit is made at once.
+            first: bodies of new people that are known already, by their index in `people`.
             judge: tells whether a body is a person; who is none is not shown, and forgotten in the end.
 
         Returns:
@@ -186,20 +191,23 @@ class MultiBodyTracker:
         self._stamp = stamp
         self._adopt_finished_fit()
         matched = self._associate(people, stamp)
-        known = {} if executor is None else {id(people[index]): fit for index, fit in first.items()}
-        fitted = parallel_map(
-            lambda pair: pair[0].begin(pair[1], known.get(id(pair[1]))) or _track(pair),
-            matched,
-            self._threads,
-        )
+        started: dict[int, BodyFit] = {}
+        for track, person in matched:
+            known = next((fit for index, fit in first.items() if people[index] is person), None)
+            if known is not None and track.tracker.last is None:
+                track.start(person, known)
+                started[track.number] = known
+        followed = [pair for pair in matched if pair[0].number not in started]
+        tracked = iter(parallel_map(_track, followed, self._threads))
+        fitted = [started[track.number] if track.number in started else next(tracked) for track, _ in matched]
         bodies: list[TrackedBody] = []
         waiting: list[tuple[_BodyTrack, SeededCloud]] = []
         for (track, person), fit in zip(matched, fitted, strict=True):
             if isinstance(fit, InputError):
                 self._report.count_unusable(fit)
                 continue
-            if judge is not None and fit is not None:
-                track.weigh(person, fit, judge)
+            if judge is not None and fit is not None and track.number not in started:
+                fit = track.weigh(person, fit, judge)
             if fit is not None and track.prove(fit):
                 bodies.append(track.show(fit))
             # A full fit to the little that is seen of a hidden person would bend the body.

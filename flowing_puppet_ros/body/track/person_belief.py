@@ -9,7 +9,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 
-SURE, CONFIRMED, MOVED_CONFIRMED, HOPELESS = 0.85, 0.6, 0.35, 0.25
+SURE, CONFIRMED, MOVED_CONFIRMED, HOPELESS = 0.8, 0.55, 0.3, 0.2
 """Mean probabilities of a person: from which one scan is enough; from which several are; the same for what has moved;
 and below which several show that it is none."""
 SEVERAL = 2  # scans

@@ -20,7 +20,7 @@ from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, se
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
-from flowing_puppet_ros.body.upright.person_finder import FoundBody, PersonFinder, PersonFinderSettings
+from flowing_puppet_ros.body.upright.person_finder import FoundBody, JudgedFit, PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
@@ -312,7 +312,7 @@ class SceneTracker:
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
 
-    def _judge(self, person: PersonCloud, fit: BodyFit) -> tuple[float, float]:
+    def _judge(self, person: PersonCloud, fit: BodyFit) -> JudgedFit:
         """Return what the cloud that was searched last says about a body: see `PersonFinder.judge`."""
         assert person.rows is not None
         return self._finder.judge(person, np.searchsorted(self._searched, np.sort(person.rows)), fit)

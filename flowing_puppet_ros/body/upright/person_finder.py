@@ -18,7 +18,7 @@ from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
 from flowing_puppet_ros.body.upright.person_model import PersonModel
 from flowing_puppet_ros.body.upright.rejected_places import RejectedPlaces
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
-from flowing_puppet_ros.body.upright.upright_fit import UprightFit, UprightFitter
+from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS, UprightFit, UprightFitter
 from flowing_puppet_ros.body.upright.verification import weigh_fit
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
@@ -27,6 +27,8 @@ MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
 """Points, probability by shape, and score of what a full search is made for though no upright body explains it."""
 MIN_WORTHWHILE = 0.15
 """Probability by the bank's best body from which on its other bodies are refined too."""
+MIN_TRACKED = 0.5
+"""Probability of a tracked body below which a new one is tried where few points show the person."""
 SAME_PERSON_M = 0.35  # between the middles of two bodies that are one person
 
 
@@ -35,7 +37,7 @@ class PersonFinderSettings(Settings):
     """Settings of `PersonFinder`."""
 
     min_points: int = setting(25, "minimum number of points of a person", low=15, high=100000)
-    min_probability: float = setting(0.35, "minimum probability of a body to be a person", low=0.0, high=1.0)
+    min_probability: float = setting(0.3, "minimum probability of a body to be a person", low=0.0, high=1.0)
     min_filter: float = setting(
         0.3, "minimum probability, by its shape alone, of what is fitted", low=0.0, high=1.0, advanced=True
     )
@@ -168,29 +170,31 @@ class PersonFinder:
                 people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
         return people
 
-    def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> tuple[float, float]:
+    def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
 
-        Returns:
-            The probability that it is a person, and that it is one whose joints are within 10 cm. What is rejected is
-            remembered as by `find`.
+        Where it explains few points badly, a new upright body may be better, and is returned instead. What is rejected
+        is remembered as by `find`.
         """
         if self._scan is None or not len(rows):
-            return 0.0, 0.0
+            return JudgedFit(0.0, 0.0, fit)
         scene, rays = self._scan
         candidate = Candidate.of(scene, rows)
         window = rays.find_window(person.points)
-        probability = float(
-            PersonModel.load().trees.predict(describe_candidates([candidate], scene, rays.viewpoint))[0]
-        )
+        shape = describe_candidates([candidate], scene, rays.viewpoint)
+        probability = float(PersonModel.load().trees.predict(shape)[0])
         try:
             cloud = self.upright.make_cloud(person.points, rays.viewpoint, rays.find_unknown(person.points, window))
         except InputError:  # the sensor stands in it
-            return 0.0, 0.0
+            return JudgedFit(0.0, 0.0, fit)
         judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, scene, rays, window)
+        if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
+            other = self.upright.fit(cloud, candidate.floor)
+            again = self._weigh(other, cloud, candidate, probability, scene, rays, window)
+            judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
             self._rejected.add(candidate, person.stamp)
-        return judged.probability, judged.confidence
+        return judged
 
     def _weigh(
         self,

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -231,14 +232,14 @@ def _read_pixels(path: Path) -> np.ndarray:
     if path.suffix.lower() in (".npy", ".npz"):
         pixels = _load_array(path)
     else:
-        try:
-            pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        except cv2.error:  # not every OpenCV reads .exr
-            pixels = None
-        if pixels is None and path.suffix.lower() == ".exr":
+        image = None
+        with suppress(cv2.error):  # not every OpenCV reads .exr
+            image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        if image is None and path.suffix.lower() == ".exr":
             raise InputError(f"{path} is not read by this OpenCV; convert it to .npy or a float .tiff, in metres")
-        if pixels is None:
+        if image is None:
             raise InputError(f"{path} is not an image, or damaged; give a 16-bit depth image")
+        pixels = image
         if pixels.ndim == 3:
             raise InputError(f"{path} is a picture, not depth; give the 16-bit depth image, and this one as --color")
         if pixels.dtype == np.uint8:

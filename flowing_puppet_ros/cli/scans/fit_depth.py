@@ -96,7 +96,7 @@ def _fit_puppets(view: DepthView, frame: ScanFrame, source: Path, fitter: BodyFi
     rows = slice(None, None, 1 + len(view.points) // MAX_POINTS)
     camera = view.turn_camera(frame.rotation)
     cloud = SeenCloud.of(frame.to_body(view.points[rows]), camera)
-    image = view.image.turn(frame.rotation).take(np.arange(len(view.points))[rows])
+    image = view.image.turn(frame.rotation).thin(np.arange(len(view.points))[rows])
     found = PeopleFitter(fitter, FusionSettings()).fit_people(cloud, puppets, image)
     if not found:
         raise PuppetError(

@@ -17,6 +17,7 @@ from tqdm import tqdm
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame, measure_stature
 from flowing_puppet_ros.body.measurements.measure import DEFINITIONS, measure_fit
+from flowing_puppet_ros.body.refine.body_beneath import measure_gaps, measure_part_gaps
 from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
 from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit, has_size_of_person
 from flowing_puppet_ros.cli.scans.fit_depth import fit_view, read_view
@@ -27,6 +28,7 @@ from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
+MIN_WORN_M = 0.008  # mean distance between surface and body from which on garments are told of
 WRITTEN_SHAPE_COEFFICIENTS = 4  # of each part, as in the thesis; all are in `all_shape_coefficients`
 
 
@@ -134,6 +136,7 @@ def write_result(
     """Write a fit and return its summary."""
     output = options.out / f"{stem}.npz"
     measured = _measure(model, found) if options.measure else {}
+    gap = _measure_gap(model, found)
     try:
         _write_fit(output, model, found, seconds, measured)
     except OSError as error:
@@ -146,6 +149,7 @@ def write_result(
         "confidence": fit.confidence,
         "reliable": fit.reliable,
         "two_way_distance_m": fit.two_way_distance * unit.metres / unit.fitted,
+        "surface_to_body_m": gap,
         "unit": unit.name,
         "metres_per_unit": unit.metres,
         "unit_clear": found.unit_clear,
@@ -153,7 +157,7 @@ def write_result(
         "up": np.round(found.frame.up, 6).tolist(),
         "up_clear": found.up_clear,
         "view": view,
-        "notes": [*notes, *_describe_frame(found)],
+        "notes": [*notes, *_describe_frame(found), *_describe_garments(gap)],
         **({"measurements": measured} if measured else {}),
         "seconds": seconds,
     }
@@ -178,8 +182,31 @@ def _finish_all(
 def _measure(model: StitchedPuppet, found: FrameFit) -> dict[str, float]:
     """Return the measurements of a person in the unit of the scan's metres: a child was fitted as an adult."""
     shrink = found.unit.metres / found.unit.fitted
-    measured = measure_fit(model, found.fit.state, found.fit.vertices)
+    measured = measure_fit(model, found.fit.state, _choose_skin(model, found))
     return {name: value * shrink ** DEFINITIONS[name].dimension for name, value in measured.items()}
+
+
+def _measure_gap(model: StitchedPuppet, found: FrameFit) -> float:
+    """Return the mean distance between surface and body over all vertices, metres of the scan."""
+    gaps = measure_gaps(model, model.vertices(found.fit.state), found.fit.vertices)
+    return float(np.abs(gaps).mean()) * found.unit.metres / found.unit.fitted
+
+
+def _choose_skin(model: StitchedPuppet, found: FrameFit) -> np.ndarray:
+    """Return what is measured (V, 3): the surface, or the body beneath where much is worn."""
+    body = model.vertices(found.fit.state)
+    worn = np.abs(measure_gaps(model, body, found.fit.vertices)).mean() > MIN_WORN_M
+    return body if worn else found.fit.vertices
+
+
+def _describe_garments(gap: float) -> list[str]:
+    """Return a sentence where the surface is not the body's."""
+    if gap < MIN_WORN_M:
+        return []
+    return [
+        f"the surface lies {100 * gap:.1f} cm from the body beneath in the mean: vertices are the surface, garments and"
+        " hair included, body_vertices and joints are the body's"
+    ]
 
 
 def _refuse_no_person(person: ScanPerson, found: FrameFit) -> None:
@@ -228,8 +255,11 @@ def _write_fit(
     """Write the fit, in the scan's frame and unit, as `output` and as a mesh beside it."""
     frame, fit = found.frame, found.fit
     vertices = to_smallest_float(frame.to_scan(fit.vertices))
+    body = model.vertices(fit.state)
     arrays: dict[str, Any] = {
         "vertices": vertices,
+        "body_vertices": frame.to_scan(body).astype(vertices.dtype),
+        "surface_to_body": measure_part_gaps(model, body, fit.vertices) / frame.scale,
         "faces": model.faces,
         "part_of_vertex": model.part_of_vertex,
         "part_names": np.array(model.tree.names),

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.evaluate.body.garments import OUTFITS, Tailor
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
 from flowing_puppet_ros.evaluate.body.synthetic_scans import (
     DepthSettings,
@@ -24,10 +25,11 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 
 WHOLE_SCAN_POINTS = 10000
 # One person in so many is in a hard pose; 0 for none.
-HARD_EVERY = {"whole": 2, "single": 4, "lidar": 0}
+HARD_EVERY = {"whole": 2, "single": 4, "lidar": 0, "clothed": 0}
 KINDS = tuple(HARD_EVERY)
 DEPTH_DISTANCE_M, DEPTH_HEIGHT_M = (2.0, 4.0), (0.8, 1.8)  # minimum and maximum of the sensor
 LIDAR_DISTANCE_M, LIDAR_HEIGHT_M = (4.5, 7.5), (1.6, 1.9)  # gives 300 to 800 points on a person
+CLOTHED_NOISE_M = 0.001
 MIN_BAD_ERROR_M = 0.04  # mean vertex error of a body with a misplaced limb
 VISIBILITY_TOLERANCE_M = 0.005  # a vertex this far behind the first hit of its ray is still visible
 
@@ -62,16 +64,20 @@ class BodyScore:
 def draw_scans(
     kind: str, source: BodySource, count: int, seed: int
 ) -> Iterator[tuple[TrueBody, RaycastScene, SensedCloud]]:
-    """Draw `count` people and scan them: whole, from a single side by a depth camera, or by a LiDAR.
+    """Draw `count` people and scan them: whole, bare or clothed, from one side by a depth camera, or by a LiDAR.
 
     Every pose is hard when the source has no motion capture.
     """
     rng = np.random.default_rng(seed)
     every = HARD_EVERY[kind]
+    tailor = Tailor(source) if kind == "clothed" else None
     for index in range(count):
         body = source.draw_body(rng, hard=not source.has_mocap or (every > 0 and index % every == every - 1))
         scene = RaycastScene(body.vertices, source.triangles)
-        if kind == "whole":
+        if tailor is not None:
+            worn = RaycastScene(*tailor.dress(body, OUTFITS[index % len(OUTFITS)], rng))
+            yield body, worn, scan_whole(worn, rng, WHOLE_SCAN_POINTS, noise=CLOTHED_NOISE_M)
+        elif kind == "whole":
             yield body, scene, scan_whole(scene, rng, WHOLE_SCAN_POINTS)
         elif kind == "single":
             eye = draw_sensor_position(rng, body.vertices, DEPTH_DISTANCE_M, DEPTH_HEIGHT_M)
@@ -82,22 +88,31 @@ def draw_scans(
 
 
 def score_fit(
-    fitter: BodyFitter, body: TrueBody, scene: RaycastScene, cloud: SensedCloud, joint_names: Sequence[str]
+    fitter: BodyFitter,
+    body: TrueBody,
+    scene: RaycastScene,
+    cloud: SensedCloud,
+    joint_names: Sequence[str],
+    beneath: bool = False,
 ) -> tuple[BodyFit, BodyScore]:
-    """Fit a model to a synthetic cloud and compare with the truth; `joint_names` name the body's joints."""
+    """Fit a model to a synthetic cloud and compare with the truth; `joint_names` name the body's joints.
+
+    The surface is compared, or the body `beneath` what is worn.
+    """
     started = time.process_time()
     fit = fitter.fit(cloud.points, cloud.normals, viewpoint=cloud.viewpoint)
     seconds = time.process_time() - started
     truth = body.template_vertices(fitter.model.name)
     joints = body.joints[[list(joint_names).index(name) for name in fitter.model.joint_names]]
-    error = np.linalg.norm(fit.vertices - truth, axis=1)
+    vertices = fitter.model.vertices(fit.state) if beneath else fit.vertices
+    error = np.linalg.norm(vertices - truth, axis=1)
     return fit, BodyScore(
         hard=body.hard,
         points=len(cloud.points),
         vertex_error=float(error.mean()),
         visible_error=float(error[find_visible_vertices(scene, truth, cloud.viewpoint)].mean()),
         joint_error=float(np.linalg.norm(fit.joints - joints, axis=1).mean()),
-        flipped=is_flipped(fit.vertices, truth, fitter.model),
+        flipped=is_flipped(vertices, truth, fitter.model),
         two_way_distance=fit.two_way_distance,
         confidence=fit.confidence,
         reliable=fit.reliable,

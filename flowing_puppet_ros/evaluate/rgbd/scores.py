@@ -10,6 +10,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.evaluate.body.bodies import is_flipped
 from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS
 from flowing_puppet_ros.evaluate.rgbd.views import RgbdFrame
@@ -17,6 +18,8 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 
 MIN_WRONG_M = 0.06  # mean error of the vertices, or of the seen joints of people who are cut off, of a wrong body
 MIN_LOST_M = 0.15  # error of a seen elbow or wrist that is lost
+MAX_HIT_M = 0.10  # error of a joint that is where it is said to be; a joint's confidence is the probability of it
+MAX_SURFACE_GAP_M = 0.02  # from the true surface at its pixel to a vertex that is seen
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +30,7 @@ class RgbdScore:
         cut: one of CUTS.
         found: whether there is a body.
         vertex_error: over all vertices of the template.
+        seen_vertex_error, hidden_vertex_error: over those that the depth camera sees, and over the others.
         seen_error, unseen_error: over the limbs' joints that are in view, and over the others, see `SeenKeypoints`.
         visible_error: over the joints that nothing hides, not even the person's own body.
         stature_error: fitted minus true.
@@ -35,11 +39,15 @@ class RgbdScore:
         lost_arms, seen_arms: elbows and wrists in view that are off by more than 15 cm, and all in view.
         reliable: as reported by the fit.
         seconds: processor time of the fit.
+        joints, hits: limbs' joints by `Visibility` (inferred, near, seen), and those of them that are off by less than
+            10 cm.
     """
 
     cut: str
     found: bool
     vertex_error: float
+    seen_vertex_error: float
+    hidden_vertex_error: float
     seen_error: float
     unseen_error: float
     visible_error: float
@@ -50,6 +58,8 @@ class RgbdScore:
     seen_arms: int
     reliable: bool
     seconds: float
+    joints: tuple[int, int, int] = (0, 0, 0)
+    hits: tuple[int, int, int] = (0, 0, 0)
 
 
 def score_body(
@@ -64,19 +74,24 @@ def score_body(
     nan = float("nan")
     if fit is None:
         number = int(arms.sum())
-        return RgbdScore(cut, False, nan, nan, nan, nan, nan, False, True, number, number, False, seconds)
+        return RgbdScore(
+            cut, False, nan, nan, nan, nan, nan, nan, nan, False, True, number, number, False, seconds
+        )  # fmt: skip
     vertices = fit.vertices @ to_world[:3, :3].T + to_world[:3, 3]
-    joints = (fit.joints @ to_world[:3, :3].T + to_world[:3, 3])[
-        [model.joint_names.index(name) for name in LIMB_JOINTS]
-    ]
+    rows = [model.joint_names.index(name) for name in LIMB_JOINTS]
+    joints = (fit.joints @ to_world[:3, :3].T + to_world[:3, 3])[rows]
     template = truth.template_vertices(model.name)
-    vertex_error = float(np.linalg.norm(vertices - template, axis=1).mean())
+    vertex_errors = np.linalg.norm(vertices - template, axis=1)
+    vertex_error, shown = float(vertex_errors.mean()), _find_shown(frame, person, template)
+    visibility = fit.visibility.joints[rows]
     error = np.linalg.norm(joints - frame.joints[person], axis=1)
     seen_error = _mean(error[seen.in_view])
     return RgbdScore(
         cut=cut,
         found=True,
         vertex_error=vertex_error,
+        seen_vertex_error=_mean(vertex_errors[shown]),
+        hidden_vertex_error=_mean(vertex_errors[~shown]),
         seen_error=seen_error,
         unseen_error=_mean(error[~seen.in_view]),
         visible_error=_mean(error[seen.visible]),
@@ -87,6 +102,8 @@ def score_body(
         seen_arms=int(arms.sum()),
         reliable=fit.reliable,
         seconds=seconds,
+        joints=_count_levels(visibility),
+        hits=_count_levels(visibility[error < MAX_HIT_M]),
     )
 
 
@@ -96,12 +113,16 @@ def summarise_rgbd(scores: Sequence[RgbdScore]) -> dict[str, float | str]:
     def mean(name: str) -> float:
         return 100 * _mean(np.array([getattr(score, name) for score in scores]))
 
+    joints, hits = (np.array([getattr(score, name) for score in scores]).sum(axis=0) for name in ("joints", "hits"))
+    share = hits / np.maximum(joints, 1)
     stature = 100 * np.array([score.stature_error for score in scores])
     return {
         "cut": scores[0].cut,
         "bodies": len(scores),
         "missed": sum(not score.found for score in scores),
         "vertices_cm": mean("vertex_error"),
+        "seen_vertices_cm": mean("seen_vertex_error"),
+        "hidden_vertices_cm": mean("hidden_vertex_error"),
         "seen_cm": mean("seen_error"),
         "visible_cm": mean("visible_error"),
         "unseen_cm": mean("unseen_error"),
@@ -112,7 +133,26 @@ def summarise_rgbd(scores: Sequence[RgbdScore]) -> dict[str, float | str]:
         "unreliable": sum(not score.reliable for score in scores),
         "wrong_reliable": sum(score.wrong and score.reliable for score in scores),
         "seconds": float(np.mean([score.seconds for score in scores])),
+        **{
+            f"{level.name.lower()}_hits": float(share[level]) if joints[level] else float("nan") for level in Visibility
+        },
     }
+
+
+def _find_shown(frame: RgbdFrame, person: int, vertices: F64) -> np.ndarray:
+    """Return which vertices (V, 3) m of a true body, in the world, the depth camera sees, (V,) bool."""
+    pixels, depth = frame.cameras.depth.project(vertices)
+    height, width = frame.true_depth.shape
+    column, row = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    column, row = np.where(inside, column, 0), np.where(inside, row, 0)
+    on_surface = np.abs(frame.true_depth[row, column] - depth) < MAX_SURFACE_GAP_M
+    return np.asarray(inside & on_surface & (frame.person[row, column] == person))
+
+
+def _count_levels(visibility: np.ndarray) -> tuple[int, int, int]:
+    inferred, near, seen = (int(np.count_nonzero(visibility == level)) for level in Visibility)
+    return inferred, near, seen
 
 
 def _mean(values: F64) -> float:

@@ -18,7 +18,7 @@ def tabulate_reliability(people: Sequence[PersonScore], ghosts: Sequence[GhostSc
     known = [person for person in people if person.found and np.isfinite(person.joint_error)]
     if not known:
         return []
-    confidence = np.array([each.confidence for each in (*known, *ghosts)])
+    confidence = np.array([person.confidence for person in known] + [ghost.confidence for ghost in ghosts])
     right = np.array([person.joint_error < CLOSE_M for person in known] + [False] * len(ghosts))
     place = np.digitize(confidence, BIN_EDGES[1:-1])
     rows: list[dict[str, float | str]] = []

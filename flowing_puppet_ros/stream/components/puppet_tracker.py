@@ -43,6 +43,10 @@ from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 _OF_A_NEW_TRACKER = {"model", "parts", "flow.max_side", "tracker.seed", "ros4hri.publish", "ros4hri.namespace"}
 
 
+BLACK_STRIDE, MIN_BRIGHTEST = 8, 12
+"""Rows and columns between the pixels of which the brightest tells whether an image is black, of 255."""
+
+
 @dataclass(frozen=True)
 class PuppetTrackerSettings(Settings):
     """Settings of the tracker, its flow and its detector, and of what it waits for, draws and publishes."""
@@ -185,6 +189,9 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
 
     def _step(self, stamp: int, message: Any) -> Output:
         image, flow = decode_image(message), self._flow(stamp)
+        if image[::BLACK_STRIDE, ::BLACK_STRIDE].max() < MIN_BRIGHTEST:
+            self.counters["black images"] += 1
+            self.report.warn("an image is black, and nobody can be found in it: see to the exposure and the lens cover")
         people = self._decode_detections(stamp, (image.shape[1], image.shape[0]))
         if people is None and "detections" not in self._expected and self.settings.detection.source != "none":
             if self.settings.detection.source == "auto" and isinstance(self._live, LiveTracker):

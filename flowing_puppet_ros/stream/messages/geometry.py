@@ -17,7 +17,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.model.rotation import exp, log, quaternion
+from flowing_puppet_ros.model.rotation import exp, log
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, MessageFactory
 from flowing_puppet_ros.units import NANOSECONDS
 
@@ -75,8 +75,22 @@ def rotation_matrix(q: Sequence[float] | Array) -> F64:
 
 def make_quaternion(factory: MessageFactory, rotation: Array) -> Any:
     """Return the geometry_msgs/Quaternion of a rotation matrix (3, 3)."""
-    w, x, y, z = (float(c) for c in quaternion(rotation))
+    w, x, y, z = _to_quaternion(np.asarray(rotation, dtype=np.float64).tolist())
     return factory.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def _to_quaternion(m: list[list[float]]) -> list[float]:
+    """Return w, x, y, z, w >= 0, of one rotation matrix; `model.rotation.quaternion` is for many at a time."""
+    (a, b, c), (d, e, f), (g, h, i) = m
+    rows = (
+        (1 + a + e + i, h - f, c - g, d - b),
+        (h - f, 1 + a - e - i, b + d, c + g),
+        (c - g, b + d, 1 - a + e - i, f + h),
+        (d - b, c + g, f + h, 1 - a - e + i),
+    )
+    row = max(range(4), key=lambda k: rows[k][k])
+    length = math.copysign(math.sqrt(sum(each * each for each in rows[row])), rows[row][0])
+    return [each / length for each in rows[row]]
 
 
 def make_pose(factory: MessageFactory, position: Array, rotation: Array) -> Any:

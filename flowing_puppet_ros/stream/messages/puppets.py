@@ -20,8 +20,12 @@ if TYPE_CHECKING:
 
 _MESSAGES = "flowing_puppet_msgs/msg/"
 
-JOINT_CONFIDENCE = np.array([0.3, 0.8, 1.0])
-"""Confidence of a joint that is inferred, near the cloud, or seen, relative to that of the body."""
+JOINT_CONFIDENCE = np.array([0.48, 0.97, 0.97])
+"""Probability that a joint that is inferred, near the cloud, or seen is within 10 cm.
+
+Measured on 60 synthetic people in colour and depth, whole and cut off, who are not those that tables are made of.
+`evaluate rgbd` prints such shares.
+"""
 
 type JointPosition = tuple[float, float, float, float]
 """x, y, z in metres, and a confidence in [0, 1]."""
@@ -108,7 +112,8 @@ def make_body(factory: MessageFactory, model: StitchedPuppet, body: TrackedBody)
             )
         )
     visibility = fit.visibility.joints
-    confidence = fit.confidence * JOINT_CONFIDENCE[visibility]
+    # That of a body that may be wrong as a whole lowers it further.
+    confidence = (1.0 if fit.reliable else fit.confidence) * JOINT_CONFIDENCE[visibility]
     return factory.make(
         _MESSAGES + "Body",
         id=body.id,

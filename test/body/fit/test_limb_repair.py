@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Limbs that were put in wrong places on the cloud of a man made of capsules, and come back."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from capsule_man import Joints, cloud_of, joints_of  # type: ignore[import-not-f
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
-from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses, FitterSettings
+from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings
 from flowing_puppet_ros.body.fit.quality import assess_fit
 from flowing_puppet_ros.body.search.limb_search import limb_groups
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
@@ -115,3 +116,43 @@ def test_groups_hold_every_limb_from_the_trunk_outwards(model: StitchedPuppet) -
         for at, part in enumerate(group):
             assert model.tree.parents[part] in (0, *group[:at])
     assert set(groups[-1]) == set(range(2, 16))
+
+
+@dataclass
+class FoundQuality:
+    """What a search asks a quality for."""
+
+    cost: float
+    reliable: bool = True
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "repaired_second", "chosen"),
+    [
+        (0.0135, 0.0161, 0.008, 1),  # may face the other way: both are repaired, and the closer one is taken
+        (0.0135, 0.0200, 0.008, 0),  # clearly not
+        (0.0060, 0.0061, 0.001, 0),  # close enough
+    ],
+)
+def test_a_body_that_may_face_the_other_way_is_compared_with_that_one_repaired(
+    model: StitchedPuppet,
+    cloud: Cloud,
+    monkeypatch: pytest.MonkeyPatch,
+    first: float,
+    second: float,
+    repaired_second: float,
+    chosen: int,
+) -> None:
+    states = [model.rest_state(), model.rest_state()]
+    repaired = {id(states[0]): first, id(states[1]): repaired_second}
+
+    def candidate(state: BodyState, cost: float) -> BodyCandidate:
+        quality: Any = FoundQuality(cost)
+        return BodyCandidate(state, quality)
+
+    found = [candidate(states[0], first), candidate(states[1], second)]
+    own = BodyHypotheses(model, FitterSettings())
+    monkeypatch.setattr(own, "_search_both_headings", lambda *_: found)
+    monkeypatch.setattr(own, "repair_limbs", lambda body, *_: candidate(body.state, repaired[id(body.state)]))
+    monkeypatch.setattr(own, "refine", lambda state, *_: state)
+    assert own.search(cloud, np.random.default_rng(0), lambda _: None) is states[chosen]

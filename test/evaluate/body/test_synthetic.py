@@ -9,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evaluate.body.garments import FEET, Tailor
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.body.synthetic_scans import (
     DepthSettings,
@@ -149,3 +150,27 @@ def test_poses_of_people_need_motion_capture() -> None:
         source.draw_body(np.random.default_rng(0), hard=False)
     with pytest.raises(InputError, match="longer motion capture"):
         source.draw_motion(np.random.default_rng(0), 4, 20.0)
+
+
+@LEARN
+def test_garments_cover_their_bones_and_lie_outside_of_the_body(source: BodySource) -> None:
+    body = source.draw_body(np.random.default_rng(2), hard=False)
+    tailor, rng = Tailor(source), np.random.default_rng(0)
+    bare, triangles = tailor.dress(body, (), rng)
+    np.testing.assert_array_equal(bare, body.vertices)
+    dressed, _ = tailor.dress(body, ("jacket", "shoes"), rng)
+    moved = dressed - body.vertices
+    bone = np.array(source.bone_names)[source.bone_of_vertex]
+    assert np.median(np.linalg.norm(moved[bone == "Spine1"], axis=1)) > 0.015
+    assert moved[bone == "Head"].any(axis=1).mean() < 0.1 and np.median(moved[np.isin(bone, FEET), 2]) < -0.01
+    corners = body.vertices[triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    outward = (moved[triangles].mean(axis=1) * normals).sum(axis=1)[np.isin(bone[triangles], ("Spine1",)).all(axis=1)]
+    assert (outward > 0).mean() > 0.95
+    skirted, faces = tailor.dress(body, ("skirt",), rng)
+    ring = skirted[len(body.vertices) :][:64, :2]
+    legs = body.vertices[np.isin(bone, ("LeftUpLeg", "RightUpLeg"))]
+    near = legs[np.abs(legs[:, 2] - skirted[len(body.vertices), 2]) < 0.02][:, :2]
+    middle = ring.mean(axis=0)
+    assert np.linalg.norm(near - middle, axis=1).max() < np.linalg.norm(ring - middle, axis=1).max()
+    assert faces.max() == len(skirted) - 1

@@ -65,6 +65,12 @@ def test_a_body_that_is_off_by_a_step_is_off_by_its_length(model: StitchedPuppet
     summary = summarise_rgbd([score, far, missing])
     assert summary["seen_cm"] == pytest.approx(12.5) and summary["missed"] == 1 and summary["over_6_cm"] == 2
     assert summary["wrong_reliable"] == 1
+    # Nobody is in the frame's `person`; all joints are said to be seen, and those of one body of two are within 10 cm.
+    assert summary["hidden_vertices_cm"] == pytest.approx(12.5) and np.isnan(summary["seen_vertices_cm"])
+    assert summary["seen_hits"] == 0.5 and np.isnan(summary["near_hits"])
+    shown = replace(frame, person=np.zeros((480, 640), int), true_depth=np.full((480, 640), 2.0))
+    near = score_body(model, make_fit(model, np.array([0.0, 0.03, 0.04])), to_world, shown, 0, "knees", 0.5)
+    assert near.seen_vertex_error == pytest.approx(0.05) and near.hidden_vertex_error == pytest.approx(0.05)
 
 
 def test_turned_bodies_are_called_flipped(model: StitchedPuppet) -> None:

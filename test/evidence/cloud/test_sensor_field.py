@@ -125,6 +125,16 @@ def test_a_lidar_that_is_told_its_limits_needs_no_surroundings() -> None:
     assert field.find_unknown(beside).tolist() == [False, True, False, True]
 
 
+def test_of_a_thinned_image_nobody_elses_points_hide(scene: np.ndarray) -> None:
+    points, pixel = camera_points(scene)
+    image, rows = RangeImage.of_camera(LENS, points, pixel, scene.shape), np.arange(0, len(points), 4)
+    own = own_of(scene)
+    behind = points[own] * 1.1
+    whole, thinned = image.make_field(own), image.thin(rows).make_field(own[rows])
+    np.testing.assert_array_equal(thinned.find_unknown(behind), whole.find_unknown(behind))
+    assert image.take(rows).make_field(own[rows]).find_unknown(behind).mean() > 0.5
+
+
 def test_unknown_places_count_as_hidden_in_a_view_and_known_ones_the_same_as_without_a_field(scene: np.ndarray) -> None:
     points, pixel = camera_points(scene)
     person = points[own_of(scene)]

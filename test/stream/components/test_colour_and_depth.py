@@ -167,3 +167,21 @@ def test_who_is_seen_in_colour_only_is_as_far_away_as_the_size_says(model: Stitc
     component.handle("puppets", puppets(model, 2 * SECOND, [near, far]))
     (array,) = bodies_in(component.handle("depth", depth(2 * SECOND, [near])) + component.flush())
     assert [body.id for body in array.bodies] == ["a1"]  # a wall is where a2 should be seen
+
+
+def test_a_calibration_of_another_size_or_a_depth_of_another_moment_is_one_sentence(model: StitchedPuppet) -> None:
+    person = [stand_at(joints_of(), 2.5)]
+    component = make()
+    component.handle("puppets/camera_info", info(SECOND, 2.0))
+    component.handle("puppets", puppets(model, SECOND, person))
+    component.handle("camera_info", info(SECOND, 2.0))  # of the colour image
+    (array,) = bodies_in(component.handle("depth", depth(SECOND, person)) + component.flush()) or (None,)
+    assert array is None
+    (said,) = component.report.drain_warnings()
+    assert said == "the depth image is 320x240, its camera_info says 640x480"
+    later = 3 * SECOND  # of a moment from which there are no puppets
+    component.handle("camera_info", info(later, 1.0))
+    (array,) = bodies_in(component.handle("depth", depth(later, person)) + component.flush())
+    (said,) = component.report.drain_warnings()
+    assert "the puppets nearest to a cloud are 2.00 s from it" in said
+    assert [body.id for body in array.bodies] == ["b1"]

@@ -320,3 +320,13 @@ def test_a_hull_finds_a_second_person_across_the_cameras(recorded: dict[str, lis
     for name in set(main) & set(other):
         np.testing.assert_allclose(np.subtract(other[name][:3], main[name][:3]), shift, atol=0.03)
     assert len({m.person.id for port, m in made if port == "silhouettes"}) == 1
+
+
+def test_a_black_image_is_one_sentence_and_the_next_is_used(images: list[Any]) -> None:
+    component = tracker(**{"detection.source": "none"})
+    black = make_image(FACTORY, images[1].header, np.full((60, 80, 3), 3, np.uint8), "rgb8")
+    found = drive(component, [("image", black), ("image", images[2])])
+    assert stamps(found, "puppets") == [stamp_ns(images[1]), stamp_ns(images[2])]
+    assert component.counters["black images"] == 1
+    (said,) = [text for text in component.report.drain_warnings() if "black" in text]
+    assert said == "an image is black, and nobody can be found in it: see to the exposure and the lens cover"

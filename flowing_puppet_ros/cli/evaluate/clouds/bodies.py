@@ -23,7 +23,7 @@ from flowing_puppet_ros.settings import make_out_folder
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flowing-puppet evaluate bodies`."""
     parser.add_argument(
-        "--kind", choices=KINDS, default="whole", help="whole scans, depth views or LiDAR [%(default)s]"
+        "--kind", choices=KINDS, default="whole", help="whole scans, depth views, LiDAR or clothed people [%(default)s]"
     )
     parser.add_argument("--count", type=int, default=20, help="people [%(default)s]")
     parser.add_argument("--people-seed", type=int, default=1, help="seed of the people and their scans [%(default)s]")
@@ -49,7 +49,8 @@ def run(arguments: argparse.Namespace) -> int:
     errors: list[dict[str, float]] = []
     with tqdm(scans, total=arguments.count, file=sys.stderr, disable=arguments.json) as bar:
         for body, scene, cloud in bar:
-            fit, score = score_fit(fitter, body, scene, cloud, source.joint_names)
+            beneath = arguments.kind == "clothed"
+            fit, score = score_fit(fitter, body, scene, cloud, source.joint_names, beneath)
             scores.append(score)
             if arguments.measure:
                 errors.append(measure_errors(fitter.model, fit, body, source.triangles))
