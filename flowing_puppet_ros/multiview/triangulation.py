@@ -67,7 +67,7 @@ class Expectation:
             length = np.linalg.norm(points[..., near, :] - placed[far], axis=-1)
             error = np.log(np.maximum(length, 1e-3) / self.lengths)
             each = _BONE_WEIGHT * np.minimum((np.nan_to_num(error) / _BONE_LOG) ** 2, 1.0)
-            np.add.at(penalty, (..., near), each)
+            penalty = penalty + each @ np.eye(penalty.shape[-1])[near]
         return penalty
 
 

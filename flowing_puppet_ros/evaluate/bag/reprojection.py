@@ -78,8 +78,8 @@ def measure_reprojection(recording: Recording, people: PeopleInSpace) -> dict[st
                 pixels, metres = compare_joints(record.camera, group[identity], puppets[index])
                 rows += [(p, m < _AGREE_M, identity) for p, m in zip(pixels, metres, strict=True)]
         if rows:
-            pixels, agrees, names = zip(*rows, strict=True)
-            found[record.name] = Reprojection(np.array(pixels), np.array(agrees, bool), np.array(names))
+            values, agrees, names = zip(*rows, strict=True)
+            found[record.name] = Reprojection(np.array(values), np.array(agrees, bool), np.array(names))
     return found
 
 

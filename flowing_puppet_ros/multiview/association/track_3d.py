@@ -19,6 +19,7 @@ _MAX_EXTRAPOLATION_S = 0.5
 _JOINT_NOISE_M, _JOINT_SPEED_M_S = 0.08, 2.0  # of a joint about where its body has carried it
 _SIZES = 101  # in the running median of sizes
 _MIN_SIZES = 10  # of a bone, before its length is known
+_UPDATES_PER_LENGTH = 10  # after which the lengths of bones are measured again
 _BONES = (
     *(("shoulder", "elbow"), ("elbow", "wrist"), ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle")),
     *(("shoulder", "shoulder"), ("hip", "hip")),
@@ -52,9 +53,12 @@ class PersonTrack3D:
     exchanged: ExchangedLimbs = field(default_factory=lambda: ExchangedLimbs(()))
     _sizes: deque[F64] = field(default_factory=lambda: deque(maxlen=_SIZES))
     _placed: F64 = field(init=False)  # (J,) ns, when each joint was last placed
+    _lengths: F64 = field(init=False)  # (B,) m of the bones, NaN where unknown
+    _updates: int = 0
 
     def __post_init__(self) -> None:
         """Take the joints as placed now."""
+        self._lengths = np.full(len(self.bones), np.nan)
         self._placed = np.full(len(self.joints), float(self.stamp))
 
     @property
@@ -69,14 +73,9 @@ class PersonTrack3D:
 
     def expect(self, stamp: int) -> Expectation:
         """Return the joints expected at a stamp, ns, and the lengths of the bones as far as they are known."""
-        lengths = np.full(len(self.bones), np.nan)
-        if self._sizes:
-            sizes = np.stack(self._sizes)
-            known = np.isfinite(sizes).sum(axis=0) >= _MIN_SIZES
-            lengths[known] = np.nanmedian(sizes[:, known], axis=0)
         seconds = np.maximum(0.0, (stamp - self._placed) * 1e-9)
         tolerance = _JOINT_NOISE_M + _JOINT_SPEED_M_S * seconds
-        return Expectation(self.predict(stamp), tolerance, np.array(self.bones, np.int64).reshape(-1, 2), lengths)
+        return Expectation(self.predict(stamp), tolerance, np.array(self.bones, np.int64).reshape(-1, 2), self._lengths)
 
     def update(self, stamp: int, joints: F64) -> None:
         """Take joints (J, 3) m, NaN where unknown: those keep moving with the body."""
@@ -95,6 +94,11 @@ class PersonTrack3D:
         self._placed[known] = stamp
         self.stamp = stamp
         self._sizes.append(measure_sizes(joints, self.bones))
+        self._updates += 1
+        if self._updates % _UPDATES_PER_LENGTH == 0:
+            sizes = np.stack(self._sizes)
+            known = np.isfinite(sizes).sum(axis=0) >= _MIN_SIZES
+            self._lengths[known] = np.nanmedian(sizes[:, known], axis=0)
 
     def relocate(self, stamp: int, joints: F64) -> None:
         """Start again somewhere else, as the same person."""

@@ -69,8 +69,9 @@ def test_a_joint_that_jumps_away_from_its_body_is_not_sure() -> None:
     results = follow(jump)
     assert results[19][0].confidence[ANKLE] > 0.7
     assert results[20][0].confidence[ANKLE] < 0.2
-    others = [np.delete(person.confidence, [ANKLE, ANKLE - 2]) for person, _ in results[19:21]]
-    assert np.abs(others[1] - others[0]).max() < 0.15
+    # The arms of these stick people are not rigid, and the knee is the ankle's neighbour.
+    others = [k for k, name in enumerate(NAMES) if k not in (ANKLE, ANKLE - 2) and name[-5:] not in ("elbow", "wrist")]
+    assert np.abs(results[20][0].confidence[others] - results[19][0].confidence[others]).max() < 0.1
 
 
 def test_joints_behind_somebody_else_count_less() -> None:

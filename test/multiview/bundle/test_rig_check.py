@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from walkers import NAMES, photograph, ring, walker  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.multiview.association.people_tracker import PeopleTracker3D
+from flowing_puppet_ros.multiview.association.view import PersonInView
 from flowing_puppet_ros.multiview.bundle.gauge import scale_to
 from flowing_puppet_ros.multiview.bundle.rig_check import RigCheck
 from flowing_puppet_ros.multiview.camera import Camera
@@ -62,7 +63,7 @@ def test_images_of_different_people_are_told_without_a_size() -> None:
     places = {"cam1": (0.0, 0.0), "cam2": (2.5, 0.0), "cam3": (-2.5, 1.0), "cam4": (0.5, -2.5)}
     told = []
     for k in range(12):
-        seen = {}
+        seen: dict[str, list[PersonInView]] = {}
         for name, place in places.items():
             seen |= photograph({name: CAMERAS[name]}, {"x": walker(place, 0.7 * k, k / 5)}, 1.0, random)
         told.append(check.add(CAMERAS, seen, []))
