@@ -24,6 +24,7 @@ from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerS
 from flowing_puppet_ros.body.track.person_belief import PersonBelief
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.body.upright.person_finder import JudgedFit
+from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.reporting import Report
@@ -85,7 +86,9 @@ class _BodyTrack:
     def start(self, person: PersonCloud, fit: BodyFit) -> None:
         """Start with a body that was found in the person's cloud, and what was said about it there."""
         self.tracker.start(person, fit)
-        self.fitted = person.stamp
+        # Many points tell more than an upright body shows: a full fit may follow at once.
+        doubtful = not fit.reliable and len(person.points) >= MIN_MANY_POINTS
+        self.fitted = person.stamp - REFIT_INTERVAL_NS if doubtful else person.stamp
         if person.proven:
             self.belief = PersonBelief(person.middle[:2])
             self.belief.add(person.score, fit.confidence, self.stamp)
