@@ -121,7 +121,7 @@ def bounds_of_masks(cameras: Sequence[Camera], masks: Sequence[U8], margin: floa
         across = np.eye(3) - np.outer(direction, direction)
         normal += across
         right += across @ camera.centre
-    middle = np.linalg.lstsq(normal, right)[0]
+    middle = np.linalg.lstsq(normal, right, rcond=None)[0]
     depths = np.array([camera.to_camera(middle)[2] for camera, _ in views])
     if (depths <= 0).any():
         raise PuppetError(

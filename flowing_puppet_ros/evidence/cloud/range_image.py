@@ -178,7 +178,7 @@ def _calibrate(local: F64, pixels: F64, axes: F64) -> SensorProjection | None:
     scale, offset = np.empty(2), np.empty(2)
     for axis in (0, 1):
         table = np.stack([local[:, axis] / local[:, 2], np.ones(len(local))], axis=1)
-        solution = np.linalg.lstsq(table, pixels[:, axis])[0]
+        solution = np.linalg.lstsq(table, pixels[:, axis], rcond=None)[0]
         error = np.abs(table @ solution - pixels[:, axis])
         if solution[0] <= 0 or np.percentile(error, 99) > MAX_PIXEL_ERROR:
             return None
