@@ -128,11 +128,11 @@ def test_a_recorded_depth_camera_gives_the_bodies_that_it_gives_live(encoding: s
     with open_bag(tmp_path / "out.mcap") as out:
         found = list(out.messages(["/rig/depth/bodies"]))
         assert out.details["/rig/depth/camera_info"].count == 2, "a viewer needs the calibration"
-    live = BodyFitterComponent(BodyFitterSettings.from_mapping(FAST), FACTORY)
-    live.set_expected("initial", True)
     ports = {f"/rig/depth/{name}": "depth"}
     inputs = [(ports.get(topic, topic.rpartition("/")[2]), message) for topic, _, message in stream]
-    with one_blas_thread():  # as a node does: sums depend on the number of threads
+    with one_blas_thread():  # as in a node from its start: sums depend on the number of threads
+        live = BodyFitterComponent(BodyFitterSettings.from_mapping(FAST), FACTORY)
+        live.set_expected("initial", True)
         made = [made for port, message in inputs for made in live.handle(port, message)] + live.flush()
     expected = [message for port, message in made if port == "bodies"]
     assert [record.raw for record in found] == [bytes(typestore().serialize_cdr(one, BODIES)) for one in expected]
