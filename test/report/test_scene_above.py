@@ -82,7 +82,7 @@ class Picture:
         self.svg = svg
         xs = re.findall(r'<text x="([\d.]+)" y="[\d.]+" class="tick centre">(-?[\d.]+)</text>', svg)
         ys = re.findall(r'<text x="[\d.]+" y="([\d.]+)" class="tick end mid">(-?[\d.]+)</text>', svg)
-        self.x, self.y = (np.polyfit(*np.array(pairs, float).T, 1) for pairs in (xs, ys))
+        self.x, self.y = (np.polyfit(at, value, 1) for at, value in (np.array(pairs, float).T for pairs in (xs, ys)))
 
     def metres(self, path: str) -> list[np.ndarray]:
         """Return the places (N, 2) of each piece of a path."""

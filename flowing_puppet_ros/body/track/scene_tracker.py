@@ -191,6 +191,11 @@ class SceneTracker:
         """What was no person in the last cloud in which people were looked for from one side, the likeliest first."""
         return sorted(self._finder.last_rejected, key=lambda one: -one.probability)[:MAX_REJECTED]
 
+    @property
+    def sees_one_side(self) -> bool:
+        """Whether people are seen from one side: as set, or as the first one's points look."""
+        return self._settings.view == "single" or (self._settings.view == "auto" and bool(self._single_view))
+
     def step(
         self, cloud: SceneCloud, seed: int, executor: Executor | None = None
     ) -> tuple[list[TrackedBody], list[str]]:
