@@ -24,11 +24,13 @@ WIDTH, MAX_HEIGHT = 820, 700  # of the picture, px
 LEFT, RIGHT, TOP, BOTTOM = 56, 14, 14, 42  # margins around it, px
 MAX_DOTS = 4000
 MARGIN_M = 3.0
-"""Around tracks, sensor and rejected candidates."""
+"""Around what is shown."""
 MIN_OVER_FLOOR_M, MAX_OVER_FLOOR_M = 0.25, 2.5
 """Points lower than this over the lowest joint are drawn as the floor, higher ones as the ceiling not at all."""
 MAX_GAP = 3.0
 """Times the usual step between clouds, from which on a track is interrupted."""
+MIN_SHOWN = 0.1
+"""Probability to be a person from which on a rejected candidate is in the picture wherever it is."""
 MAX_REASONS = 12
 """RejectedMark candidates in the table, the likeliest."""
 _LAST_CLOUDS = 3  # that are tried, in case the last one is damaged
@@ -162,7 +164,11 @@ def draw_above(above: AboveData) -> str:
     ]
     x, y = view.place(np.zeros((1, 2)))[0]
     body.append(f'<path d="M{x - 7:.1f},{y:.1f}h14M{x:.1f},{y - 7:.1f}v14" stroke="currentColor" stroke-width="2"/>')
-    body += [view.draw_track(identity, track) for identity, track in above.tracks.items()]
+    # Ids need not have numbers, so that colours go by the order in which people come.
+    body += [
+        view.draw_track(identity, track, "rgb({},{},{})".format(*person_colour(f"p{number}")))
+        for number, (identity, track) in enumerate(above.tracks.items(), start=1)
+    ]
     title = f"The scene from above with the tracks of {', '.join(above.tracks)}"
     return (
         f'<svg class="plot above" viewBox="0 0 {WIDTH} {view.height:.0f}" role="img" aria-label="{escape(title)}">'
@@ -180,9 +186,9 @@ class _View:
 
     @classmethod
     def around(cls, above: AboveData) -> _View:
-        """Return the view of all tracks, rejected candidates and the sensor."""
+        """Return the view of all tracks, the sensor, and rejected candidates that were not far from being people."""
         places = [np.zeros((1, 2)), *(track.places for track in above.tracks.values())]
-        places += [np.array([[one.forward, one.left]]) for one in above.rejected]
+        places += [np.array([[one.forward, one.left]]) for one in above.rejected if one.probability > MIN_SHOWN]
         joined = np.concatenate(places)
         low, high = joined.min(axis=0) - MARGIN_M, joined.max(axis=0) + MARGIN_M
         scale = min((WIDTH - LEFT - RIGHT) / (high - low)[0], (MAX_HEIGHT - TOP - BOTTOM) / (high - low)[1])
@@ -232,15 +238,17 @@ class _View:
         )
 
     def draw_rejected(self, one: RejectedMark, number: int | None) -> str:
-        x, y = self.place(np.array([[one.forward, one.left]]))[0]
+        place = np.array([one.forward, one.left])
+        if (place < self.low).any() or (place > self.high).any():
+            return ""
+        x, y = self.place(place[None])[0]
         text = "" if number is None else f'<text x="{x + 7:.1f}" y="{y - 5:.1f}">{number}</text>'
         return (
             f'<g class="rejected"><title>{escape(one.reason)}</title>'
             f'<path d="M{x - 4:.1f},{y - 4:.1f}l8,8m0,-8l-8,8"/>{text}</g>'
         )
 
-    def draw_track(self, identity: str, track: TrackAbove) -> str:
-        colour = "rgb({},{},{})".format(*person_colour(identity))
+    def draw_track(self, identity: str, track: TrackAbove, colour: str) -> str:
         pixels = self.place(track.places)
         steps = np.diff(track.seconds)
         usual = np.median(steps) if len(steps) else 0.0

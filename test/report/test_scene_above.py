@@ -27,14 +27,15 @@ OPTICAL = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 """From x forward, y left, z up to x right, y down, z forward."""
 REJECTED = [
     {"place": [3.0, -2.0, -1.5], "probability": 0.02, "reason": "its shape is no person's"},
+    {"place": [40.0, 0.0, -1.5], "probability": 0.01, "reason": "far away"},
     {"place": [5.0, -2.5, -1.5], "probability": 0.4, "reason": "no upright <body> explains it"},
 ]
 
 
 def walk(frame: int) -> dict[str, tuple[float, float]]:
     """One person walks to the left, one stands and is out of sight for a while."""
-    people = {"b1": (4.0, -1.0 + 0.15 * frame), "b2": (6.0, 2.0)}
-    return {name: place for name, place in people.items() if name == "b1" or not 4 <= frame < 9}
+    people = {"ezuxg": (4.0, -1.0 + 0.15 * frame), "fdjnz": (6.0, 2.0)}
+    return {name: place for name, place in people.items() if name == "ezuxg" or not 4 <= frame < 9}
 
 
 def scene() -> np.ndarray:
@@ -105,13 +106,15 @@ def test_tracks_and_dots_lie_where_people_and_walls_are(tmp_path: Path, turn: np
     assert picture.x[0] == pytest.approx(-picture.y[0], rel=0.01), "metres are equal along x and y"
     walker, stander = picture.tracks()
     assert [len(piece) for piece in walker] == [FRAMES] and [len(piece) for piece in stander] == [4, 3]
-    assert np.abs(walker[0] - [walk(k)["b1"] for k in range(FRAMES)]).max() < 0.02
+    assert np.abs(walker[0] - [walk(k)["ezuxg"] for k in range(FRAMES)]).max() < 0.02
     assert all(np.abs(piece - (6.0, 2.0)).max() < 0.02 for piece in stander)
     wall = picture.dots("cloud")
     assert 50 < len(wall) <= 4000 and np.abs(wall[:, 0] - WALL_M).max() < 0.05, "neither floor nor ceiling"
     floor = picture.dots("floor")
     assert 1000 < len(floor) <= 4000 and floor[:, 0].min() < 2.0
-    assert picture.svg.count(">b1</text>") == picture.svg.count(">b2</text>") == 1
+    colours = re.findall(r'class="track" style="stroke:([^"]*)"', picture.svg)
+    assert len(set(colours)) == 2
+    assert picture.svg.count(">ezuxg</text>") == picture.svg.count(">fdjnz</text>") == 1
 
 
 def test_rejected_candidates_are_marked_with_their_reasons(tmp_path: Path) -> None:
@@ -122,12 +125,12 @@ def test_rejected_candidates_are_marked_with_their_reasons(tmp_path: Path) -> No
     assert data.above is not None
     picture = Picture(draw_above(data.above))
     marks = re.findall(r'class="rejected"><title>([^<]*)</title><path d="M([\d.]+),([\d.]+)', picture.svg)
-    assert [mark[0][:9] for mark in marks] == ["no uprigh", "its shape"], "the likeliest first"
+    assert [mark[0][:9] for mark in marks] == ["no uprigh", "its shape"], "the likeliest first, nothing far away"
     corner = picture.metres(f"M{marks[0][1]},{marks[0][2]}")[0][0]
     assert np.abs(corner - (5.0, -2.5)).max() < 5 * picture.x[0], "its corner is 4 px away"
 
 
 def test_a_person_seen_once_is_drawn() -> None:
     one = TrackAbove(np.array([0.0]), np.array([[2.0, 0.0]]))
-    svg = draw_above(AboveData("", {"b1": one}, np.zeros((0, 3)), 0.0, []))
+    svg = draw_above(AboveData("", {"ezuxg": one}, np.zeros((0, 3)), 0.0, []))
     assert "nan" not in svg and Picture(svg).tracks()[0][0] == pytest.approx(np.array([[2.0, 0.0]]), abs=0.02)
