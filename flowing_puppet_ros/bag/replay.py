@@ -364,6 +364,7 @@ class _Replay:
             "topic_map": dict(self._options.topic_map),
             "settings": {instance.name: instance.component.settings.values() for instance in instances},
             "counters": {instance.name: dict(sorted(instance.component.counters.items())) for instance in instances},
+            "rejected": {each.name: told for each in instances if (told := each.component.describe_rejected())},
             "warnings": self.warnings,
         }
 

@@ -28,6 +28,7 @@ from flowing_puppet_ros.cli.scans.fit_file import fit_file, list_files
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions
 from flowing_puppet_ros.cli.scans.fit_sequence import fit_sequence
 from flowing_puppet_ros.cli.scans.given_joints import read_joints
+from flowing_puppet_ros.cli.scans.track_scene import track_scene
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.exchange.files import FORMATS, write_people
 from flowing_puppet_ros.exchange.motion import read_fit
@@ -82,7 +83,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scene",
         action="store_true",
         help="find the people among floor, walls and furniture first (in metres if --unit is auto); results are"
-        " <stem>-1 and so on, the likeliest person first",
+        " <stem>-1 and so on, the likeliest person first; a folder is scans in time order by name, through which people"
+        " are tracked: results are <stem>-b1 and so on with the ids",
+    )
+    parser.add_argument(
+        "--scan-rate", type=float, default=10.0, metavar="HZ", help="scans a second of such a folder [%(default)s]"
     )
     parser.add_argument(
         "--sequence",
@@ -148,6 +153,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("--sequence fits one person in scans one after another; leave --scene and --scheduler")
     if arguments.joints is not None and (arguments.scene or (several and not arguments.sequence)):
         raise InputError("--joints are those of the person in one scan; give one INPUT, and leave --scene")
+    folders = [given for given in arguments.inputs if given.is_dir()] if arguments.scene else []
+    tracked = bool(folders) and options.camera_info is None
+    if tracked:
+        _refuse_untrackable(arguments)
     if arguments.rerun is not None:
         from flowing_puppet_ros.report.rerun_file import import_rerun
 
@@ -164,6 +173,9 @@ def run(arguments: argparse.Namespace) -> int:
         make_out_folder(options.out)
         fit_sequence(sources, options, tell)
         status = 0
+    elif tracked:
+        make_out_folder(options.out)
+        status = track_scene(sources, arguments.scan_rate, options, tell)
     elif several:
         status = runner.run_batch(verb, sources, options, arguments.out, arguments)
     else:
@@ -173,6 +185,17 @@ def run(arguments: argparse.Namespace) -> int:
 
         write_fits(_fits(finished), arguments.rerun)
     return status
+
+
+def _refuse_untrackable(arguments: argparse.Namespace) -> None:
+    """Raise InputError where the scans of a folder cannot be tracked."""
+    if len(arguments.inputs) > 1 or arguments.scheduler is not None:
+        raise InputError(
+            "--scene tracks people through the scans of one folder, one after another; give one folder and no"
+            " --scheduler, or the files in it to fit each by itself"
+        )
+    if not 0 < arguments.scan_rate < np.inf:
+        raise InputError(f"--scan-rate is {arguments.scan_rate:g}; give the scans a second, such as 10")
 
 
 def _resolve_info(arguments: argparse.Namespace) -> str | None:

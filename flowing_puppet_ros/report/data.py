@@ -56,6 +56,7 @@ from flowing_puppet_ros.report.bag_pictures import (
 )
 from flowing_puppet_ros.report.people_in_space import SpaceData, gather_space
 from flowing_puppet_ros.report.scene_3d import SceneFrame, count_affordable_frames, make_scene_data
+from flowing_puppet_ros.report.scene_above import AboveData, gather_above
 from flowing_puppet_ros.stream.messages.images import decode_image
 
 MAX_STRIP_FRAMES, MAX_FLOW_FRAMES, MAX_BODY_FRAMES, MAX_VIEWS = 120, 4, 3, 6
@@ -110,6 +111,7 @@ class ReportData:
     body_shots: list[BodyShot] = field(default_factory=list)
     scene: Mapping[str, Any] | None = None
     space: SpaceData | None = None
+    above: AboveData | None = None
 
     def seconds(self, stamp: int) -> float:
         """Return the seconds from the first stamp to `stamp` (ns)."""
@@ -138,6 +140,7 @@ def gather_data(input_bag: Path, output_bag: Path, summary: Mapping[str, Any] | 
             if not data.strip:
                 _add_overlays(data, shown, made)
         data.space = gather_space(recording, given, made)
+        data.above = gather_above(recording, given, summary)
         if recording.bodies:
             data.bodies = _make_bodies_data(recording)
             _add_bodies(data, recording, given, made)

@@ -52,6 +52,8 @@ svg .grid{stroke:var(--rule);stroke-width:1}svg text{fill:var(--soft);font-size:
 svg .end{text-anchor:end}svg .centre{text-anchor:middle}svg .mid{dominant-baseline:central}
 svg .now{display:none;stroke:var(--fg);stroke-width:1.2}.timeline svg .now{display:inline}
 .timeline svg{cursor:crosshair;touch-action:pan-y}
+svg .cloud,svg .floor{stroke:var(--soft);stroke-width:2;stroke-linecap:round;opacity:.75}svg .floor{opacity:.22}
+svg .rejected{stroke:var(--soft);stroke-width:1.6;fill:none}svg .rejected text{stroke:none}svg .track{stroke-width:2}
 svg .line{fill:none;stroke-width:1.8;stroke-linejoin:round}
 .legend{display:flex;flex-wrap:wrap;gap:2px 18px;margin:4px 0 10px;font-size:.9rem;color:var(--soft)}
 .key{display:inline-block;width:22px;height:4px;border-radius:2px;margin-right:7px;vertical-align:middle}

@@ -17,6 +17,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.report.data import BodiesData, ReportData, gather_data, make_energy_series, make_error_series
 from flowing_puppet_ros.report.page import build_page, details, figure, paragraph, row
 from flowing_puppet_ros.report.people_in_space import make_space_section
+from flowing_puppet_ros.report.scene_above import make_above_section
 from flowing_puppet_ros.report.tables import (
     format_percent,
     make_cameras_table,
@@ -59,6 +60,7 @@ def build_report_page(data: ReportData) -> str:
         ("Over time", _make_time_section(data)),
         ("Tracked puppets", _make_track_section(data)),
         *([("People in all cameras", make_space_section(data.space, data.start))] if data.space is not None else []),
+        *([("People from above", make_above_section(data.above))] if data.above is not None else []),
         ("Optical flow and puppet flow", _make_flow_section(data)),
         ("Bodies", _make_body_section(data)),
         ("Joint by joint", _make_joints_section(data)),

@@ -124,6 +124,10 @@ class Component[S: Settings]:
         """Return the messages for what still waits for a partner at the end of the input."""
         return []
 
+    def describe_rejected(self) -> dict[str, Any] | None:
+        """Return the last cloud's `stamp_ns` and the `candidates` that are no people, for JSON; None without clouds."""
+        return None
+
     def warm_up(self) -> None:
         """Load and compile what the first message would otherwise wait for; the component's state does not change."""
 

@@ -20,7 +20,13 @@ from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, se
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
-from flowing_puppet_ros.body.upright.person_finder import FoundBody, JudgedFit, PersonFinder, PersonFinderSettings
+from flowing_puppet_ros.body.upright.person_finder import (
+    FoundBody,
+    JudgedFit,
+    PersonFinder,
+    PersonFinderSettings,
+    RejectedCandidate,
+)
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
@@ -36,6 +42,7 @@ MAX_NEW_FITS = 8
 next. In a recording, which waits, so many in a row have to be nobody."""
 MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
 _UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
+MAX_REJECTED = 50  # candidates that are told of
 MIN_DECIDING_POINTS = 60
 """Points of a person from which on they tell whether people are seen from one side."""
 ONLY_ID = "b1"
@@ -178,6 +185,16 @@ class SceneTracker:
         self._planes = PlaneCache()
         self._finder.reset()
         self._was_searched = False
+
+    @property
+    def rejected(self) -> Sequence[RejectedCandidate]:
+        """What was no person in the last cloud in which people were looked for from one side, the likeliest first."""
+        return sorted(self._finder.last_rejected, key=lambda one: -one.probability)[:MAX_REJECTED]
+
+    @property
+    def sees_one_side(self) -> bool:
+        """Whether people are seen from one side: as set, or as the first one's points look."""
+        return self._settings.view == "single" or (self._settings.view == "auto" and bool(self._single_view))
 
     def step(
         self, cloud: SceneCloud, seed: int, executor: Executor | None = None

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -76,6 +77,11 @@ class RejectedCandidate:
     place: np.ndarray
     probability: float
     reason: str
+
+    def describe(self, rotation: np.ndarray, translation: np.ndarray) -> dict[str, Any]:
+        """Return it for JSON, in a frame to which `rotation` (3, 3) and then `translation` (3,) m lead."""
+        place = np.round(rotation @ self.place + translation, 3).tolist()
+        return {"place": place, "probability": round(self.probability, 3), "reason": self.reason}
 
 
 class PersonFinder:

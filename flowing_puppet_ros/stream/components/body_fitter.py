@@ -121,6 +121,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._model = StitchedPuppet.load(settings.model)
         self._fitter = BodyFitter(self._model, settings.fitter)
         self._scene = SceneTracker(self._fitter, settings, self.report)
+        self._looked_at: tuple[int, SensorPlace] | None = None
         self._fused = FusedTracker(
             PeopleFitter(self._fitter, settings.fusion),
             settings.tracker,
@@ -285,6 +286,13 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         puppets = calibrated and "puppets" in self._expected and waiting < self.settings.fusion.wait
         return not puppets or self._puppets.is_ready(frame, stamp)
 
+    def describe_rejected(self) -> dict[str, Any] | None:
+        """Return what was looked at in the last cloud and is no person."""
+        if self._looked_at is None:
+            return None
+        stamp, place = self._looked_at
+        return {"stamp_ns": stamp, "candidates": [one.describe(*place.back) for one in self._scene.rejected]}
+
     def _fit_one(self, stamp: int, cloud: Any, of_depth: bool, initial: Any | None) -> Output:
         self.counters["clouds"] += 1
         bodies: list[TrackedBody] = []
@@ -302,6 +310,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             else:
                 bodies, occluded = self._fit_scene(scene, cloud.header, stamp, place, is_known)
             bodies = [body.move(*place.back) for body in bodies]
+            self._looked_at = stamp, place
         except InputError as error:
             self.report.count_unusable(error)
         self.counters["bodies"] += len(bodies)

@@ -80,11 +80,13 @@ class Drive:
     found: list[tuple[int, str, np.ndarray, np.ndarray]]
     remembered: int
     warnings: list[str]
+    rejected: list[np.ndarray]
+    """Places in the map of what is no person in the last cloud."""
 
 
 def drive(walkers: Walkers, roll: float = 0.0, **settings: Any) -> Drive:
     component = BodyFitterComponent(BodyFitterSettings.from_mapping({"view": "single", **settings}), FACTORY)
-    result = Drive([], 0, [])
+    result = Drive([], 0, [], [])
     for frame in range(FRAMES):
         seconds = frame / RATE_HZ
         stamp = SECOND + round(seconds * SECOND)
@@ -100,6 +102,9 @@ def drive(walkers: Walkers, roll: float = 0.0, **settings: Any) -> Drive:
                 result.found.append((frame, body.id, turn @ hips + place, turn @ velocity))
         reasons = [each.reason for each in component._scene._finder.last_rejected]
         result.remembered += reasons.count("rejected before")
+    told = component.describe_rejected()
+    assert told is not None and told["stamp_ns"] == stamp
+    result.rejected = [turn @ one["place"] + place for one in told["candidates"]]
     result.warnings = component.report.drain_warnings()
     return result
 
@@ -141,3 +146,8 @@ def test_a_lidar_that_hangs_upside_down_is_no_special_case(walkers: Walkers) -> 
 
 def test_what_stands_in_the_map_is_rejected_once(level: Drive, walkers: Walkers) -> None:
     assert level.remembered > drive(walkers).remembered
+
+
+def test_the_places_of_what_is_rejected_are_told(level: Drive) -> None:
+    for cupboard in ([6.0, -3.4, 0.0], [3.0, 3.2, 0.0]):
+        assert min(np.linalg.norm(place - cupboard) for place in level.rejected) < 0.4
