@@ -15,6 +15,7 @@ import mathml  # type: ignore[import-not-found]
 import numpy as np
 import pages  # type: ignore[import-not-found]
 import pytest
+import screenshots  # type: ignore[import-not-found]
 from docutils import nodes
 from sphinx.errors import SphinxError
 
@@ -163,7 +164,7 @@ def test_pages_show_the_figures_that_are_drawn() -> None:
         for name in re.findall(r"\{figure\} (\S+)", page.read_text()):
             assert (page.parent / name).is_file(), f"{page}: {name}"
             shown.add(Path(name).stem)
-    assert drawn == shown == {*figures_2d.FIGURES, *figures_3d.FIGURES}
+    assert drawn == shown == {*figures_2d.FIGURES, *figures_3d.FIGURES, *screenshots.PICTURES}
 
 
 def test_the_tests_that_pages_name_are_there() -> None:

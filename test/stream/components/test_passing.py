@@ -76,7 +76,7 @@ def test_two_people_who_pass_each_other_keep_their_ids(monkeypatch: pytest.Monke
         truth[:] = [_walker(model, index, cloud) for index in range(2)]
         points, second = _seen(model, [state for state, _ in truth], rng)
         hidden += second < SEEN
-        header = make_header(FACTORY, int((cloud + 1) * PERIOD * 1e9), "map")
+        header = make_header(FACTORY, int((cloud + 1) * PERIOD * 1e9), "lidar")
         made = dict(component.handle("points", make_cloud(FACTORY, header, points)))
         for body in made["bodies"].bodies:
             joint = next(joint.position for joint in body.joints if joint.name == "pelvis")
