@@ -91,7 +91,7 @@ class _BodyTrack:
         self.fitted = person.stamp - REFIT_INTERVAL_NS if doubtful else person.stamp
         if person.proven:
             self.belief = PersonBelief(person.middle[:2])
-            self.belief.add(person.score, fit.confidence, self.stamp)
+            self.belief.add(person.score, fit.confidence, self.stamp, len(person.points))
 
     def weigh(self, person: PersonCloud, fit: BodyFit, judge: Judge) -> BodyFit:
         """Ask a scan whether it is a person, unless that was asked lately or too little is seen; return its body."""
@@ -100,7 +100,7 @@ class _BodyTrack:
         self.belief.visit(person.middle)
         if self.belief.is_due(self.stamp) and not self.tracker.hidden:
             judged = judge(person, fit)
-            self.belief.add(judged.probability, judged.confidence, self.stamp)
+            self.belief.add(judged.probability, judged.confidence, self.stamp, len(person.points))
             if judged.fit is not fit:
                 self.tracker.start(person, judged.fit)
             return judged.fit

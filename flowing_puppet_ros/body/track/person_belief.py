@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 
-SURE, CONFIRMED, MOVED_CONFIRMED, HOPELESS = 0.8, 0.55, 0.3, 0.2
+SURE, CONFIRMED, MOVED_CONFIRMED, HOPELESS = 0.75, 0.45, 0.3, 0.2
 """Mean probabilities of a person: from which one scan is enough; from which several are; the same for what has moved;
 and below which several show that it is none."""
+MANY_SURE, MANY_CONFIRMED = 0.9, 0.8
+"""The first two where many points are seen: they leave little doubt about people, and furniture is near the sensor."""
 SEVERAL = 2  # scans
 MAX_WEIGHT = 20  # scans that the mean reaches back
 MIN_MOVE_M = 0.5  # from the first place on, which furniture does not get by the noise of its points
@@ -29,6 +32,7 @@ class PersonBelief:
         odds: mean log odds of a person.
         count: scans that were asked, at most `MAX_WEIGHT`.
         confidence: of the last body, that it is a person and close; None before.
+        many: whether the last scan that was asked showed many points of it.
         moved: whether it was far from its first place.
         shown: whether it ever was taken for a person.
     """
@@ -38,6 +42,7 @@ class PersonBelief:
     count: int = 0
     asked: int = 0
     confidence: float | None = None
+    many: bool = False
     moved: bool = False
     shown: bool = field(default=False)
 
@@ -45,12 +50,12 @@ class PersonBelief:
         """Return whether the scan of a stamp in nanoseconds should be asked."""
         return self.count < EVERY_SCAN or stamp - self.asked >= LATER_NS or not self.shown
 
-    def add(self, probability: float, confidence: float, stamp: int) -> None:
-        """Take what the scan of a stamp says."""
+    def add(self, probability: float, confidence: float, stamp: int, points: int) -> None:
+        """Take what the scan of a stamp in nanoseconds says by a number of points."""
         bounded = float(np.clip(probability, MIN_ODDS, 1 - MIN_ODDS))
         self.count, self.asked = min(self.count + 1, MAX_WEIGHT), stamp
         self.odds += (float(np.log(bounded / (1 - bounded))) - self.odds) / self.count
-        self.confidence = confidence
+        self.confidence, self.many = confidence, points >= MIN_MANY_POINTS
 
     def visit(self, place: F64) -> None:
         """Take where (3,) m it is."""
@@ -63,9 +68,10 @@ class PersonBelief:
 
     def decide(self) -> bool:
         """Return whether it is taken for a person; who once was stays one until it is hopeless."""
-        limit = MOVED_CONFIRMED if self.moved else CONFIRMED
-        confirmed = self.probability >= limit and self.count >= SEVERAL
-        self.shown = (self.shown and not self.is_hopeless) or confirmed or self.probability >= SURE
+        sure, confirmed = (MANY_SURE, MANY_CONFIRMED) if self.many else (SURE, CONFIRMED)
+        limit = MOVED_CONFIRMED if self.moved else confirmed
+        enough = self.probability >= (limit if self.count >= SEVERAL else sure)
+        self.shown = (self.shown and not self.is_hopeless) or enough
         return self.shown
 
     @property

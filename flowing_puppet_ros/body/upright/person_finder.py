@@ -145,7 +145,10 @@ class PersonFinder:
         chosen = self._choose(candidates, probability, stamp, remember)
         self._scan = scene, ScanRays.of(points, viewpoint)
         rays = self._scan[1]
-        taken = [np.asarray(body)[:, :2].mean(axis=0) for body in known if len(body)]
+        seen = {body.person.owner for body in people}
+        middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
+        unseen = {owner: middle for owner, middle in enumerate(middles) if owner not in seen}
+        taken = [middle for owner, middle in enumerate(middles) if owner in seen]
         found: list[tuple[JudgedFit, Candidate]] = []
         bent: list[Candidate] = []
         limit, misses = self._settings.max_fits if max_fits is None else max_fits, 0
@@ -168,7 +171,9 @@ class PersonFinder:
             middle = judged.fit.vertices[:, :2].mean(axis=0)
             if all(np.hypot(*(middle - other)) > SAME_PERSON_M for other in taken):
                 taken.append(middle)
-                person = make(candidate.rows, score=judged.probability)
+                # Who stands at a wall may have no points by the prediction: the candidate there is that person.
+                owner = _pop_nearest(unseen, middle)
+                person = make(candidate.rows, score=judged.probability, owner=owner)
                 people.append(FoundBody(person, replace(judged.fit, confidence=judged.confidence)))
         for candidate in bent:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
@@ -263,6 +268,16 @@ class PersonFinder:
         self.last_rejected.append(_describe_rejected(candidate, probability, reason))
         if remember:
             self._rejected.add(candidate, stamp)
+
+
+def _pop_nearest(middles: dict[int, np.ndarray], place: np.ndarray) -> int | None:
+    """Return whose middle (2,) m is so near to a place that they are one person, and take it out; None for nobody."""
+    away = {owner: float(np.hypot(*(middle - place))) for owner, middle in middles.items()}
+    nearest = min(away, key=away.__getitem__, default=None)
+    if nearest is None or away[nearest] > SAME_PERSON_M:
+        return None
+    del middles[nearest]
+    return nearest
 
 
 def _make_person(

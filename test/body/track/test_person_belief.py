@@ -8,11 +8,11 @@ from flowing_puppet_ros.body.track.person_belief import PersonBelief
 TENTH = 100_000_000
 
 
-def tell(belief: PersonBelief, *probabilities: float) -> list[bool]:
+def tell(belief: PersonBelief, *probabilities: float, points: int = 60) -> list[bool]:
     """Ask scans 0.1 s apart, and return after each whether it is taken for a person."""
     shown = []
     for probability in probabilities:
-        belief.add(probability, 0.5, belief.asked + TENTH)
+        belief.add(probability, 0.5, belief.asked + TENTH, points)
         shown.append(belief.decide())
     return shown
 
@@ -20,15 +20,23 @@ def tell(belief: PersonBelief, *probabilities: float) -> list[bool]:
 def test_a_sure_scan_is_enough_and_a_doubtful_one_is_not() -> None:
     assert tell(PersonBelief(np.zeros(2)), 0.95) == [True]
     assert tell(PersonBelief(np.zeros(2)), 0.7, 0.7) == [False, True]
-    assert not any(tell(PersonBelief(np.zeros(2)), *[0.5] * 10))
+    assert not any(tell(PersonBelief(np.zeros(2)), *[0.4] * 10))
+
+
+def test_many_points_have_to_show_more_unless_they_move() -> None:
+    assert tell(PersonBelief(np.zeros(2)), 0.95, points=600) == [True]
+    assert not any(tell(PersonBelief(np.zeros(2)), 0.85, 0.7, 0.7, points=600))
+    walking = PersonBelief(np.zeros(2))
+    walking.visit(np.array([0.6, 0.0, 1.0]))
+    assert tell(walking, 0.7, 0.7, points=600) == [False, True]
 
 
 def test_what_moved_needs_less_and_the_noise_of_a_place_is_no_motion() -> None:
     belief = PersonBelief(np.zeros(2))
     belief.visit(np.array([0.2, -0.2, 1.0]))
-    assert not any(tell(belief, 0.5, 0.5, 0.5))
+    assert not any(tell(belief, 0.4, 0.4, 0.4))
     belief.visit(np.array([0.4, 0.4, 1.0]))
-    assert tell(belief, 0.5) == [True]
+    assert tell(belief, 0.4) == [True]
 
 
 def test_who_was_shown_stays_through_doubtful_scans_and_not_through_many_bad_ones() -> None:

@@ -101,6 +101,24 @@ def test_a_new_person_has_a_body_in_the_first_scan_and_keeps_the_id(
     assert tracker.step(SceneCloud(empty, None, 500_000_000), 9) == ([], ["b1"])
 
 
+@LEARN
+def test_who_stands_in_a_large_cluster_is_found_again_as_the_one_who_is_known(
+    scan: tuple[np.ndarray, np.ndarray, float],
+) -> None:
+    """A person who touches a long wall has a small share of that cluster, which no prediction claims then."""
+    points, owner, _ = scan
+    gap = np.linspace(0.0, 12.0, 3000)
+    heights = np.tile(np.linspace(-HEIGHT + 0.2, -HEIGHT + 1.5, 30), 100)
+    fence = np.column_stack([np.full(3000, PLACE[0] + 0.25), PLACE[1] + 0.25 + gap, heights])
+    finder = PersonFinder(BodyFitter(StitchedPuppet.load(), FitterSettings()), PersonFinderSettings())
+    joined = np.concatenate([points, fence])
+    (first,) = finder.find(joined, None, ORIGIN, 0)
+    assert first.fit is not None and first.person.owner is None
+    again = finder.find(joined, None, ORIGIN, 100_000_000, [first.fit.vertices[::8]])
+    assert [body.person.owner for body in again] == [0]
+    assert again[0].person.rows is not None and (owner[again[0].person.rows[:-1]] == 0).mean() > 0.5
+
+
 def test_the_bank_stands_on_the_floor_and_is_of_many_statures() -> None:
     bank = make_upright_bank(StitchedPuppet.load())
     model = StitchedPuppet.load()
