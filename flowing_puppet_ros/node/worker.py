@@ -28,6 +28,11 @@ class Worker:
         self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
         self._thread.start()
 
+    def is_behind(self) -> bool:
+        """Return whether messages wait in a bounded queue."""
+        with self._changed:
+            return any(name is not None for name, _ in self._tasks)
+
     def put(self, queue: str, task: Task, person: str = "") -> None:
         """Append a task to a bounded queue; drop the queue's oldest tasks if it is full.
 
