@@ -49,6 +49,7 @@ from flowing_puppet_ros.stream.messages.puppets import JointPosition, decode_bod
 from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
 from flowing_puppet_ros.stream.stamp_buffer import CloudLine, StampBuffer
+from flowing_puppet_ros.threads import one_blas_thread
 
 ASSUMED_INTERVAL_NS = 100_000_000
 """Between clouds whose stamps do not advance (drivers that stamp nothing)."""
@@ -278,7 +279,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             except InputError as error:
                 self.report.count_unusable(error)
             else:
-                outputs += self._fit_one(stamp, cloud, port == "depth", initial)
+                with one_blas_thread():  # several only wait for each other in products of many points with 3x3
+                    outputs += self._fit_one(stamp, cloud, port == "depth", initial)
 
     def _is_ready(self, index: int) -> bool:
         """Return whether all that is expected for a cloud in line is there, or it has waited long enough."""
