@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""More input than a node can work on: the newest cloud with its puppets is taken, the others are dropped and counted."""
+"""More input than a node can work on: the newest cloud with its puppets is taken, others are dropped and counted."""
 
 from collections import deque
 from typing import Any
