@@ -46,9 +46,11 @@ class FusionSettings(Settings):
     max_lag: float = setting(
         0.35, "time from a cloud to the nearest puppets up to which they belong together", unit="s", low=0.0, high=5.0
     )  # fmt: skip
-    wait: int = setting(
-        3, "clouds to wait for late puppets before one is used without them", low=0, high=50, advanced=True
-    )
+    wait: float = setting(
+        2.0,
+        "time by which the puppets may lag behind the clouds before these are used without waiting for them",
+        unit="s", low=0.0, high=10.0, advanced=True,
+    )  # fmt: skip
     colour_only: bool = setting(
         True,
         "publish whom the camera sees where there is no depth: joints alone, as far away as their size says, never"

@@ -46,7 +46,8 @@ class SeenCloud:
         pixels, depth = camera.project(points)
         width, height = camera.size
         with np.errstate(invalid="ignore"):
-            inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < width - 0.5) & (pixels[:, 1] < height - 0.5)
+            x, y = pixels[:, 0], pixels[:, 1]
+            inside = (x >= -0.5) & (y >= -0.5) & (x < width - 0.5) & (y < height - 0.5)
         seen = inside.copy()
         if np.linalg.norm(camera.centre - viewpoint) > MAX_SAME_PLACE_M:
             seen[inside] = _find_unhidden(pixels[inside], depth[inside])

@@ -121,7 +121,8 @@ class Camera:
         local = self.to_camera(points)
         depth = local[..., 2]
         plane = local[..., :2] / np.where(depth > 0, depth, np.nan)[..., None]
-        plane = np.where((plane**2).sum(axis=-1, keepdims=True) <= self.max_squared_radius, plane, np.nan)
+        radius2 = plane[..., :1] ** 2 + plane[..., 1:] ** 2
+        plane = np.where(radius2 <= self.max_squared_radius, plane, np.nan)
         return self.to_pixels(distort(plane, self.distortion)), depth
 
     def to_pixels(self, image_plane: F64) -> F64:

@@ -167,7 +167,7 @@ class ComponentNode[C: Component[Any]](LifecycleNode):
         self._node_settings = apply_changes(self._node_settings, parameters)
         if self.session is None:
             return
-        self.session.worker.limit = self._node_settings.queue
+        self.session.worker.limit = max(self._node_settings.queue, self.session.component.min_queue)
         self.session.image_transport = self._node_settings.image_transport
         after = self._settings.values()
         different = {name for name, value in before.values().items() if value != after[name]}
@@ -193,7 +193,7 @@ class ComponentNode[C: Component[Any]](LifecycleNode):
         status = NodeStatus(self.state, self.problem)
         if (session := self.session) is not None:
             publishers = {topic: self.count_publishers(topic) for topic in session.topics}
-            counters, dropped = dict(session.component.counters), dict(session.worker.dropped)
+            counters, dropped = dict(session.component.counters), session.worker.dropped + session.component.dropped
             status = NodeStatus(self.state, self.problem, counters, dropped, publishers)
         report = self._diagnostics.report(self.get_clock().now().to_msg(), max(seconds, 1e-3), status)
         self._publisher.publish(report)

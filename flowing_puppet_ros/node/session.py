@@ -107,7 +107,8 @@ class Session[C: Component[Any]]:
             self._close_outputs()
             raise
         component.background = _background_executor()
-        self.worker = Worker(queue, self._on_task_error)
+        self.worker = Worker(max(queue, component.min_queue), self._on_task_error)
+        component.is_behind = self.worker.is_behind
 
     def activate(self) -> None:
         """Open the inputs."""

@@ -22,11 +22,22 @@ class Worker:
         self.dropped: Counter[str] = Counter()
         self.limit = limit
         self._on_error = on_error
-        self._tasks: deque[tuple[tuple[str, str] | None, Task]] = deque()
+        self._tasks: deque[tuple[tuple[str, str] | None, Task, int]] = deque()
+        self._added = 0
+        self._batch = 0
         self._changed = threading.Condition()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name="worker", daemon=True)
         self._thread.start()
+
+    def is_behind(self) -> bool:
+        """Return whether messages of the present batch wait in a bounded queue.
+
+        A batch is what waits when its first task begins. What comes later belongs to the next one, so that a flood of
+        messages does not put off the work for ever.
+        """
+        with self._changed:
+            return any(name is not None and number <= self._batch for name, _, number in self._tasks)
 
     def put(self, queue: str, task: Task, person: str = "") -> None:
         """Append a task to a bounded queue; drop the queue's oldest tasks if it is full.
@@ -34,18 +45,22 @@ class Worker:
         On an input that has a topic for each person, each `person` has a queue; what is dropped is counted together.
         """
         with self._changed:
-            waiting = [index for index, (name, _) in enumerate(self._tasks) if name == (queue, person)]
+            waiting = [index for index, (name, _, _) in enumerate(self._tasks) if name == (queue, person)]
             for index in reversed(waiting[: max(0, len(waiting) + 1 - self.limit)]):
                 del self._tasks[index]
                 self.dropped[queue] += 1
-            self._tasks.append(((queue, person), task))
+            self._append((queue, person), task)
             self._changed.notify()
 
     def call(self, task: Task) -> None:
         """Append a task that is never dropped."""
         with self._changed:
-            self._tasks.append((None, task))
+            self._append(None, task)
             self._changed.notify()
+
+    def _append(self, name: tuple[str, str] | None, task: Task) -> None:
+        self._added += 1
+        self._tasks.append((name, task, self._added))
 
     def clear(self) -> None:
         """Drop the messages that wait; keep the tasks given to `call`."""
@@ -66,7 +81,9 @@ class Worker:
                 self._changed.wait_for(lambda: self._tasks or self._stopping)
                 if self._stopping:
                     return
-                _, task = self._tasks.popleft()
+                _, task, number = self._tasks.popleft()
+                if number > self._batch:
+                    self._batch = self._added
             try:
                 task()
             except Exception as error:

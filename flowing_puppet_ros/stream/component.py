@@ -9,7 +9,7 @@ same messages give the same results live and replayed.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -100,6 +100,8 @@ class Component[S: Settings]:
     """Fully qualified name of the node, from which the ids of its people follow; empty where there is no node."""
     background: Executor | None = None
     """Executor of slow work in a live node; None: all work is done at once, as in a replay."""
+    min_queue: ClassVar[int] = 1
+    """Messages of each input that a live node keeps at least; more where the component itself drops old ones."""
     inputs: tuple[Port, ...]
     outputs: tuple[Port, ...]
 
@@ -108,6 +110,10 @@ class Component[S: Settings]:
         self.settings = settings
         self.factory = factory
         self.report = Report()
+        self.dropped: Counter[str] = Counter()
+        """Messages of each input that were dropped for newer ones."""
+        self.is_behind: Callable[[], bool] = _never
+        """Whether messages wait already; a live node sets it, a replay is never behind."""
         self._expected: set[str] = set()
         self._subscribed: set[str] = set()
 
@@ -177,3 +183,7 @@ class Component[S: Settings]:
         if port not in {item.name for item in ports}:
             raise ValueError(f"no port {port!r}")
         (switches.add if on else switches.discard)(port)
+
+
+def _never() -> bool:
+    return False

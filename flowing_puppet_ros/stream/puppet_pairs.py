@@ -66,6 +66,11 @@ class PuppetPairs:
         """Whether the calibration of the puppets' camera has come."""
         return self._info is not None
 
+    def is_awaited(self, first: int, last: int) -> bool:
+        """Return whether puppets will soon come for clouds of the stamps from `first` to `last`, nanoseconds."""
+        newest = self._messages[-1][0] if self._messages else first
+        return (last - newest) * 1e-9 <= self._settings.wait
+
     def is_ready(self, frame: str, stamp: int) -> bool:
         """Return whether no later message of puppets or transforms can change what `find` tells of a cloud.
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
@@ -62,3 +63,52 @@ class PendingQueue:
         """Drop everything."""
         self.waiting.clear()
         self.last_popped = None
+
+
+class CloudLine(PendingQueue):
+    """Clouds in order of arrival, which wait for what belongs to them.
+
+    Whoever falls behind goes on with the newest cloud that has everything; those before it are dropped.
+    """
+
+    def __init__(self, drop: Callable[[Any], None]) -> None:
+        """Make an empty line; `drop` is told of every item that is dropped for a newer one."""
+        super().__init__()
+        self._drop = drop
+        self.clear()
+
+    def clear(self) -> None:
+        """Drop everything, and be up to date."""
+        super().clear()
+        self.first: int | None = None
+        self.is_behind = False
+
+    def append(self, stamp: int, item: Any, limit: int | None = None) -> None:
+        """Let an item wait; where there are more than `limit` (3 or more), drop items where they are densest.
+
+        If the oldest were dropped instead, a partner that is always late would never find its item.
+        """
+        self.first = stamp if self.first is None else min(self.first, stamp)
+        self.waiting.append((stamp, item))
+        while limit is not None and len(self.waiting) > limit:
+            stamps = [each for each, _ in self.waiting]
+            gaps = [later - earlier for earlier, later in zip(stamps, stamps[2:], strict=False)]
+            index = 1 + gaps.index(min(gaps))
+            self._drop(self.waiting[index][1])
+            del self.waiting[index]
+
+    def take(self, is_ready: Callable[[int], bool]) -> tuple[int, Any] | None:
+        """Remove and return the first (stamp, item) if it has everything; the newest that has if we are behind.
+
+        `is_ready` tells of the item at an index whether it has everything.
+        """
+        if self.is_behind:
+            newest = next((index for index in reversed(range(len(self.waiting))) if is_ready(index)), None)
+            if newest is None:
+                return None
+            self.is_behind = False
+            for _ in range(newest):
+                self._drop(self.pop()[1])
+        elif not self.waiting or not is_ready(0):
+            return None
+        return self.pop()

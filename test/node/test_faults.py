@@ -293,11 +293,12 @@ def test_clouds_that_lie(world: World) -> None:
         with world.fault("body_fitter"):
             cloud.header = world.header()
             world.send("points", cloud)
-    for cloud in empty_clouds():
+    for cloud in empty_clouds():  # one by one: of several that wait, only the newest is answered
+        count = len(world.results["bodies"]) + 1
         cloud.header = world.header()
         world.send("points", cloud)
-    count = before + len(clouds) + len(empty_clouds())
-    world.peer.spin_until(lambda: len(world.results["bodies"]) >= count, "an answer to every cloud")
+        world.peer.spin_until(lambda count=count: len(world.results["bodies"]) >= count, "an answer")  # type: ignore[misc]
+    assert len(world.results["bodies"]) >= before + len(clouds) + len(empty_clouds())
     assert not any(answer.bodies for answer in world.results["bodies"][before:])
     found = world.works("bodies", "points", body(world.header()))
     assert all(math.isfinite(v) for j in found.bodies[0].joints for v in (j.position.x, j.position.y, j.position.z))

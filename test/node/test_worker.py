@@ -59,3 +59,25 @@ def test_an_error_is_reported_and_the_work_goes_on() -> None:
     finish(worker, gate)
     assert seen == [2]
     assert [type(error) for error in errors] == [ZeroDivisionError]
+
+
+def test_only_what_waited_when_a_batch_began_is_behind() -> None:
+    seen: list[tuple[str, bool]] = []
+    worker, gate = held_worker(9, [])
+
+    def note(name: str, then: str = "") -> None:
+        if then:
+            worker.put("a", lambda: note(then))
+        seen.append((name, worker.is_behind()))
+
+    worker.put("a", lambda: note("first", "later"))
+    worker.put("b", lambda: note("second"))
+    worker.put("a", lambda: note("third"))
+    done = threading.Event()
+    worker.put("c", lambda: note("last"))
+    worker.call(lambda: worker.put("c", done.set))
+    gate.set()
+    assert done.wait(10)
+    worker.stop()
+    # "later" waits already while "last" is done, which ends the batch, and begins the next one.
+    assert seen == [("first", True), ("second", True), ("third", True), ("last", False), ("later", True)]

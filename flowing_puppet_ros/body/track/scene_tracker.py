@@ -90,7 +90,10 @@ def crop_to_region(points: F64, region: RegionSettings) -> Bools:
     """Return which (N,) of the points (N, 3) m in the cloud's frame lie in the region."""
     low = np.array([region.min_x, region.min_y, region.min_z])
     high = np.array([region.max_x, region.max_y, region.max_z])
-    return np.asarray(((points >= low) & (points <= high)).all(axis=1))
+    inside = np.ones(len(points), dtype=bool)
+    for column, least, most in zip(points.T, low, high, strict=True):  # faster than rows of three
+        inside &= (column >= least) & (column <= most)
+    return inside
 
 
 @dataclass(frozen=True, slots=True, eq=False)

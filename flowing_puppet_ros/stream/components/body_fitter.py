@@ -48,11 +48,14 @@ from flowing_puppet_ros.stream.messages.message_types import (
 from flowing_puppet_ros.stream.messages.puppets import JointPosition, decode_body_joints, make_bodies, make_body
 from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
-from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
+from flowing_puppet_ros.stream.stamp_buffer import CloudLine, StampBuffer
+from flowing_puppet_ros.threads import one_blas_thread
 
 ASSUMED_INTERVAL_NS = 100_000_000
 """Between clouds whose stamps do not advance (drivers that stamp nothing)."""
 COLOUR_PORTS = ("puppets", "puppets/camera_info", "/tf_static", "/tf")
+MAX_WAITING = 12
+"""Clouds that wait at most in a live node."""
 MIN_OUTSIDE_SHARE = 0.1
 """Of a cloud's points, outside of the camera's view, from which on people are found there without puppets."""
 
@@ -102,6 +105,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
     """
 
     settings_type = BodyFitterSettings
+    min_queue = MAX_WAITING
     inputs = (
         Port("points", POINT_CLOUD, "sensor"),
         Port("depth", IMAGE, "sensor", transport=COMPRESSED_DEPTH),
@@ -138,7 +142,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
         self._depth = DepthPairs(self.report)
         self._clock: tuple[int, int] | None = None
-        self._line = PendingQueue()
+        self._line = CloudLine(lambda item: self.dropped.update([item[0]]))
         self._initial = StampBuffer()
         self._outputs = BodyOutputs(settings.output, settings.ros4hri, factory, self._model)
         self.outputs = self._outputs.ports
@@ -162,7 +166,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def flush(self) -> Output:
         """Fit the clouds that still wait."""
-        return self._fit_depth(self._depth.flush()) + self._release(final=True) + self._publish_silhouettes()
+        for pair in self._depth.flush():
+            self._append("depth", *pair)
+        return self._release(final=True) + self._publish_silhouettes()
 
     def fit(
         self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None
@@ -236,54 +242,59 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         if port == "silhouettes":
             return self._fit_silhouettes(message)
         if port in ("depth", "camera_info"):
-            return self._fit_depth(self._depth.add(port, message))
-        if port in COLOUR_PORTS:
+            for pair in self._depth.add(port, message):
+                self._append("depth", *pair)
+        elif port in COLOUR_PORTS:
             self._puppets.add(port, message)
-            return self._release(final=False)
-        stamp = stamp_ns(message)
-        if port == "points":
-            self._line.waiting.append((stamp, (message, False)))
-        elif self._line.is_late(stamp):
+        elif port == "points":
+            self._append(port, message)
+        elif self._line.is_late(stamp_ns(message)):
             self.counters["late initial"] += 1
         else:
-            self._initial.put(stamp, message)
+            self._initial.put(stamp_ns(message), message)
         return self._release(final=False)
 
-    def _fit_depth(self, pairs: list[tuple[Any, Any]]) -> Output:
-        """Fit the clouds of depth images."""
+    def _append(self, port: str, message: Any, info: Any = None) -> None:
+        """Let a cloud wait, or a depth image with its camera_info."""
+        is_live = self.background is not None
+        self._line.append(stamp_ns(message), (port, message, info), MAX_WAITING if is_live else None)
+
+    def _release(self, final: bool) -> Output:
+        """Fit the clouds that have what they wait for.
+
+        While messages wait, none: a node that is behind first takes in what came, then goes on with the newest cloud.
+        """
         outputs: Output = []
-        for image, info in pairs:
+        while True:
+            if not final and self.is_behind():
+                self._line.is_behind = True
+                return outputs
+            taken = self._line.take(lambda index: final or self._is_ready(index))
+            if taken is None:
+                return outputs
+            stamp, (port, message, info) = taken
+            initial = self._initial.get(stamp)
+            self._initial.drop_until(stamp)
             try:
-                cloud = make_depth_cloud(self.factory, image, info)
+                cloud = message if port == "points" else make_depth_cloud(self.factory, message, info)
             except InputError as error:
                 self.report.count_unusable(error)
             else:
-                self._line.waiting.append((stamp_ns(cloud), (cloud, True)))
-                outputs += self._release(final=False)
-        return outputs
+                with one_blas_thread():  # several only wait for each other in products of many points with 3x3
+                    outputs += self._fit_one(stamp, cloud, port == "depth", initial)
 
-    def _release(self, final: bool) -> Output:
-        outputs: Output = []
-        while self._line.waiting:
-            stamp, (cloud, of_depth) = self._line.waiting[0]
-            initial = self._initial.get(stamp)
-            if not (final or self._is_ready(cloud.header.frame_id, stamp, initial)):
-                break
-            self._line.pop()
-            self._initial.drop_until(stamp)
-            outputs += self._fit_one(stamp, cloud, of_depth, initial)
-        return outputs
-
-    def _is_ready(self, frame: str, stamp: int, initial: Any | None) -> bool:
-        """Return whether all that is expected for the first cloud in line is there, or it has waited long enough."""
-        waiting = len(self._line.waiting) - 1
-        if "initial" in self._expected and initial is None and waiting < self.settings.wait:
+    def _is_ready(self, index: int) -> bool:
+        """Return whether all that is expected for a cloud in line is there, or it has waited long enough."""
+        stamp, (_, message, _) = self._line.waiting[index]
+        frame, waiting = message.header.frame_id, len(self._line.waiting) - 1 - index
+        if "initial" in self._expected and self._initial.get(stamp) is None and waiting < self.settings.wait:
             return False
         if waiting < self.settings.transform_wait and self._places.is_awaited(frame, stamp):
             return False
         # Without a calibration no puppet can be used, however long a cloud waits for it.
         calibrated = self._puppets.is_calibrated or "puppets/camera_info" in self._expected
-        puppets = calibrated and "puppets" in self._expected and waiting < self.settings.fusion.wait
+        first, last = self._line.first or stamp, self._line.waiting[-1][0]
+        puppets = calibrated and "puppets" in self._expected and self._puppets.is_awaited(first, last)
         return not puppets or self._puppets.is_ready(frame, stamp)
 
     def describe_rejected(self) -> dict[str, Any] | None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, I64, Array
+from flowing_puppet_ros.arrays import F64, I64, Array, Bools
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.message_types import MessageFactory, message_bytes
 
@@ -37,14 +37,21 @@ def decode_pixels(message: Any) -> tuple[F64, F64 | None, I64]:
         raise InputError(f"a point cloud with the fields {', '.join(types) or 'none'} has no {missing[0]}")
     records = _read_records(message, types)
     points = np.stack([records[name].astype(float) for name in "xyz"], axis=1)
-    good = np.isfinite(points).all(axis=1)
+    # Column by column: NumPy takes several times longer for rows of three.
+    good = _are_all(np.isfinite(points))
     if good.any():
-        good[good] = np.abs(points[good] - np.median(points[good], axis=0)).max(axis=1) < _MAX_DISTANCE_M
+        known = points if good.all() else points[good]
+        good[good] = _are_all(np.abs(known - np.median(known, axis=0)) < _MAX_DISTANCE_M)
     places = np.flatnonzero(good)
     if not all(name in types for name in _NORMALS):
         return points[good], None, places
     normals = np.stack([records[name].astype(float) for name in _NORMALS], axis=1)[good]
     return points[good], np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0), places
+
+
+def _are_all(flags: Bools) -> Bools:
+    """Return whether all three of each row (N, 3) are true."""
+    return np.asarray(flags[:, 0] & flags[:, 1] & flags[:, 2])
 
 
 def _read_records(message: Any, fields: dict[str, Any]) -> Array:
