@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stamps that do not advance, as of drivers without a clock, replaced by the times of recording."""
+"""Stamps that do not advance, as of drivers without a clock: the times of recording, or even steps, instead."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
+from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.units import NANOSECONDS
+
+ASSUMED_INTERVAL_NS = 100_000_000
+"""Between clouds whose stamps do not advance (drivers that stamp nothing)."""
 
 
 @dataclass(slots=True)
@@ -43,3 +47,27 @@ class StuckStamps:
         message.header.stamp.sec, message.header.stamp.nanosec = seconds, rest
         sentence = f"the messages on {topic} all have one stamp: they follow one another by their times of recording"
         return [sentence] if begins else []
+
+
+class CloudClock:
+    """Tells the times of the clouds of a stream, which advance even where their stamps do not."""
+
+    def __init__(self, report: Report) -> None:
+        """Start with no cloud; `report` is told of stamps that come twice."""
+        self._report = report
+        self._last: tuple[int, int] | None = None
+
+    def reset(self) -> None:
+        """Forget the clouds."""
+        self._last = None
+
+    def advance(self, stamp: int) -> int:
+        """Return the time of a cloud, ns: its stamp, or some time after the cloud before it if that has the same."""
+        earlier, self._last = self._last, (stamp, stamp)
+        if earlier is None or stamp != earlier[0]:
+            return stamp
+        self._report.warn(
+            f"two clouds have the stamp {stamp} ns: they are taken as {ASSUMED_INTERVAL_NS * 1e-9:g} s apart"
+        )
+        self._last = stamp, earlier[1] + ASSUMED_INTERVAL_NS
+        return self._last[1]

@@ -5,12 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, I64, Bools
+from flowing_puppet_ros.arrays import F64, I64
 from flowing_puppet_ros.body.cloud.coverage import is_single_view
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
@@ -19,6 +18,7 @@ from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
+from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.person_finder import (
     FoundBody,
@@ -29,11 +29,9 @@ from flowing_puppet_ros.body.upright.person_finder import (
 )
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings, nested, setting
 
-_MAX_COORDINATE = 10_000.0
 MAX_HEIGHT_M = 2.6
 """A cloud that is no wider is a person, when nobody can be told from their surroundings in it."""
 _NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
@@ -47,22 +45,6 @@ MIN_DECIDING_POINTS = 60
 """Points of a person from which on they tell whether people are seen from one side."""
 ONLY_ID = "b1"
 """Id of the person when all of a cloud is one person."""
-
-
-def _bound(default: float, text: str) -> Any:
-    return setting(default, text, unit="m", low=-_MAX_COORDINATE, high=_MAX_COORDINATE, advanced=True)
-
-
-@dataclass(frozen=True)
-class RegionSettings(Settings):
-    """The box, in the cloud's own frame, in which people are searched for."""
-
-    min_x: float = _bound(-_MAX_COORDINATE, "minimum x of the points that are used")
-    max_x: float = _bound(_MAX_COORDINATE, "maximum x of the points that are used")
-    min_y: float = _bound(-_MAX_COORDINATE, "minimum y of the points that are used")
-    max_y: float = _bound(_MAX_COORDINATE, "maximum y of the points that are used")
-    min_z: float = _bound(-_MAX_COORDINATE, "minimum z of the points that are used")
-    max_z: float = _bound(_MAX_COORDINATE, "maximum z of the points that are used")
 
 
 @dataclass(frozen=True)
@@ -84,79 +66,6 @@ class SceneSettings(Settings):
     segmentation: SegmentationSettings = nested(SegmentationSettings)
     people: PersonFinderSettings = nested(PersonFinderSettings)
     tracker: MultiBodyTrackerSettings = nested(MultiBodyTrackerSettings)
-
-
-def crop_to_region(points: F64, region: RegionSettings) -> Bools:
-    """Return which (N,) of the points (N, 3) m in the cloud's frame lie in the region."""
-    low = np.array([region.min_x, region.min_y, region.min_z])
-    high = np.array([region.max_x, region.max_y, region.max_z])
-    inside = np.ones(len(points), dtype=bool)
-    for column, least, most in zip(points.T, low, high, strict=True):  # faster than rows of three
-        inside &= (column >= least) & (column <= most)
-    return inside
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SceneCloud:
-    """A cloud with z up.
-
-    Attributes:
-        points: (N, 3) metres, in a frame that is the same for all clouds of a stream.
-        normals: (N, 3) or None.
-        stamp: nanoseconds.
-        single_view: whether it is known to be seen from one side.
-        image: its range image where it is organised, whose pixels are those of the points.
-        viewpoint: (3,) metres, where the sensor is.
-        to_sensor: (3, 3), from this frame to the sensor's own with z up, however the sensor is tilted.
-    """
-
-    points: F64
-    normals: F64 | None
-    stamp: int
-    single_view: bool = False
-    image: RangeImage | None = None
-    viewpoint: F64 = field(default_factory=lambda: np.zeros(3))
-    to_sensor: F64 = field(default_factory=lambda: np.eye(3))
-
-    @property
-    def whole(self) -> PersonCloud:
-        """All of the cloud as one person."""
-        return PersonCloud(self.points, self.normals, self.stamp)
-
-    def take(self, rows: Bools) -> SceneCloud:
-        """Return the part of the cloud whose points are `rows` (N,)."""
-        normals = None if self.normals is None else self.normals[rows]
-        return replace(self, points=self.points[rows], normals=normals, image=self.image and self.image.take(rows))
-
-    @property
-    def distance(self) -> F64:
-        """Distance (N,) m of the points from the sensor."""
-        return np.asarray(np.linalg.norm(self.points - self.viewpoint, axis=1))
-
-    def draw_image(self) -> RangeImage:
-        """Return its range image; a scan without order is drawn into one as its sensor is held."""
-        if self.image is not None:
-            return self.image
-        drawn = RangeImage.of_scan((self.points - self.viewpoint) @ self.to_sensor.T, np.zeros(3))
-        return drawn.turn(self.to_sensor.T).move(self.viewpoint)
-
-    def with_fields(self, people: Sequence[PersonCloud]) -> list[PersonCloud]:
-        """Return people seen from the viewpoint with what the sensor can know of each.
-
-        A scan without order is drawn into an image for that, unless the person is all of it: its own extent says
-        nothing about the sensor's.
-        """
-        image = self.image
-        if image is None and any(person.rows is not None for person in people):
-            image = self.draw_image()
-        if image is None:
-            return list(people)
-        return [
-            replace(person, field=image.make_field(slice(None) if person.rows is None else person.rows))
-            if self.image is not None or person.rows is not None
-            else person
-            for person in people
-        ]
 
 
 class SceneTracker:

@@ -17,7 +17,8 @@ from flowing_puppet_ros.body.scans.scan import Scan, read_scan
 from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.scans.unit import ScanUnit
 from flowing_puppet_ros.body.segmentation.people import segment_people
-from flowing_puppet_ros.body.track.scene_tracker import SceneCloud, SceneSettings, SceneTracker
+from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody, TrackStatus
 from flowing_puppet_ros.cli.scans.fit_file import make_fitter, write_result
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions, list_scene_ups

@@ -10,13 +10,8 @@ import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES
-from flowing_puppet_ros.body.track.scene_tracker import (
-    RegionSettings,
-    SceneCloud,
-    SceneSettings,
-    SceneTracker,
-    crop_to_region,
-)
+from flowing_puppet_ros.body.track.scene_cloud import RegionSettings, SceneCloud, crop_to_region
+from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
@@ -49,10 +44,9 @@ from flowing_puppet_ros.stream.messages.puppets import JointPosition, decode_bod
 from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
 from flowing_puppet_ros.stream.stamp_buffer import CloudLine, StampBuffer
+from flowing_puppet_ros.stream.stuck_stamps import CloudClock
 from flowing_puppet_ros.threads import one_blas_thread
 
-ASSUMED_INTERVAL_NS = 100_000_000
-"""Between clouds whose stamps do not advance (drivers that stamp nothing)."""
 COLOUR_PORTS = ("puppets", "puppets/camera_info", "/tf_static", "/tf")
 MAX_WAITING = 12
 """Clouds that wait at most in a live node."""
@@ -141,7 +135,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._is_fixed = False
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
         self._depth = DepthPairs(self.report)
-        self._clock: tuple[int, int] | None = None
+        self._clock = CloudClock(self.report)
         self._line = CloudLine(lambda item: self.dropped.update([item[0]]))
         self._initial = StampBuffer()
         self._outputs = BodyOutputs(settings.output, settings.ros4hri, factory, self._model)
@@ -162,7 +156,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._initial.clear()
         self._places.reset()
         self._frames.forget_moving()
-        self._clock = None
+        self._clock.reset()
 
     def flush(self) -> Output:
         """Fit the clouds that still wait."""
@@ -311,7 +305,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._coarse: list[CoarsePerson] = []
         try:
             scene, place, is_known = self._decode(cloud, of_depth)
-            scene = replace(scene, stamp=self._advance_clock(stamp))
+            scene = replace(scene, stamp=self._clock.advance(stamp))
             if is_known and place.is_fixed != self._is_fixed:
                 self._is_fixed = place.is_fixed
                 self._scene.reset()
@@ -374,17 +368,6 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
     def _step_alone(self, scene: SceneCloud, seed: int) -> tuple[list[TrackedBody], list[str]]:
         """Return the bodies of everybody in a cloud that nothing joins to the others, and nobody's ids."""
         return self._publish_ids(self._scene.step_alone(scene, seed)), []
-
-    def _advance_clock(self, stamp: int) -> int:
-        """Return the time of a cloud, ns: its stamp, or some time after the cloud before it if that has the same."""
-        earlier, self._clock = self._clock, (stamp, stamp)
-        if earlier is None or stamp != earlier[0]:
-            return stamp
-        self.report.warn(
-            f"two clouds have the stamp {stamp} ns: they are taken as {ASSUMED_INTERVAL_NS * 1e-9:g} s apart"
-        )
-        self._clock = stamp, earlier[1] + ASSUMED_INTERVAL_NS
-        return self._clock[1]
 
     def _fit_silhouettes(self, message: Any) -> Output:
         """Fit one person; bodies go out together when the last one of the same images is there."""

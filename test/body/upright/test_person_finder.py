@@ -9,7 +9,8 @@ import pytest
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
-from flowing_puppet_ros.body.track.scene_tracker import MAX_NEW_FITS, SceneCloud, SceneSettings, SceneTracker
+from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.track.scene_tracker import MAX_NEW_FITS, SceneSettings, SceneTracker
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank
 from flowing_puppet_ros.evaluate.body.synthetic_scans import make_box

@@ -23,7 +23,8 @@ from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES, parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.scans.scene_labels import LabelledScene, label_scene, read_labels
-from flowing_puppet_ros.body.track.scene_tracker import SceneCloud, SceneSettings, SceneTracker
+from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
