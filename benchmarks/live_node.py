@@ -16,6 +16,7 @@ import statistics
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -134,6 +135,20 @@ def _resident_megabytes(pid: int) -> float:
     return next(int(line.split()[1]) / 1024 for line in lines if line.startswith("VmRSS"))
 
 
+def print_figures(name: str, source: Path, measure_with: Callable[[Any], dict[str, Any]]) -> int:
+    """Print what is measured with the arrays of a file, in ROS, as JSON; return the exit status."""
+    rclpy.init(args=[])
+    try:
+        with np.load(source) as arrays:
+            print(json.dumps(measure_with(arrays)))
+    except (RuntimeError, KeyboardInterrupt, ExternalShutdownException) as error:
+        print(f"measure {name}: {error or 'interrupted'}", file=sys.stderr)
+        return 1
+    finally:
+        rclpy.try_shutdown()
+    return 0
+
+
 def main() -> int:
     """Measure according to the command line and print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -143,16 +158,9 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, required=True)
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
     given, ros_arguments = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
-    rclpy.init(args=[])
-    try:
-        with np.load(given.input) as arrays:
-            print(json.dumps(measure(given.node, arrays, given.rate, given.seconds, ros_arguments)))
-    except (RuntimeError, KeyboardInterrupt, ExternalShutdownException) as error:
-        print(f"measure {given.node}: {error or 'interrupted'}", file=sys.stderr)
-        return 1
-    finally:
-        rclpy.try_shutdown()
-    return 0
+    return print_figures(
+        given.node, given.input, lambda arrays: measure(given.node, arrays, given.rate, given.seconds, ros_arguments)
+    )
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ and forth, stamped with the current time, and prints one JSON object.
 from __future__ import annotations
 
 import argparse
-import json
 import signal
 import subprocess
 import sys
@@ -20,12 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from benchmarks.live_node import NAMESPACE, START_TIMEOUT_S
+from benchmarks.live_node import NAMESPACE, START_TIMEOUT_S, print_figures
 from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS
 from flowing_puppet_ros.node.factory import RosMessageFactory, message_type
 from flowing_puppet_ros.stream.messages.geometry import header_ns, make_camera_info, make_header
@@ -162,16 +160,9 @@ def main() -> int:
     parser.add_argument("--rate", type=float, required=True)
     parser.add_argument("--seconds", type=float, required=True)
     given = parser.parse_args()
-    rclpy.init(args=[])
-    try:
-        with np.load(given.input) as arrays:
-            print(json.dumps(measure(dict(arrays), given.rate, given.seconds)))
-    except (RuntimeError, KeyboardInterrupt, ExternalShutdownException) as error:
-        print(f"measure colour and depth: {error or 'interrupted'}", file=sys.stderr)
-        return 1
-    finally:
-        rclpy.try_shutdown()
-    return 0
+    return print_figures(
+        "colour and depth", given.input, lambda arrays: measure(dict(arrays), given.rate, given.seconds)
+    )
 
 
 if __name__ == "__main__":

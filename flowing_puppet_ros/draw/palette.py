@@ -8,7 +8,7 @@ have colours too, by their ids.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -55,6 +55,11 @@ def joint_colour(name: str) -> tuple[int, int, int]:
     if name.startswith("right_"):
         return (30, 110, 255)
     return (255, 255, 255)
+
+
+def list_person_colours(ids: Iterable[str]) -> dict[str, tuple[int, int, int]]:
+    """Return the RGB colour of each person by the order of the `ids`, which need not have numbers; they repeat."""
+    return {identity: PERSON_COLOURS[k % len(PERSON_COLOURS)] for k, identity in enumerate(ids)}
 
 
 def person_colour(identity: str) -> tuple[int, int, int]:

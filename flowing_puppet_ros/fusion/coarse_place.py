@@ -13,6 +13,7 @@ from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.fusion.puppet_joints import MIN_PUPPET_JOINTS, PuppetJoints
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.multiview.camera import Camera
 
 LONG_BONES = (
     ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
@@ -41,29 +42,36 @@ class CoarsePerson:
         return CoarsePerson(self.id, self.joints @ rotation.T + translation, self.confidence)
 
 
-def place_coarsely(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud) -> CoarsePerson | None:
-    """Return the person of a puppet where no depth is known; None where it is, or where the puppet tells no size."""
+def _place_coarsely(
+    model: StitchedPuppet, puppet: PuppetJoints, camera: Camera, seen: cKDTree | None
+) -> CoarsePerson | None:
+    """Return the person of a puppet where no depth is known; None where it is, or where the puppet tells no size.
+
+    `seen` are the pixels of the points, None without any.
+    """
     sure = puppet.known & (puppet.confidence >= MIN_CONFIDENCE)
     if np.count_nonzero(sure) < MIN_PUPPET_JOINTS:
         return None
-    rays = cloud.camera.cast_rays(puppet.pixels)
+    rays = camera.cast_rays(puppet.pixels)
     distances = _measure_distances(model, rays, sure)
     if not len(distances):
         return None
     distance = float(np.quantile(distances, LONG_SHARE))
-    seen = cloud.pixels[cloud.seen]
-    if len(seen):
-        radius = RADIUS_M * cloud.camera.focal / distance
-        near, _ = cKDTree(seen).query(puppet.pixels[sure], distance_upper_bound=max(radius, 1.0))
+    if seen is not None:
+        radius = RADIUS_M * camera.focal / distance
+        near, _ = seen.query(puppet.pixels[sure], distance_upper_bound=max(radius, 1.0))
         if np.isfinite(near).mean() > MAX_SEEN_SHARE:
             return None
-    joints = np.where(puppet.known[:, None], cloud.camera.centre + rays * distance, np.nan)
+    joints = np.where(puppet.known[:, None], camera.centre + rays * distance, np.nan)
     return CoarsePerson(puppet.id, joints, np.where(puppet.known, COARSE_CONFIDENCE * puppet.confidence, 0.0))
 
 
 def place_others(model: StitchedPuppet, puppets: Sequence[PuppetJoints], cloud: SeenCloud) -> list[CoarsePerson]:
     """Return the people of the puppets with an id of whom there is no depth."""
-    found = [place_coarsely(model, puppet, cloud) for puppet in puppets if puppet.id]
+    named = [puppet for puppet in puppets if puppet.id]
+    pixels = cloud.pixels[cloud.seen]
+    seen = cKDTree(pixels) if named and len(pixels) else None
+    found = [_place_coarsely(model, puppet, cloud.camera, seen) for puppet in named]
     return [person for person in found if person is not None]
 
 

@@ -145,9 +145,7 @@ def _fold(
     back: list[np.ndarray] = []
     for near, far in zip(names[-2::-1], names[:0:-1], strict=True):
         length = scale * float(np.linalg.norm(place[near] - place[far]))
-        step = _measure_pair_cost(choices[near], choices[far], length)
-        slope = (choices[near].depth[:, None] - choices[far].depth) / SLOPE_M
-        table = step + 0.5 * slope**2 + cost
+        table = measure_limb_cost(choices[near], choices[far], length) + cost
         back.insert(0, table.argmin(axis=1))
         cost = choices[near].cost + table.min(axis=1)
     return cost, back
@@ -161,6 +159,12 @@ def measure_bone_cost(a: F64, b: F64, length: float, spread: F64) -> F64:
     apart = np.linalg.norm(a[:, None] - b, axis=2)
     variance = (BONE_DEVIATION_M + BONE_DEVIATION_SHARE * length) ** 2 + spread**2
     return np.asarray(np.minimum(0.5 * (apart - length) ** 2 / variance, MAX_BONE_COST))
+
+
+def measure_limb_cost(near: DepthChoices, far: DepthChoices, length: float) -> F64:
+    """Return what the choices (A, B) of two joints next to each other along a limb cost, for a bone of `length` m."""
+    slope = (near.depth[:, None] - far.depth) / SLOPE_M
+    return np.asarray(_measure_pair_cost(near, far, length) + 0.5 * slope**2)
 
 
 def _measure_pair_cost(a: DepthChoices, b: DepthChoices, length: float) -> F64:

@@ -17,7 +17,7 @@ from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
 from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
 from flowing_puppet_ros.fusion.lift import LiftedJoints
-from flowing_puppet_ros.fusion.limb_depths import SLOPE_M, measure_bone_cost, measure_seen_share
+from flowing_puppet_ros.fusion.limb_depths import SLOPE_M, measure_bone_cost, measure_limb_cost, measure_seen_share
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 LIMB_PARTS = {
@@ -93,21 +93,19 @@ class LimbSearcher:
 
     def find_doubtful(self, body: BodyState, joints: LiftedJoints) -> list[int]:
         """Return the limbs of a fitted body that may be in a wrong place: joints left them open, or it is off them."""
-        doubtful = np.array([_is_doubtful(row, joints) for row in range(len(joints.points))])
         across, gap = self._measure_gaps(body, joints)
-        return self._find_limbs(doubtful | (across > MAX_GAP_M) | (gap > MAX_SEEN_GAP_M), joints)
+        return self._find_limbs(_find_doubtful(joints) | (across > MAX_GAP_M) | (gap > MAX_SEEN_GAP_M), joints)
 
     def find_lost(self, body: BodyState, joints: LiftedJoints) -> list[int]:
         """Return the limbs of a tracked body of which a joint is certainly not where the puppet sees it."""
         across, gap = self._measure_gaps(body, joints)
-        doubtful = np.array([_is_doubtful(row, joints) for row in range(len(joints.points))])
-        return self._find_limbs((across > LOST_GAP_M) | (~doubtful & (gap > LOST_SEEN_GAP_M)), joints)
+        return self._find_limbs((across > LOST_GAP_M) | (~_find_doubtful(joints) & (gap > LOST_SEEN_GAP_M)), joints)
 
     def contradicts(self, body: BodyState, joints: LiftedJoints) -> bool:
         """Return whether a joint of a limb is far from where the puppet surely sees it."""
         across, gap = self._measure_gaps(body, joints)
-        sure = ~np.array([_is_doubtful(row, joints) for row in range(len(joints.points))])
-        return bool(self._find_limbs(sure & ((across > WRONG_GAP_M) | (gap > WRONG_SEEN_GAP_M)), joints))
+        wrong = (across > WRONG_GAP_M) | (gap > WRONG_SEEN_GAP_M)
+        return bool(self._find_limbs(wrong & ~_find_doubtful(joints), joints))
 
     def _measure_gaps(self, body: BodyState, joints: LiftedJoints) -> tuple[F64, F64]:
         """Return the distances (J,) m of a body's joints from their rays, and from where they were lifted to."""
@@ -184,10 +182,7 @@ class LimbSearcher:
             outer = lists[end]
             cost = cost + outer.cost
             if middle in lists:
-                slope = (lists[middle].depth[:, None] - outer.depth) / SLOPE_M
-                spread = np.hypot(lists[middle].spread[:, None], outer.spread)
-                bone = measure_bone_cost(lists[middle].points, outer.points, float(length[1]), spread)
-                cost = cost + bone + 0.5 * slope**2
+                cost = cost + measure_limb_cost(lists[middle], outer, float(length[1]))
         share = np.exp(cost.min() - cost).ravel()
         drawn = np.unravel_index(rng.choice(len(share), SAMPLES, p=share / share.sum()), cost.shape)
         free = rng.random(SAMPLES) < FREE_SHARE
@@ -206,6 +201,11 @@ class LimbSearcher:
         pick = np.zeros(len(groups), dtype=np.int64)
         pick[list(limb)] = row
         return particles_to_state(self._model, groups, pick)
+
+
+def _find_doubtful(joints: LiftedJoints) -> Bools:
+    """Return which joints (J,) may well be elsewhere on their rays."""
+    return np.array([_is_doubtful(row, joints) for row in range(len(joints.points))])
 
 
 def _is_doubtful(row: int, joints: LiftedJoints) -> bool:

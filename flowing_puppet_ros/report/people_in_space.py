@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from flowing_puppet_ros.bag.reader import Bag
-from flowing_puppet_ros.draw.palette import person_colour
+from flowing_puppet_ros.draw.palette import list_person_colours
 from flowing_puppet_ros.draw.pictures import scale_to_height
 from flowing_puppet_ros.draw.plots import Series, draw_line_plot
 from flowing_puppet_ros.evaluate.bag.recording import CameraRecord, Joints, Recording
@@ -61,7 +61,7 @@ def gather_space(recording: Recording, given: Bag, made: Bag) -> SpaceData | Non
         return None
     cameras = [c for c in recording.cameras.values() if c.camera is not None and c.image_topic][:_MAX_CAMERAS]
     most = max(map(len, people.values()))
-    colours = {identity: person_colour(f"p{number}") for number, identity in enumerate(_list_ids(people), 1)}
+    colours = list_person_colours(_list_ids(people))
     stamps = pick_evenly([stamp for stamp, group in people.items() if len(group) == most], _MOMENTS)
     images = fetch_messages(given, {camera.image_topic: stamps for camera in cameras})
     moments = []

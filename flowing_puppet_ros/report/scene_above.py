@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.bag.reader import Bag
-from flowing_puppet_ros.draw.palette import person_colour
+from flowing_puppet_ros.draw.palette import list_person_colours
 from flowing_puppet_ros.draw.plots import ticks
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bag.recording import Recording, body_joints, sensor_cloud_topics, to_cloud
@@ -32,7 +32,7 @@ MAX_GAP = 3.0
 MIN_SHOWN = 0.1
 """Probability to be a person from which on a rejected candidate is in the picture wherever it is."""
 MAX_REASONS = 12
-"""RejectedMark candidates in the table, the likeliest."""
+"""Rejected candidates in the table, the likeliest."""
 _LAST_CLOUDS = 3  # that are tried, in case the last one is damaged
 
 
@@ -164,10 +164,10 @@ def draw_above(above: AboveData) -> str:
     ]
     x, y = view.place(np.zeros((1, 2)))[0]
     body.append(f'<path d="M{x - 7:.1f},{y:.1f}h14M{x:.1f},{y - 7:.1f}v14" stroke="currentColor" stroke-width="2"/>')
-    # Ids need not have numbers, so that colours go by the order in which people come.
+    colours = list_person_colours(above.tracks)
     body += [
-        view.draw_track(identity, track, "rgb({},{},{})".format(*person_colour(f"p{number}")))
-        for number, (identity, track) in enumerate(above.tracks.items(), start=1)
+        view.draw_track(identity, track, "rgb({},{},{})".format(*colours[identity]))
+        for identity, track in above.tracks.items()
     ]
     title = f"The scene from above with the tracks of {', '.join(above.tracks)}"
     return (

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -31,6 +31,7 @@ class PersonBelief:
         first: (2,) metres, where it was first.
         odds: mean log odds of a person.
         count: scans that were asked, at most `MAX_WEIGHT`.
+        asked: stamp of the last of them, nanoseconds.
         confidence: of the last body, that it is a person and close; None before.
         many: whether the last scan that was asked showed many points of it.
         moved: whether it was far from its first place.
@@ -44,7 +45,7 @@ class PersonBelief:
     confidence: float | None = None
     many: bool = False
     moved: bool = False
-    shown: bool = field(default=False)
+    shown: bool = False
 
     def is_due(self, stamp: int) -> bool:
         """Return whether the scan of a stamp in nanoseconds should be asked."""

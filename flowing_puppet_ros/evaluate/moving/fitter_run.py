@@ -15,10 +15,11 @@ from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS, SeenKeypoint
 from flowing_puppet_ros.fusion.puppet_joints import ANKLE_DROP
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
-from flowing_puppet_ros.stream.messages.geometry import make_camera_info, make_header, make_transform
+from flowing_puppet_ros.stream.messages.geometry import make_camera_info, make_header, make_transform, stamp_ns
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import PUPPETS, TRANSFORMS
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
+from flowing_puppet_ros.threads import one_blas_thread
 
 BEGIN_NS = 1_000_000_000
 TRANSFORM_RATE_HZ = 50.0
@@ -68,18 +69,15 @@ class FitterRun:
 
 def run_fitter(view: RobotView, sensing: Sensing) -> FitterRun:
     """Let the body fitter see the people."""
-    component = BodyFitterComponent(BodyFitterSettings.from_mapping({"fixed_frame": sensing.fixed_frame}), FACTORY)
-    for port in ("puppets", "puppets/camera_info"):
-        component.set_expected(port, True)
     moments = list(view.look(sensing))
-    found: dict[int, Any] = {}
-    for _, _, port, message in sorted(list_messages(view, sensing, moments), key=lambda item: item[:2]):
-        for name, made in component.handle(port, message):
-            if name == "bodies":
-                found[made.header.stamp.sec * 10**9 + made.header.stamp.nanosec] = made
-    for name, made in component.flush():
-        if name == "bodies":
-            found[made.header.stamp.sec * 10**9 + made.header.stamp.nanosec] = made
+    messages = sorted(list_messages(view, sensing, moments), key=lambda item: item[:2])
+    with one_blas_thread():  # as nodes and replays do
+        component = BodyFitterComponent(BodyFitterSettings.from_mapping({"fixed_frame": sensing.fixed_frame}), FACTORY)
+        for port in ("puppets", "puppets/camera_info"):
+            component.set_expected(port, True)
+        outputs = [made for _, _, port, message in messages for made in component.handle(port, message)]
+        outputs += component.flush()
+    found = {stamp_ns(message): message for name, message in outputs if name == "bodies"}
     return _compare(view, moments, found, component.report.drain_warnings())
 
 

@@ -45,7 +45,6 @@ from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
 from flowing_puppet_ros.stream.stamp_buffer import CloudLine, StampBuffer
 from flowing_puppet_ros.stream.stuck_stamps import CloudClock
-from flowing_puppet_ros.threads import one_blas_thread
 
 COLOUR_PORTS = ("puppets", "puppets/camera_info", "/tf_static", "/tf")
 MAX_WAITING = 12
@@ -274,8 +273,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             except InputError as error:
                 self.report.count_unusable(error)
             else:
-                with one_blas_thread():  # several only wait for each other in products of many points with 3x3
-                    outputs += self._fit_one(stamp, cloud, port == "depth", initial)
+                outputs += self._fit_one(stamp, cloud, port == "depth", initial)
 
     def _is_ready(self, index: int) -> bool:
         """Return whether all that is expected for a cloud in line is there, or it has waited long enough."""

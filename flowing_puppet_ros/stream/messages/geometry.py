@@ -284,16 +284,19 @@ def _is_old(link: _Link, stamp: int) -> bool:
 def _find_pose(link: _Link, stamp: int | None) -> tuple[F64, F64] | None:
     """Return position and rotation in the parent at a stamp, ns, or the last ones; None outside of what is known."""
     if link.is_static or stamp is None:
-        later = len(link.stamps) - 1
-        share = 0.0
-    else:
-        later = bisect_left(link.stamps, stamp)
-        if later == len(link.stamps) or (later == 0 and link.stamps[0] > stamp):
-            return None
-        share = 0.0 if link.stamps[later] == stamp else 1.0
-    after = np.array(link.poses[later][:3]), rotation_matrix(link.poses[later][3:])
-    if share == 0.0 or stamp is None:
-        return after
-    before = np.array(link.poses[later - 1][:3]), rotation_matrix(link.poses[later - 1][3:])
+        return _read_pose(link.poses[-1])
+    later = bisect_left(link.stamps, stamp)
+    if later == len(link.stamps):
+        return None
+    if link.stamps[later] == stamp:
+        return _read_pose(link.poses[later])
+    if later == 0:
+        return None
+    before, after = _read_pose(link.poses[later - 1]), _read_pose(link.poses[later])
     share = (stamp - link.stamps[later - 1]) / (link.stamps[later] - link.stamps[later - 1])
     return before[0] + share * (after[0] - before[0]), before[1] @ exp(share * log(before[1].T @ after[1]))
+
+
+def _read_pose(pose: tuple[float, ...]) -> tuple[F64, F64]:
+    """Return the position (3,) and rotation (3, 3) of x, y, z, qx, qy, qz, qw."""
+    return np.array(pose[:3]), rotation_matrix(pose[3:])
