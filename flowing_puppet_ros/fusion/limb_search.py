@@ -105,7 +105,7 @@ class LimbSearcher:
         """
         across, gap = self._measure_gaps(body, joints)
         open_or_off = _find_doubtful(joints) | (across > MAX_GAP_M) | (gap > MAX_SEEN_GAP_M)
-        return self._find_limbs(open_or_off & _find_on_surface(joints), joints)
+        return self._find_limbs(open_or_off & find_on_surface(joints), joints)
 
     def find_lost(self, body: BodyState, joints: LiftedJoints) -> list[int]:
         """Return the limbs of a tracked body of which a joint is certainly not where the puppet sees it."""
@@ -227,7 +227,7 @@ def _is_doubtful(row: int, joints: LiftedJoints) -> bool:
     return bool(joints.hidden[row] or several or not sure)
 
 
-def _find_on_surface(joints: LiftedJoints) -> Bools:
+def find_on_surface(joints: LiftedJoints) -> Bools:
     """Return which joints (J,) have a surface at their pixels."""
     on = np.zeros(len(joints.points), dtype=bool)
     on[[row for row, choices in joints.choices.items() if choices.seen.any()]] = True
