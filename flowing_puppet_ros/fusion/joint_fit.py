@@ -138,7 +138,7 @@ class JointFitter:
             body, coarse, joints, self.limbs.find_doubtful(body, joints),
             lambda tried: run(tried, cloud, targets, close, terms),
         )  # fmt: skip
-        held = self._hold(joints, targets, unknown)
+        held = self.hold(joints, targets, unknown)
         fit = self.fitter.assess(run(body, cloud, held, free, terms), cloud)
         return replace(fit, reliable=fit.reliable and not self.limbs.contradicts(fit.state, joints))
 
@@ -154,7 +154,7 @@ class JointFitter:
         )  # fmt: skip
         return None if found is body else self.fitter.assess(found, cloud)
 
-    def _hold(self, joints: LiftedJoints, targets: JointTargets, unknown: float) -> JointTargets:
+    def hold(self, joints: LiftedJoints, targets: JointTargets, unknown: float) -> JointTargets:
         """Return the pull of joints in the last steps: of the hidden ones, and of all where the ends are out of sight.
 
         Nothing else would hold the hidden ones. Of a body that is cut off, the cloud holds no limb along its axis, and

@@ -131,7 +131,7 @@ class LimbSearcher:
     def measure_cost(self, body: BodyState, coarse: CoarseCloud, joints: LiftedJoints) -> float:
         """Return the cost of a body in a cloud plus that of its joints, metres."""
         places = self._model.joints(self._model.vertices(body))
-        return self._bank.cost(body, coarse) + float(_measure_joint_cost(places[None], joints, _can_count(joints))[0])
+        return self._bank.cost(body, coarse) + float(measure_joint_cost(places[None], joints, _can_count(joints))[0])
 
     def _sample(
         self,
@@ -160,7 +160,7 @@ class LimbSearcher:
         cost = self._bank.coverage_cost(groups, coarse, limb, without.distance).cost
         counted = np.zeros(places.shape[1], dtype=bool)
         counted[rows[1:]] = True
-        cost = cost + _measure_joint_cost(places, joints, counted & _can_count(joints))
+        cost = cost + measure_joint_cost(places, joints, counted & _can_count(joints))
         chosen: list[int] = []
         for row in np.argsort(cost, kind="stable"):
             apart = [np.linalg.norm(places[row, rows] - places[other, rows], axis=1).max() for other in chosen]
@@ -238,7 +238,7 @@ def _can_count(joints: LiftedJoints) -> Bools:
     return np.asarray(joints.found & (joints.confidence >= MIN_CONFIDENCE))
 
 
-def _measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F64:
+def measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F64:
     """Return what the `counted` (J,) joints of bodies, at `places` (P, J, 3) m, cost each of them (P,), metres."""
     cost = np.zeros(len(places))
     for row in np.flatnonzero(counted):
