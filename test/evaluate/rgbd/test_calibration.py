@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of said confidence against the share that is right, from scores whose shares are known."""
 
+from dataclasses import replace
+
 import pytest
 
 from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, tabulate_calibration
@@ -19,7 +21,7 @@ def test_shares_are_those_of_the_joints_and_bodies() -> None:
     good = score(True, 0.9, 0.02, (2, 0, 10), (1, 0, 10))
     fair = score(True, 0.7, 0.12, (2, 0, 10), (0, 0, 8))
     poor = score(False, 0.5, 0.03, (0, 4, 8), (0, 1, 4))
-    missing = RgbdScore("whole", False, *[float("nan")] * 7, False, True, 4, 4, False, 0.0, 0.3)
+    missing = replace(score(False, 0.0, float("nan"), (0, 0, 0), (0, 0, 0)), found=False)
     table = {(row["kind"], row["reliable"]): row for row in tabulate_calibration([good, fair, poor, missing])}
     assert table["seen joints", "yes"]["count"] == 20
     assert table["seen joints", "yes"]["within_10_cm"] == pytest.approx(0.9)
