@@ -262,8 +262,8 @@ class BodyTracker:
             points, stamp, viewpoint, MIN_VISIBLE_OF_FEW if on_floor else MIN_VISIBLE
         )
         if viewpoint is not None and not on_floor:
-            thin = -(-len(points) // self._settings.max_view_points)
-            points, normals = points[::thin], None if normals is None else normals[::thin]
+            few = PersonCloud(points, normals).thin(self._settings.max_view_points)
+            points, normals = few.points, few.normals
         last = self._state.last
         oriented = normals is None and viewpoint is None and last is not None
         if oriented and last is not None:
