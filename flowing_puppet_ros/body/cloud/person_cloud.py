@@ -45,7 +45,8 @@ class PersonCloud:
         if count <= max_points:
             return self
         kept = np.arange(max_points) * count // max_points
-        normals, rows = (None if each is None else each[kept] for each in (self.normals, self.rows))
+        normals = None if self.normals is None else self.normals[kept]
+        rows = None if self.rows is None else self.rows[kept]
         return replace(self, points=self.points[kept], normals=normals, rows=rows)
 
     @property
