@@ -16,13 +16,18 @@ from flowing_puppet_ros.node.launching.rgbd_topics import find_rgbd
 ARGUMENTS = {
     "camera": ("", "namespace of the camera's driver; empty: that of the only camera with colour and depth"),
     "detections": ("detections", "keypoints of people that another node finds, if one does"),
+    "flow": (
+        "fast",
+        "preset of the optical flow; medium is more accurate and takes as long as a whole camera's bodies",
+    ),
 }
 
 
 def start(values: Values) -> list[Node]:
     """Return the tracker of the colour images, and the body fitter that joins its puppets with the depth images."""
     topics = find_rgbd(values["camera"])
-    tracker = make_node(values, "puppet_tracker", {"image": topics.image, "detections": values["detections"]})
+    images = {"image": topics.image, "detections": values["detections"]}
+    tracker = make_node(values, "puppet_tracker", images, **{"flow.preset": values["flow"]})
     inputs = {"depth": topics.depth, "camera_info": topics.depth_info, "puppets/camera_info": topics.image_info}
     chosen = {"fusion.rectified": True} if topics.rectified else {}
     return [tracker, make_node(values, "body_fitter", inputs, **chosen, **humans(values))]

@@ -67,7 +67,7 @@ class BodyTrackerSettings(Settings):
         advanced=True,
     )
     max_view_points: int = setting(
-        1500, "points that a tracked cloud from one side is thinned to", low=200, high=200000, advanced=True
+        3000, "points that a tracked cloud from one side is thinned to", low=200, high=200000, advanced=True
     )
     gauss_newton_steps: int = setting(5, "Gauss-Newton steps per cloud", low=1, high=100, advanced=True)
     lost_ratio: float = setting(
