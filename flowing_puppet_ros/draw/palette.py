@@ -66,7 +66,7 @@ def list_person_colours(ids: Iterable[str]) -> dict[str, tuple[int, int, int]]:
 def person_colour(identity: str) -> tuple[int, int, int]:
     """Return the RGB colour of a person by the number that the id (`a1`, `a2`, ...) ends with, or by its letters.
 
-    Neighbouring numbers differ; two ids of letters alone, as REP-155 has them, may share a colour, but each keeps its own.
+    Neighbouring numbers differ; ids of letters alone, as REP-155 has them, may share a colour, but each keeps its own.
     """
     number = re.search(r"\d*$", identity)
     place = int(number[0]) - 1 if number and number[0] else zlib.crc32(identity.encode())
