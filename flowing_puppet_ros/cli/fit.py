@@ -129,38 +129,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit every input; one that fails is reported and the others go on."""
-    settings = FitVerbSettings.from_arguments(arguments)
-    options = FitOptions(
-        out=runner.resolve_path(arguments.out, arguments),
-        model=arguments.model,
-        up=arguments.up,
-        upright=arguments.upright,
-        unit=arguments.unit,
-        view=arguments.view,
-        viewpoint=arguments.viewpoint,
-        scene=arguments.scene,
-        camera_info=_resolve_info(arguments),
-        color=None if arguments.color is None else runner.resolve_path(arguments.color, arguments),
-        settings=settings.fitter,
-        segmentation=settings.segmentation,
-        measure=arguments.measure,
-        joints=() if arguments.joints is None else tuple(read_joints(arguments.joints).items()),
-    )
+    options = _make_options(arguments)
     sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in _find_scans(given)]
     several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
-    finished: list[dict[str, Any]] = []
-    if arguments.sequence and (arguments.scene or arguments.scheduler is not None):
-        raise InputError("--sequence fits one person in scans one after another; leave --scene and --scheduler")
-    if arguments.joints is not None and (arguments.scene or (several and not arguments.sequence)):
-        raise InputError("--joints are those of the person in one scan; give one INPUT, and leave --scene")
-    folders = [given for given in arguments.inputs if given.is_dir()] if arguments.scene else []
-    tracked = bool(folders) and options.camera_info is None
-    if tracked:
-        _refuse_untrackable(arguments)
+    tracked = arguments.scene and arguments.camera_info is None and any(given.is_dir() for given in arguments.inputs)
+    _refuse_contradictions(arguments, several, tracked)
     if arguments.rerun is not None:
         from flowing_puppet_ros.report.rerun_file import import_rerun
 
         import_rerun()
+    finished: list[dict[str, Any]] = []
 
     def tell(summary: dict[str, Any]) -> None:
         _tell(summary, arguments.json)
@@ -187,14 +165,38 @@ def run(arguments: argparse.Namespace) -> int:
     return status
 
 
-def _refuse_untrackable(arguments: argparse.Namespace) -> None:
-    """Raise InputError where the scans of a folder cannot be tracked."""
-    if len(arguments.inputs) > 1 or arguments.scheduler is not None:
+def _make_options(arguments: argparse.Namespace) -> FitOptions:
+    settings = FitVerbSettings.from_arguments(arguments)
+    return FitOptions(
+        out=runner.resolve_path(arguments.out, arguments),
+        model=arguments.model,
+        up=arguments.up,
+        upright=arguments.upright,
+        unit=arguments.unit,
+        view=arguments.view,
+        viewpoint=arguments.viewpoint,
+        scene=arguments.scene,
+        camera_info=_resolve_info(arguments),
+        color=None if arguments.color is None else runner.resolve_path(arguments.color, arguments),
+        settings=settings.fitter,
+        segmentation=settings.segmentation,
+        measure=arguments.measure,
+        joints=() if arguments.joints is None else tuple(read_joints(arguments.joints).items()),
+    )
+
+
+def _refuse_contradictions(arguments: argparse.Namespace, several: bool, tracked: bool) -> None:
+    """Raise InputError where flags contradict one another or the inputs."""
+    if arguments.sequence and (arguments.scene or arguments.scheduler is not None):
+        raise InputError("--sequence fits one person in scans one after another; leave --scene and --scheduler")
+    if arguments.joints is not None and (arguments.scene or (several and not arguments.sequence)):
+        raise InputError("--joints are those of the person in one scan; give one INPUT, and leave --scene")
+    if tracked and (len(arguments.inputs) > 1 or arguments.scheduler is not None):
         raise InputError(
             "--scene tracks people through the scans of one folder, one after another; give one folder and no"
             " --scheduler, or the files in it to fit each by itself"
         )
-    if not 0 < arguments.scan_rate < np.inf:
+    if tracked and not 0 < arguments.scan_rate < np.inf:
         raise InputError(f"--scan-rate is {arguments.scan_rate:g}; give the scans a second, such as 10")
 
 
