@@ -12,7 +12,7 @@ points each.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -32,6 +32,10 @@ KEPT, FINISHED = (8, 6, 4), 3  # bodies whose limbs are sampled again in each ro
 LIMB_SAMPLES = 600  # poses sampled for each limb in a round
 # Parts of an arm and of a leg from the trunk outwards, without the side.
 LIMB_CHAINS = (("shoulder", "upper_arm", "lower_arm", "hand"), ("upper_leg", "lower_leg", "foot"))
+COMBINED_SAMPLES = 40  # of them, that are combined with those of another limb
+MIN_DIFFERENCE_M = 0.03  # mean distance between the centres of two bodies' parts, below which only the better is kept
+type Limb = tuple[int, ...]
+"""The parts of a limb, from the trunk outwards."""
 MAX_COST_INCREASE_M = 0.003
 """Cost by which a sampled limb may exceed the present one and still be refined."""
 MIN_DENSE_POINTS = 2000
@@ -53,11 +57,13 @@ class SingleViewSearch:
         self._bank = bank
         self._proposer = proposer
         self._refiner = refiner
-        self._limbs = [
+        limbs = [
             tuple(model.tree.index(f"{side}_{name}") for name in chain)
             for chain in LIMB_CHAINS
             for side in ("left", "right")
         ]
+        self._limbs = [(limb,) for limb in limbs]
+        self._pairs = [(limbs[0], limbs[1]), (limbs[2], limbs[3])]
 
     def run(
         self, cloud: SingleViewCloud, rng: np.random.Generator, steps: int, progress: Callable[[float], None]
@@ -71,21 +77,19 @@ class SingleViewSearch:
             progress: called with the fraction done, 0 to 1.
         """
         coarse = CoarseCloud.of(cloud)
-        found = [(body, True) for body in self._find_starts(cloud, coarse)]
+        bodies = self._find_starts(cloud, coarse)
         progress(0.3)
 
-        def improve(start: tuple[tuple[BodyState, bool], np.random.Generator]) -> tuple[BodyState, bool]:
-            (body, changed), own = start
-            return self._improve_limbs(body, cloud, coarse, own) if changed else (body, False)
-
         for number, kept in enumerate(KEPT):
-            pairs = zip(found[:kept], rng.spawn(kept), strict=False)
-            found = sorted(
-                parallel_map(improve, list(pairs), self._threads), key=lambda pair: self._bank.cost(pair[0], coarse)
-            )
+
+            def improve(start: tuple[BodyState, np.random.Generator], paired: bool = number % 2 > 0) -> BodyState:
+                return self._improve_limbs(start[0], cloud, coarse, start[1], self._pairs if paired else self._limbs)
+
+            starts = list(zip(bodies[:kept], rng.spawn(kept), strict=False))
+            bodies = self._rank(parallel_map(improve, starts, self._threads), coarse)
             progress(0.3 + 0.5 * (number + 1) / len(KEPT))
         weights = _final_weights(cloud, steps)
-        bodies = parallel_map(lambda pair: self._refine(pair[0], cloud, weights), found[:FINISHED], self._threads)
+        bodies = parallel_map(lambda body: self._refine(body, cloud, weights), bodies[:FINISHED], self._threads)
         progress(1.0)
         return min(bodies, key=lambda body: self._bank.cost(body, coarse))
 
@@ -94,44 +98,68 @@ class SingleViewSearch:
         bodies = self._bank.find_best(coarse, STARTS)
         for weights, kept in ((FIRST, KEPT_STARTS), (SECOND, KEPT[0])):
             refine = partial(self._refine, cloud=cloud, weights=weights)
-            bodies = parallel_map(refine, bodies, self._threads)
-            bodies = sorted(bodies, key=lambda body: self._bank.cost(body, coarse))[:kept]
+            bodies = self._rank(parallel_map(refine, bodies, self._threads), coarse)[:kept]
         return bodies
 
+    def _rank(self, bodies: list[BodyState], coarse: CoarseCloud) -> list[BodyState]:
+        """Return the bodies, the best first, without those that are nearly the same as a better one."""
+        ranked: list[BodyState] = []
+        for body in sorted(bodies, key=lambda body: self._bank.cost(body, coarse)):
+            if all(np.linalg.norm(body.center - other.center, axis=1).mean() > MIN_DIFFERENCE_M for other in ranked):
+                ranked.append(body)
+        return ranked
+
     def _improve_limbs(
-        self, body: BodyState, cloud: SingleViewCloud, coarse: CoarseCloud, rng: np.random.Generator
-    ) -> tuple[BodyState, bool]:
-        """Sample every limb again and keep what is better after Gauss-Newton; return also whether anything is."""
-        cost, changed = self._bank.cost(body, coarse), False
-        for limb in self._limbs:
-            proposed = self._resample_limb(body, limb, coarse, cost + MAX_COST_INCREASE_M, rng)
+        self,
+        body: BodyState,
+        cloud: SingleViewCloud,
+        coarse: CoarseCloud,
+        rng: np.random.Generator,
+        groups: Sequence[tuple[Limb, ...]],
+    ) -> BodyState:
+        """Sample limbs again, those of each group at once, and keep what is better after Gauss-Newton."""
+        cost = self._bank.cost(body, coarse)
+        for limbs in groups:
+            proposed = self._resample_limbs(body, limbs, coarse, cost + MAX_COST_INCREASE_M, rng)
             if proposed is None:
                 continue
             proposed = self._refine(proposed, cloud, CLOSE)
             new_cost = self._bank.cost(proposed, coarse)
             if new_cost < cost:
-                body, cost, changed = proposed, new_cost, True
-        return body, changed
+                body, cost = proposed, new_cost
+        return body
 
-    def _resample_limb(
-        self, body: BodyState, limb: tuple[int, ...], coarse: CoarseCloud, max_cost: float, rng: np.random.Generator
+    def _resample_limbs(
+        self, body: BodyState, limbs: tuple[Limb, ...], coarse: CoarseCloud, max_cost: float, rng: np.random.Generator
     ) -> BodyState | None:
-        """Return the body with the best of many samples of one limb, None when all cost more than `max_cost`."""
-        groups = states_to_particles(self._model, [body])
-        rest = [part for part in range(len(groups)) if part not in limb]
+        """Return the body with the best of many samples of some limbs, None when all cost more than `max_cost`.
+
+        Of several limbs the best samples of each are combined.
+        """
+        groups, model = states_to_particles(self._model, [body]), self._model
+        rest = [part for part in range(len(groups)) if not any(part in limb for limb in limbs)]
         without = self._bank.coverage_cost(groups, coarse, rest)
-        for part in limb:
-            above = groups[self._model.tree.parents[part]]
-            above = above if len(above) > 1 else above.take(np.zeros(LIMB_SAMPLES, dtype=np.int64))
-            groups[part] = self._proposer.attach_to_parent(part, above, body.shape[part], rng)
-        sampled = self._bank.coverage_cost(groups, coarse, limb, without.distance)
-        total = sampled.cost + without.cost - without.distance.mean()
-        best = int(total.argmin())
-        if total[best] > max_cost:
+        distance, own_cost = without.distance, without.cost - without.distance.mean()
+        rows = np.zeros((1, 0), dtype=np.int64)
+        for limb in limbs:
+            for part in limb:
+                above = groups[model.tree.parents[part]]
+                above = above if len(above) > 1 else above.take(np.zeros(LIMB_SAMPLES, dtype=np.int64))
+                groups[part] = self._proposer.attach_to_parent(part, above, body.shape[part], rng)
+            sampled = self._bank.coverage_cost(groups, coarse, limb, without.distance)
+            best = np.argsort(sampled.cost, kind="stable")[:COMBINED_SAMPLES]
+            apart, other = sampled.distance[best], (sampled.cost - sampled.distance.mean(axis=1))[best]
+            distance = np.minimum(distance[:, None], apart).reshape(-1, distance.shape[1])
+            own_cost = np.add.outer(own_cost, other).reshape(-1)
+            rows = np.column_stack([np.repeat(rows, len(best), axis=0), np.tile(best, len(rows))])
+        total = distance.mean(axis=1) + own_cost
+        chosen = int(total.argmin())
+        if total[chosen] > max_cost:
             return None
         pick = np.zeros(len(groups), dtype=np.int64)
-        pick[list(limb)] = best
-        return particles_to_state(self._model, groups, pick)
+        for limb, row in zip(limbs, rows[chosen], strict=True):
+            pick[list(limb)] = row
+        return particles_to_state(model, groups, pick)
 
     def _refine(self, body: BodyState, cloud: SingleViewCloud, weights: RefineWeights) -> BodyState:
         none = JointTargets.none(self._model)
