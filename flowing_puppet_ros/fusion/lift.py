@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from flowing_puppet_ros.arrays import F64, Bools
 from flowing_puppet_ros.fusion.limb_depths import (
@@ -122,13 +123,20 @@ def _find_near(puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray) -> Bool
     return np.asarray(outside < np.maximum(MIN_RADIUS_PX, RADIUS_M * cloud.camera.focal / depth))
 
 
+@njit(cache=True, nogil=True)
 def _find_surfaces(depth: F64) -> F64:
     """Return the depths (K,) of the surfaces to which depths (N,) belong, the one with the most points first."""
     ordered = np.sort(depth)
-    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > SURFACE_GAP_M) + 1)
-    size = np.array([len(group) for group in groups])
-    chosen = [k for k in np.argsort(-size, kind="stable") if size[k] >= max(MIN_POINTS, MIN_SURFACE_SHARE * size.sum())]
-    return np.array([np.median(groups[k]) for k in chosen[:MAX_SURFACES]] or [np.median(ordered)])
+    ends = np.append(np.flatnonzero(np.diff(ordered) > SURFACE_GAP_M) + 1, len(ordered))
+    size = np.diff(np.append(np.zeros(1, np.int64), ends))
+    chosen = np.argsort(-size, kind="mergesort")
+    chosen = chosen[size[chosen] >= max(float(MIN_POINTS), MIN_SURFACE_SHARE * len(ordered))][:MAX_SURFACES]
+    if not len(chosen):
+        return np.full(1, np.median(ordered))
+    found = np.empty(len(chosen))
+    for k, group in enumerate(chosen):
+        found[k] = np.median(ordered[ends[group] - size[group] : ends[group]])
+    return found
 
 
 def _collect_samples(puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray) -> dict[int, F64]:
