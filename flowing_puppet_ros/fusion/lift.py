@@ -152,12 +152,23 @@ def _collect_samples(puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray) -
 
 
 def _find_trunk_depth(puppet: PuppetJoints, samples: dict[int, F64], trunk: list[int]) -> float:
-    """Return the median depth of the trunk, of all joints where the trunk has none, or NaN."""
+    """Return the median depth of the trunk, of all joints where the trunk has none, or NaN.
+
+    Joints count by their squared confidence: at hidden hips, the cloud shows the table before them.
+    """
     for joints in (trunk, list(samples)):
-        medians = [np.median(samples[joint]) for joint in joints if len(samples.get(joint, ())) >= MIN_POINTS]
-        if medians:
-            return float(np.median(medians))
+        known = [joint for joint in joints if len(samples.get(joint, ())) >= MIN_POINTS]
+        if known:
+            depth = np.array([np.median(samples[joint]) for joint in known])
+            return _find_weighted_median(depth, puppet.confidence[known] ** 2)
     return float("nan")
+
+
+def _find_weighted_median(values: F64, weight: F64) -> float:
+    """Return the least of the values (N,) up to which lies half of the weight (N,), or more."""
+    order = np.argsort(values, kind="stable")
+    total = np.cumsum(weight[order])
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])
 
 
 def _kind(name: str) -> str:
