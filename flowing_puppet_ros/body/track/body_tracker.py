@@ -325,7 +325,8 @@ class BodyTracker:
         self.counters["searched"] += 1
         cloud = prepared.cloud
         if prepared.floor is not None and isinstance(cloud, SingleViewCloud):
-            fit = self._upright.fit(cloud, prepared.floor).fit
+            facing = None if tracked is None else tracked.state.rotation[0, :2, 0]
+            fit = self._upright.fit(cloud, prepared.floor, facing).fit
             return self._keep_closer(tracked, fit)
         # Normals that were turned by a body that is lost would mislead the search.
         normals = None if prepared.oriented else cloud.normals
