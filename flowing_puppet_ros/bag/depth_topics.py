@@ -205,11 +205,8 @@ def _see_the_same(first: Any, second: Any, frames: FrameTree) -> bool:
     if pose is None:
         return False
     try:
-        camera = Camera.from_info(second.k, [], second.width, second.height, np.eye(3), np.zeros(3))
-        rays = Camera.from_info(first.k, [], first.width, first.height, np.eye(3), np.zeros(3)).undistort(
-            np.stack(
-                np.meshgrid(*(np.linspace(0, side - 1, RIG_GRID) for side in (first.width, first.height))), axis=-1
-            )
+        own_camera, camera = (
+            Camera.from_info(info.k, [], info.width, info.height, np.eye(3), np.zeros(3)) for info in (first, second)
         )
     except InputError:
         return False
