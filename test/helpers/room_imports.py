@@ -155,8 +155,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "evaluate.moving": {
         "bag",
+        "body.fit",
+        "body.track",
         "evaluate.body",
         "evaluate.rgbd",
+        "evaluate.scene",
         "fusion",
         "model",
         "multiview",
@@ -263,7 +266,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "node.launching": set(),
     "node.live": {"bag", "doctor", "node"},
     "report": {"bag", "draw", "evaluate", "evaluate.bag", "flow", "model", "model.ds", "multiview", "stream.messages"},
-    "stream": {"body.scans", "fusion", "model", "multiview", "stream.messages"},
+    "stream": {"body.scans", "body.track", "fusion", "model", "multiview", "stream.messages"},
     "stream.components": {
         "body.fit",
         "body.measurements",
