@@ -26,9 +26,7 @@ from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.cli.scans.fit_file import fit_file, list_files
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions
-from flowing_puppet_ros.cli.scans.fit_sequence import fit_sequence
 from flowing_puppet_ros.cli.scans.given_joints import read_joints
-from flowing_puppet_ros.cli.scans.track_scene import track_scene
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.exchange.files import FORMATS, write_people
 from flowing_puppet_ros.exchange.motion import read_fit
@@ -148,10 +146,16 @@ def run(arguments: argparse.Namespace) -> int:
 
     verb = runner.Verb("fit", fit_file, list_files, tell)
     if arguments.sequence:
+        from flowing_puppet_ros.cli.scans.fit_sequence import (
+            fit_sequence,  # the trackers are loaded for those who track
+        )
+
         make_out_folder(options.out)
         fit_sequence(sources, options, tell)
         status = 0
     elif tracked:
+        from flowing_puppet_ros.cli.scans.track_scene import track_scene
+
         make_out_folder(options.out)
         status = track_scene(sources, arguments.scan_rate, options, tell)
     elif several:
