@@ -37,7 +37,7 @@ REFIT_INTERVAL_NS, LIMB_INTERVAL_NS = 1_000_000_000, 250_000_000
 MAX_PATIENCE = 16
 """Times that interval: it doubles with every attempt that finds nothing better, which takes as long as ten clouds."""
 BETTER_SHARE = 0.95
-"""Two-way distance of a new fit, relative to the tracked body's, below which it is better; it has more points."""
+"""Two-way distance of a new fit, relative to the tracked body's, below which it is better."""
 MAX_PLANE_CLOUDS = 40
 """Clouds after which floor and walls are searched again though they are still there."""
 MAX_SAME_PERSON_M = 0.6
@@ -205,7 +205,7 @@ class FusedTracker:
                 return None if tracker.lost else fit
             doubtful = fit is not None and not fit.reliable and not tracker.hidden and job.track.refit.is_due(stamp)
             if fit is None or tracker.lost or doubtful:
-                fresh = self._people.fit_claim(claim, job.person)
+                fresh = self._people.fit_claim(claim, job.person.thin(self._settings.max_view_points))
                 limit = np.inf if fit is None else BETTER_SHARE * fit.two_way_distance
                 better = fresh is not None and fresh.two_way_distance < limit
                 job.track.refit.record(stamp, better)

@@ -20,7 +20,7 @@ ALIGNED = RefineWeights(stitch=1.0, pose=1e-5, shape=1e-2, pairwise=1e-5, sigma_
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TimedFit:
+class BodyObservation:
     """A fit, the time of its cloud in nanoseconds, and the mean (3,) of the cloud's points, metres."""
 
     fit: BodyFit
@@ -28,7 +28,7 @@ class TimedFit:
     middle: F64
 
 
-def extrapolate(before: TimedFit | None, last: TimedFit, stamp: int) -> BodyState:
+def extrapolate(before: BodyObservation | None, last: BodyObservation, stamp: int) -> BodyState:
     """Return the last body, moved on by its last motion in proportion to the time."""
     state = last.fit.state
     if before is None:
@@ -42,7 +42,7 @@ def extrapolate(before: TimedFit | None, last: TimedFit, stamp: int) -> BodyStat
     )
 
 
-def translate(before: TimedFit | None, last: TimedFit, stamp: int) -> BodyState:
+def translate(before: BodyObservation | None, last: BodyObservation, stamp: int) -> BodyState:
     """Return the last body, moved on as its torso moved, in the pose that it has."""
     state = last.fit.state
     if before is None:
@@ -56,6 +56,6 @@ def align(refiner: GaussNewton, body: BodyState, places: JointTargets) -> BodySt
     return refiner.run(body, None, places, replace(ALIGNED, shape_center=body.shape.mean(axis=0)))
 
 
-def _stretch(before: TimedFit, last: TimedFit, stamp: int) -> float:
+def _stretch(before: BodyObservation, last: BodyObservation, stamp: int) -> float:
     """Return by how many frames the last motion is extrapolated."""
     return min((stamp - last.stamp) / (last.stamp - before.stamp), MAX_STRETCH)

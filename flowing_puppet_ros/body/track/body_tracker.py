@@ -25,7 +25,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, ch
 from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.track.body_motion import TimedFit, align, extrapolate, translate
+from flowing_puppet_ros.body.track.body_motion import BodyObservation, align, extrapolate, translate
 from flowing_puppet_ros.body.upright.upright_fit import (
     FEW_POINTS,
     MIN_MANY_POINTS,
@@ -96,8 +96,8 @@ class _TrackState:
     is normally seen (points times squared metres of distance), `lost`: the body is not where the person is.
     """
 
-    before: TimedFit | None = None
-    last: TimedFit | None = None
+    before: BodyObservation | None = None
+    last: BodyObservation | None = None
     best: float = np.inf
     frames: int = 0
     visible: float = 0.0
@@ -157,7 +157,7 @@ class BodyTracker:
 
     def start(self, person: PersonCloud, fit: BodyFit) -> None:
         """Start from a body that was found in the person's cloud."""
-        seen = TimedFit(fit, person.stamp, person.points.mean(axis=0))
+        seen = BodyObservation(fit, person.stamp, person.points.mean(axis=0))
         self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
 
     def correct(self, fit: BodyFit, parts: Sequence[int]) -> None:
@@ -262,8 +262,8 @@ class BodyTracker:
             points, stamp, viewpoint, MIN_VISIBLE_OF_FEW if on_floor else MIN_VISIBLE
         )
         if viewpoint is not None and not on_floor:
-            thin = -(-len(points) // self._settings.max_view_points)
-            points, normals = points[::thin], None if normals is None else normals[::thin]
+            few = PersonCloud(points, normals).thin(self._settings.max_view_points)
+            points, normals = few.points, few.normals
         last = self._state.last
         oriented = normals is None and viewpoint is None and last is not None
         if oriented and last is not None:
@@ -294,7 +294,7 @@ class BodyTracker:
         state = self._state
         if prepared.floor is not None:
             fit = keep_place_only(self._fitter.model, fit, len(prepared.cloud.points))
-        seen = TimedFit(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
+        seen = BodyObservation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
         best = state.best if lost or prepared.occluded else min(state.best, fit.two_way_distance)
         frames = state.frames + (not prepared.occluded)
         self._state = replace(state, before=state.last, last=seen, best=best, frames=frames, lost=lost)
@@ -325,8 +325,7 @@ class BodyTracker:
         self.counters["searched"] += 1
         cloud = prepared.cloud
         if prepared.floor is not None and isinstance(cloud, SingleViewCloud):
-            facing = None if tracked is None else tracked.state.rotation[0, :2, 0]
-            fit = self._upright.fit(cloud, prepared.floor, facing).fit
+            fit = self._upright.fit(cloud, prepared.floor).fit
             return self._keep_closer(tracked, fit)
         # Normals that were turned by a body that is lost would mislead the search.
         normals = None if prepared.oriented else cloud.normals
@@ -351,7 +350,7 @@ class BodyTracker:
         self._state = _TrackState(best=fit.two_way_distance, visible=self._state.visible)
         return fit
 
-    def _predict(self, last: TimedFit, middle: F64, stamp: int) -> BodyState:
+    def _predict(self, last: BodyObservation, middle: F64, stamp: int) -> BodyState:
         """Return the last body, moved on by its last motion in proportion to the time.
 
         After a long gap, which a full fit leaves in a live stream too, it moves as the middle of the cloud did.
