@@ -3,10 +3,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.body.track.rig_agreement import measure_disagreement
 from flowing_puppet_ros.body.track.rig_scene import RigScene
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.errors import InputError
@@ -24,6 +29,10 @@ MAX_SILENCE_NS = 500_000_000
 """From the last cloud of a sensor, within which what it misses is left out: without it bodies would jump."""
 MAX_MISSED = 10
 """Moments in a row that a sensor which is alive may miss; then its clouds are never near the others' in time."""
+COMPARED_MOMENTS, MAX_FREE_SHARE = 10, 0.3
+"""Moments by which it is told whether sensors are where they are said to be, and the median share of what one saw that
+another saw through from which on they are not: it is 0.02 to 0.1 where they are, and half where one is 2 degrees or
+10 cm off."""
 
 type SensedCloud = tuple[SceneCloud, SensorPlace, bool]
 """A cloud with z up, the place of its sensor, and whether that is known."""
@@ -83,6 +92,7 @@ class DepthRig:
         self._sync = TimeSynchronizer(self.names, slop, patience=self._settings.max_waiting, min_items=1)
         self._last: dict[str, int] = {}
         self._missed = 0
+        self._compared, self._shares = 0, dict[tuple[str, str], list[float]]()
 
     def add(self, port: str, message: Any) -> list[RigMoment]:
         """Add a message of one of the `ports`; return the moments that are now complete."""
@@ -136,7 +146,7 @@ class DepthRig:
         `decode` makes a scene of a cloud message, and is told whether it is a depth image's. InputError when no sensor
         can be used.
         """
-        parts, left_out = [], []
+        parts, used, left_out = [], [], []
         for name, (kind, message, info) in moment.seen.items():
             problem = self._places.describe_missing(message.header.frame_id, stamp_ns(message))
             if problem:
@@ -150,11 +160,27 @@ class DepthRig:
                 continue
             if len(scene.points):
                 parts.append(scene)
+                used.append(name)
         for sentence in left_out:
             self._report.count_unusable(InputError(sentence))
         if not parts:
             raise InputError("no sensor has a point in the region of interest")
+        if len(parts) == len(self.names) and self._compared < COMPARED_MOMENTS:
+            self._compared += 1
+            self._compare(used, measure_disagreement(parts))
         return RigScene.merge(parts, stamp_ns(moment)), self._places.find_fixed(), True
+
+    def _compare(self, names: Sequence[str], share: F64) -> None:
+        """Warn of sensors that go on seeing things in space that another one sees through."""
+        for (i, first), (j, second) in combinations(enumerate(names), 2):
+            both = [each for each in (share[i, j], share[j, i]) if np.isfinite(each)]
+            shares = self._shares.setdefault((first, second), [])
+            shares += [float(np.mean(both))] if both else []
+            if self._compared == COMPARED_MOMENTS and shares and np.median(shares) > MAX_FREE_SHARE:
+                self._report.warn(
+                    f"{first} and {second} do not fit together: {100 * np.median(shares):.0f} % of what one of them "
+                    "saw stands where the other saw through; check their transforms on /tf, and their stamps"
+                )
 
 
 def _list_ports(name: str) -> tuple[Port, ...]:

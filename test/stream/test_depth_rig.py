@@ -12,7 +12,7 @@ from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
-from flowing_puppet_ros.stream.depth_rig import MAX_MISSED, DepthRig, DepthRigSettings
+from flowing_puppet_ros.stream.depth_rig import COMPARED_MOMENTS, MAX_MISSED, DepthRig, DepthRigSettings
 from flowing_puppet_ros.stream.messages.geometry import (
     FrameTree,
     make_camera_info,
@@ -48,6 +48,16 @@ def depth_from(angle: float, points: np.ndarray) -> np.ndarray:
     nearest = np.full((HEIGHT, WIDTH), np.inf)
     np.minimum.at(nearest, (rows[inside], columns[inside]), local[inside, 2])
     return np.where(np.isfinite(nearest), nearest, 0.0)
+
+
+def room_from(angle: float) -> np.ndarray:
+    """Return the depths (H, W) m of the walls, the floor and the ceiling of a room of 7 x 7 m."""
+    columns, rows = np.meshgrid(np.arange(WIDTH) - (WIDTH - 1) / 2, np.arange(HEIGHT) - (HEIGHT - 1) / 2)
+    rays = np.stack([columns / FOCAL, rows / FOCAL, np.ones_like(rows)], axis=-1) @ axes_of(angle).T
+    eye = AWAY_M * np.array([np.cos(angle), np.sin(angle), 0.0])
+    ends = np.where(rays > 0, np.array([3.5, 3.5, 1.6]), np.array([-3.5, -3.5, -0.92]))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(np.nanmin((ends - eye) / rays, axis=-1))
 
 
 def frames_of(angles: Iterable[float], shift: float = 0.0) -> Any:
@@ -114,14 +124,13 @@ def test_clouds_that_are_never_near_in_time_are_used_one_by_one_and_it_is_said()
 def test_a_camera_without_a_transform_is_left_out_with_a_sentence() -> None:
     two = frames_of((0.0, 2.0))
     two.transforms = two.transforms[:1]
-    points = cloud_of(MAN, 3000)[0]
     component = BodyFitterComponent(BodyFitterSettings.from_mapping({"rig.cameras": "cam0,cam1"}), FACTORY)
     component.handle("/tf_static", two)
     rig = component._rig
     assert rig is not None
     moment = next(iter([*feed(rig, [(0, TENTH), (1, TENTH)]), *rig.flush()]))
     scene, place, _ = rig.merge(moment, component._decode)
-    assert len(scene.parts) == 1 and place.is_fixed and len(points)
+    assert len(scene.parts) == 1 and place.is_fixed
     (sentence,) = component.report.drain_warnings()
     assert sentence.startswith("cam1 is left out: ") and "cam1_optical_frame" in sentence
 
@@ -149,6 +158,26 @@ def measure(angles: tuple[float, ...], frames: Any = None) -> tuple[list[float],
             gaps = [np.linalg.norm(np.array(joints[name][:3]) - MAN[name]) for name in LIMBS]
             errors.append(float(np.mean(gaps)))
     return errors, component
+
+
+@pytest.mark.slow
+def test_a_camera_that_is_not_where_it_is_said_to_be_is_told_of_and_one_that_is_is_not() -> None:
+    points = cloud_of(MAN, 60_000)[0]
+    for shift, expected in ((0.0, 0), (0.15, 1)):
+        angles = (0.0, 1.2)
+        component = BodyFitterComponent(BodyFitterSettings.from_mapping({"rig.cameras": "cam0,cam1"}), FACTORY)
+        component.handle("/tf_static", frames_of(angles, shift))
+        rig = component._rig
+        assert rig is not None
+        depth = [depth_from(angle, points) for angle in angles]
+        depth = [np.where(image == 0, room_from(angle), image) for angle, image in zip(angles, depth, strict=True)]
+        for time in range(10, 12 + COMPARED_MOMENTS):
+            for number, image in enumerate(depth):
+                for port, message in messages_of(number, time * TENTH, image):
+                    for moment in rig.add(port, message):
+                        rig.merge(moment, component._decode)
+        found = [sentence for sentence in component.report.drain_warnings() if "do not fit together" in sentence]
+        assert len(found) == expected, (shift, found)
 
 
 @pytest.mark.slow

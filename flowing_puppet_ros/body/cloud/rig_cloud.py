@@ -89,5 +89,6 @@ class RigCloud(SingleViewCloud):
         return np.any([part.sees(vertices, normals) for part in self.parts], axis=0)
 
     def free_space_term(self, vertices: np.ndarray, sigma: float) -> VertexQuadratic:
-        """Return the sum of the quadratics that pull vertices (V, 3) out of the space each sensor saw to be free."""
-        return VertexQuadratic.sum([part.free_space_term(vertices, sigma) for part in self.parts])
+        """Return the mean of the quadratics that pull vertices (V, 3) out of the space each sensor saw to be free."""
+        total = VertexQuadratic.sum([part.free_space_term(vertices, sigma) for part in self.parts])
+        return VertexQuadratic(total.matrix / len(self.parts), total.vector / len(self.parts))

@@ -18,6 +18,7 @@ from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
+from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.seen_free import SeenFree
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
@@ -176,8 +177,8 @@ class SceneTracker:
         if not people:
             raise InputError(_NOBODY.format(len(cloud.points)))
         people = self._with_viewpoint(cloud, people, remember=False)
-        fits = [(self._fit(person, seed, progress), person.proven) for person in people]
-        proven = [fit for fit, proven in fits if proven or fit.reliable]
+        fits = [(person, self._fit(person, seed, progress)) for person in people]
+        proven = [fit for person, fit in fits if person.proven or shows_person(person, fit)]
         return [TrackedBody(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:

@@ -30,7 +30,7 @@ JITTER_RAD = 0.2  # of their places on the ring
 CIRCLE_M, FIRST_GAP_M = (0.45, 0.8), 1.0  # of the people about the middle; between two of them at least
 AIM_HEIGHT_M = 0.9
 MAX_MATCH_M = 0.5  # between the mean joints of a body and of the person that it is
-CUPBOARDS_M = (((2.0, 0.3, 0.4), (0.5, 0.8, 0.8)), ((-1.0, -1.7, 0.9), (0.4, 0.6, 1.8)))  # middle and size
+CUPBOARDS_M = (((4.0, 0.6, 0.4), (0.5, 0.8, 0.8)), ((-2.0, -3.7, 0.9), (0.4, 0.6, 1.8)))  # middle and size
 
 
 class CameraRing:
