@@ -77,7 +77,8 @@ def list_choices(
         ray: (3,) unit vector from the camera to the joint.
         axis: (3,) the camera's axis.
         centre: (3,) metres, the camera's.
-        surfaces: (K,) depths of the surfaces at the pixel, metres, the most probable first.
+        surfaces: (K,) depths of the surfaces at the pixel, metres, the most probable first; none where the sensor has
+            no value.
         offset: distance of the joint behind the surface, metres along the ray.
         middle: depth of the trunk, metres.
         reach: of the grid around it, metres.
@@ -89,7 +90,7 @@ def list_choices(
     on_surface = surfaces + offset * slope
     depth = np.concatenate([on_surface, grid])
     rank = np.arange(len(surfaces))
-    behind = grid > on_surface.min() + GRID_M / 2
+    behind = grid > on_surface.min() + GRID_M / 2 if len(surfaces) else np.ones(len(grid), dtype=bool)
     seen_cost = -np.log(seen_share) + np.log(2.0) * rank
     grid_cost = np.where(behind, -np.log(1 - seen_share), -np.log(MISSED))
     return DepthChoices(

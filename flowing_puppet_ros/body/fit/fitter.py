@@ -6,12 +6,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.cloud.limb_crop import crop_to_limbs
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleViewCloud
 from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings, Progress, sub_progress
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
@@ -25,6 +27,7 @@ from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, ExactCloud
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import one_blas_thread
 
@@ -73,8 +76,12 @@ class BodyFitter:
         self.model = model
         self.settings = settings
         self.hypotheses = BodyHypotheses(model, settings)
-        self._nonrigid = NonRigidRefinement(model.faces, len(model.part_of_vertex), NonRigidWeights())
         self._beneath = BodyBeneath(model, self.gauss_newton)
+
+    @cached_property
+    def _nonrigid(self) -> NonRigidRefinement:
+        """The refinement beyond the model, made when a dense whole cloud first needs it."""
+        return NonRigidRefinement(self.model.faces, len(self.model.part_of_vertex), NonRigidWeights())
 
     @property
     def gauss_newton(self) -> GaussNewton:
@@ -94,7 +101,7 @@ class BodyFitter:
         *,
         initial: Mapping[str, tuple[float, float, float, float]] | None = None,
         viewpoint: np.ndarray | None = None,
-        field: SensorField | None = None,
+        field: SensorField | SensorRig | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
         nonrigid: bool = True,
@@ -116,7 +123,7 @@ class BodyFitter:
                 person is upright with unknown yaw.
             viewpoint: (3,) position of the sensor in metres, for a cloud that shows one side only.
             field: what the sensor at the viewpoint can know of the person; without it, all that is not in the cloud
-                counts as free.
+                counts as free; of several sensors what all can know, and which of them saw each point.
             seed: overrides the settings' seed.
             progress: called with the fraction done, 0 to 1.
             nonrigid: refine the vertices beyond the model where a whole cloud is dense.
@@ -145,9 +152,12 @@ class BodyFitter:
         points: np.ndarray,
         normals: np.ndarray | None,
         viewpoint: np.ndarray | None,
-        field: SensorField | None = None,
+        field: SensorField | SensorRig | None = None,
     ) -> Cloud:
         """Downsample and index a cloud; InputError when it cannot be the surface of a person."""
+        if isinstance(field, SensorRig):
+            self.prepare_points(points, None, viewpoint)
+            return RigCloud.seen_by(points, field)
         points, normals = self.prepare_points(points, normals, viewpoint)
         if normals is None:
             normals = estimate_normals(points, viewpoint)
@@ -205,7 +215,7 @@ class BodyFitter:
         points: np.ndarray,
         normals: np.ndarray | None,
         initial: Mapping[str, tuple[float, float, float, float]],
-        sensor: tuple[np.ndarray | None, SensorField | None],
+        sensor: tuple[np.ndarray | None, SensorField | SensorRig | None],
         rng: np.random.Generator,
         progress: Progress,
     ) -> BodyFit:

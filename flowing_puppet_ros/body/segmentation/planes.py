@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import label
 
 MIN_TRIALS, MAX_TRIALS, TRIALS_TIMES_POINTS = 200, 3000, 2_000_000
 """RANSAC trials. Small clouds may have a small floor, and take more trials in the same time."""
@@ -236,6 +235,8 @@ def _fit_best(
 
 def _largest_piece(along: np.ndarray) -> np.ndarray:
     """Return the points (M, 2) in metres of the piece with most cells, which touch, if only at corners."""
+    from scipy.ndimage import label  # loaded here: a fit of one person needs no planes
+
     cell = np.floor((along - along.min(axis=0)) / CELL_M).astype(np.int64)
     filled = np.zeros(cell.max(axis=0) + 1, dtype=bool)
     filled[tuple(cell.T)] = True

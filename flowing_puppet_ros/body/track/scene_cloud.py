@@ -66,6 +66,11 @@ class SceneCloud:
     to_sensor: F64 = field(default_factory=lambda: np.eye(3))
 
     @property
+    def is_merged(self) -> bool:
+        """Whether several sensors saw it."""
+        return False
+
+    @property
     def whole(self) -> PersonCloud:
         """All of the cloud as one person."""
         return PersonCloud(self.points, self.normals, self.stamp)

@@ -9,6 +9,7 @@ import numpy as np
 
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
@@ -20,6 +21,7 @@ from flowing_puppet_ros.body.upright.upright_bank import (
     stature_cost,
 )
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import parallel_map, usable_threads
@@ -72,7 +74,7 @@ class UprightFitter:
         points: np.ndarray,
         viewpoint: np.ndarray,
         unknown: np.ndarray | None,
-        field: SensorField | None = None,
+        field: SensorField | SensorRig | None = None,
     ) -> SingleViewCloud:
         """Return the cloud of a candidate; InputError when part of it lies behind the sensor.
 
@@ -82,6 +84,8 @@ class UprightFitter:
             unknown: (K, 3) m, see `ScanRays.find_unknown`; None where there is a field.
             field: what the sensor can know of the candidate.
         """
+        if isinstance(field, SensorRig):
+            return RigCloud.seen_by(points, field)
         points = downsample(points, None, MAX_FIT_POINTS)[0]
         return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, unknown, field)
 
@@ -89,9 +93,10 @@ class UprightFitter:
         """Return the bank's best bodies with their costs in metres."""
         return make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS)
 
-    def fit(self, cloud: SingleViewCloud, floor: float) -> UprightFit:
-        """Fit the best upright body to a cloud; `floor` is z of the floor, metres."""
-        return self.refine(self.find_rough(cloud, floor), cloud, floor)
+    def fit(self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None) -> UprightFit:
+        """Fit the best upright body to a cloud; `floor` is z of the floor, m; `facing` (2,) as in `UprightBank`."""
+        starts = make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS, facing)
+        return self.refine(starts, cloud, floor)
 
     def refine(self, starts: list[tuple[float, BodyState]], cloud: SingleViewCloud, floor: float) -> UprightFit:
         """Refine bodies and return the best; `floor` is z of the floor, metres."""
