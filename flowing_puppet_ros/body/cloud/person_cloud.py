@@ -49,7 +49,8 @@ class PersonCloud:
         kept = np.arange(max_points) * count // max_points
         normals = None if self.normals is None else self.normals[kept]
         rows = None if self.rows is None else self.rows[kept]
-        return replace(self, points=self.points[kept], normals=normals, rows=rows)
+        field = self.field.own(self.field.owner[kept]) if isinstance(self.field, SensorRig) else self.field
+        return replace(self, points=self.points[kept], normals=normals, rows=rows, field=field)
 
     @property
     def middle(self) -> F64:

@@ -25,7 +25,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, ch
 from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.track.body_motion import BodyObservation, align, extrapolate, translate
+from flowing_puppet_ros.body.track.tracked_body import BodyObservation, align, extrapolate, translate
 from flowing_puppet_ros.body.upright.upright_fit import (
     FEW_POINTS,
     MIN_MANY_POINTS,
@@ -262,8 +262,8 @@ class BodyTracker:
             points, stamp, viewpoint, MIN_VISIBLE_OF_FEW if on_floor else MIN_VISIBLE
         )
         if viewpoint is not None and not on_floor:
-            few = PersonCloud(points, normals).thin(self._settings.max_view_points)
-            points, normals = few.points, few.normals
+            person = replace(person, points=points, normals=normals).thin(self._settings.max_view_points)
+            points, normals = person.points, person.normals
         last = self._state.last
         oriented = normals is None and viewpoint is None and last is not None
         if oriented and last is not None:

@@ -123,13 +123,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._fitter = BodyFitter(self._model, settings.fitter)
         self._scene = SceneTracker(self._fitter, settings, self.report)
         self._looked_at: tuple[int, SensorPlace] | None = None
-        self._fused = FusedTracker(
-            PeopleFitter(self._fitter, settings.fusion),
-            settings.tracker,
-            settings.tracker.hold,
-            self.report,
-            self.publish_id,
-        )
+        people, hold = PeopleFitter(self._fitter, settings.fusion), settings.tracker.hold
+        self._fused = FusedTracker(people, settings.tracker, hold, self.report, self.publish_id)
         self._frames = FrameTree()
         self._puppets = PuppetPairs(self._model, settings.fusion, self._frames)
         self._places = SensorPlaces(
@@ -153,10 +148,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._scene.warm_up()
         self._outputs.warm_up()
         other = type(self)(replace(self.settings, up="auto", fixed_frame="", sensor_frame=""), self.factory)
-        for port in ("puppets", "puppets/camera_info"):
-            other.set_expected(port, True)
-        for port, message in warm_up.make_fitter_input(self.factory, self._model):
-            other.handle(port, message)
+        warm_up.run(other, warm_up.make_fitter_input(self.factory, self._model))
 
     def reset(self) -> None:
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""

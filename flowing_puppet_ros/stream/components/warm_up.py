@@ -15,6 +15,7 @@ from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.stream.component import Component
 from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, PUPPETS, TRANSFORMS, MessageFactory
@@ -27,6 +28,15 @@ SCALE_PX_PER_M, FOCAL_PX, DISTANCE_M = 80.0, 200.0, 2.5  # scale = focal length 
 PERIOD_NS = 100_000_000  # between two images
 FRAMES = 3  # images per camera
 WORLD_FRAME = "warm_up"
+
+
+def run(component: Component[Any], messages: Messages) -> None:
+    """Let a component, which is used for nothing else, process messages; optional inputs among them are expected."""
+    optional = {port.name for port in component.inputs if port.optional}
+    for name in optional & {name for name, _ in messages}:
+        component.set_expected(name, True)
+    for name, message in messages:
+        component.handle(name, message)
 
 
 def make_images(factory: MessageFactory, camera: str = WORLD_FRAME) -> list[Any]:
