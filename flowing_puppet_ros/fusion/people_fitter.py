@@ -144,31 +144,24 @@ class PeopleFitter:
             The claims of the puppets that have enough points, and the points (N,) of the others.
         """
         bodies = list(known) or [None] * len(puppets)
-        rows = np.flatnonzero(clear)
-        part = cloud.take(rows)  # most of a room is floor and walls
-        own = [np.ones(len(rows), dtype=bool)] * len(puppets)
+        own = [clear] * len(puppets)
         claims: list[Claim | None] = []
         extra = [self._list_body(body) for body in others]
         for _round in range(CLAIM_ROUNDS if any(body is None for body in bodies) else 1):
             claims = [
-                self._start(part, puppet, points, body)
+                self._start(cloud, puppet, points, body)
                 for puppet, points, body in zip(puppets, own, bodies, strict=True)
             ]
             limbs = [np.empty((0, 8)) if claim is None else self._list_capsules(claim) for claim in claims]
-            owner = assign_points(part.points, [*limbs, *extra])
+            owner = np.full(len(cloud.points), -1, dtype=np.int32)
+            owner[clear] = assign_points(cloud.points[clear], [*limbs, *extra])
             own = [owner == number for number in range(len(puppets))]
-
-        def mark(number: int) -> Bools:
-            marked = np.zeros(len(clear), dtype=bool)
-            marked[rows[owner == number]] = True
-            return marked
-
         found = [
-            replace(claim, joints=lift_joints(self.model, claim.puppet, part, own[number]), own=mark(number))
-            for number, claim in enumerate(claims)
-            if claim is not None and np.count_nonzero(own[number]) >= self.min_points
+            replace(claim, joints=lift_joints(self.model, claim.puppet, cloud, points), own=points)
+            for claim, points in zip(claims, own, strict=True)
+            if claim is not None and np.count_nonzero(points) >= self.min_points
         ]
-        return found, [mark(len(puppets) + number) for number in range(len(others))] if claims or others else []
+        return found, [owner == len(puppets) + number for number in range(len(others))] if claims or others else []
 
     def _start(self, cloud: SeenCloud, puppet: PuppetJoints, usable: Bools, body: BodyState | None) -> Claim | None:
         """Return a puppet's joints on the `usable` (N,) points and the body that they describe, None without one.
