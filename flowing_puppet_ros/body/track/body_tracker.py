@@ -66,9 +66,6 @@ class BodyTrackerSettings(Settings):
         high=200000,
         advanced=True,
     )
-    max_view_points: int = setting(
-        3000, "points that a tracked cloud from one side is thinned to", low=200, high=200000, advanced=True
-    )
     gauss_newton_steps: int = setting(5, "Gauss-Newton steps per cloud", low=1, high=100, advanced=True)
     lost_ratio: float = setting(
         1.3,
@@ -261,9 +258,6 @@ class BodyTracker:
         occluded = viewpoint is not None and self._update_visible(
             points, stamp, viewpoint, MIN_VISIBLE_OF_FEW if on_floor else MIN_VISIBLE
         )
-        if viewpoint is not None and not on_floor:
-            person = replace(person, points=points, normals=normals).thin(self._settings.max_view_points)
-            points, normals = person.points, person.normals
         last = self._state.last
         oriented = normals is None and viewpoint is None and last is not None
         if oriented and last is not None:
