@@ -18,7 +18,7 @@ from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleVie
 from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings, Progress, sub_progress
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.quality import assess_fit
-from flowing_puppet_ros.body.fit.visibility import BodyVisibility, judge_visibility
+from flowing_puppet_ros.body.fit.visibility import BodyVisibility, judge_visibility, rate_joints
 from flowing_puppet_ros.body.refine.body_beneath import BodyBeneath
 from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton
 from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
@@ -67,6 +67,11 @@ class BodyFit:
     reliable: bool
     two_way_distance: float
     visibility: BodyVisibility
+
+    @property
+    def joint_confidence(self) -> np.ndarray:
+        """Probability (J,) that each joint is within 10 cm."""
+        return rate_joints(self.visibility.joints, self.reliable, self.confidence)
 
 
 class BodyFitter:
