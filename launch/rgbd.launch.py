@@ -2,8 +2,8 @@
 """Fit bodies to the people before a camera with colour and depth: `ros2 launch flowing_puppet_ros rgbd.launch.py`.
 
 `camera:=/camera` names the driver's namespace; without it there may be one camera only. With several, as in
-`camera:=/left,/right`, one body a person is fitted to the depth images of all of them, which /tf joins. The layouts of RealSense,
-Orbbec, ZED, Azure Kinect, HSR and OpenNI drivers are known.
+`camera:=/left,/right`, one body a person is fitted to the depth images of all of them, which /tf joins. The layouts of
+RealSense, Orbbec, ZED, Azure Kinect, HSR and OpenNI drivers are known.
 """
 
 from __future__ import annotations
