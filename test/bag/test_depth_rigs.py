@@ -24,7 +24,8 @@ def looking_along(yaw: float) -> np.ndarray:
 
 def graph_of(places: list[tuple[tuple[float, float, float], float]], linked: int) -> Graph:
     """Return the graph of depth cameras at places with yaws, of which so many have a transform."""
-    frames, topics, samples, infos = FrameTree(), {}, {}, {}
+    frames, topics = FrameTree(), dict[str, str]()
+    samples, infos = dict[str, ImageSample](), dict[str, Any]()
     header = make_header(FACTORY, 0, "map")
     links = [
         make_transform(FACTORY, header, f"eye{number}", np.array(place), looking_along(yaw))

@@ -162,7 +162,7 @@ def test_colour_and_depth_of_a_camera_are_joined(monkeypatch: pytest.MonkeyPatch
 
 def test_several_cameras_with_depth_give_one_body_a_person(monkeypatch: pytest.MonkeyPatch) -> None:
     image, info = ["sensor_msgs/msg/Image"], ["sensor_msgs/msg/CameraInfo"]
-    seen = {}
+    seen: dict[str, list[str]] = {}
     for camera in ("left", "right"):
         seen |= {f"/{camera}/color/image_raw": image, f"/{camera}/color/camera_info": info}
         seen |= {f"/{camera}/depth/image_rect_raw": image, f"/{camera}/depth/camera_info": info}

@@ -32,7 +32,7 @@ class _KnowingFitter(BodyFitter):
         *,
         initial: Mapping[str, tuple[float, float, float, float]] | None = None,
         viewpoint: np.ndarray | None = None,
-        field: SensorField | None = None,
+        field: SensorField | SensorRig | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
         nonrigid: bool = True,
