@@ -23,7 +23,6 @@ from flowing_puppet_ros.body.fit.partial_view import measure_unknown_share, stre
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.fusion.lift import LiftedJoints
@@ -47,9 +46,12 @@ HIDDEN_SHARE = 0.25
 MIN_START_CONFIDENCE, MIN_LIMB_CONFIDENCE = 0.1, 0.3
 """In a start: what joints of trunk and head count at least, since a puppet places them as the rest of the body
 suggests, and below which those of limbs do not count, since a hanging arm is a better guess."""
+HELD_SHARE, HELD_UNKNOWN = 0.3, 0.15
+"""Of the weight that seen joints keep in the last steps, and the share of the body out of sight from which on."""
 START_STEPS, FEW_STEPS = 15, 6
 """Of Gauss-Newton from the joints alone, for a start and where the body only needs to be about right."""
 SHOULDERS = ("left_shoulder", "right_shoulder")
+LOWER_TRUNK = ("left_hip", "right_hip", "pelvis", "belly")
 
 type NamedJoints = dict[str, tuple[float, float, float, float]]
 """x, y, z in metres and a weight, by name."""
@@ -72,10 +74,10 @@ class JointFitter:
         floor = np.where(self._is_limb, 0.0, MIN_START_CONFIDENCE)
         weight = np.where(joints.found, np.sqrt(np.maximum(joints.confidence, floor)), 0.0)
         certain = np.where(joints.hidden, HIDDEN_SHARE * weight, weight)
-        try:
-            targets = make_joint_targets(self.model, self._name(joints, certain))
-        except InputError:
-            targets = make_joint_targets(self.model, _add_trunk(self.model, self._name(joints, weight)))
+        named = self._name(joints, certain)
+        if not any(name in named for name in LOWER_TRUNK):
+            named = _add_trunk(self.model, named, self._name(joints, weight))
+        targets = make_joint_targets(self.model, named)
         return body_from_joints(self.model, self.fitter.gauss_newton, targets, steps)
 
     def _name(self, joints: LiftedJoints, weight: F64) -> NamedJoints:
@@ -124,7 +126,7 @@ class JointFitter:
             body, coarse, joints, self.limbs.find_doubtful(body, joints),
             lambda tried: run(tried, cloud, targets, close, terms),
         )  # fmt: skip
-        held = self._hold_hidden(joints, targets)
+        held = self._hold(joints, targets, unknown)
         fit = self.fitter.assess(run(body, cloud, held, free, terms), cloud)
         return replace(fit, reliable=fit.reliable and not self.limbs.contradicts(fit.state, joints))
 
@@ -140,9 +142,14 @@ class JointFitter:
         )  # fmt: skip
         return None if found is body else self.fitter.assess(found, cloud)
 
-    def _hold_hidden(self, joints: LiftedJoints, targets: JointTargets) -> JointTargets:
-        """Return the pull of the hidden joints alone, which nothing else would hold."""
-        return replace(targets, weight=np.where(joints.hidden, targets.weight, 0.0))
+    def _hold(self, joints: LiftedJoints, targets: JointTargets, unknown: float) -> JointTargets:
+        """Return the pull of joints in the last steps: of the hidden ones, and of all where the ends are out of sight.
+
+        Nothing else would hold the hidden ones. Of a body that is cut off, the cloud holds no limb along its axis, and
+        of a few centimetres there the shape would make many of the stature. `unknown` is the body's share out of sight.
+        """
+        share = HELD_SHARE * float(np.clip(unknown / HELD_UNKNOWN, 0.0, 1.0))
+        return replace(targets, weight=np.where(joints.hidden, 1.0, share) * targets.weight)
 
 
 def swap_lifted(model: StitchedPuppet, joints: LiftedJoints) -> LiftedJoints:
@@ -158,13 +165,16 @@ def swap_lifted(model: StitchedPuppet, joints: LiftedJoints) -> LiftedJoints:
     )
 
 
-def _add_trunk(model: StitchedPuppet, joints: NamedJoints) -> NamedJoints:
-    """Return joints that lie on a line, as shoulders do, with the neck and the pelvis of somebody upright."""
-    if not all(name in joints for name in SHOULDERS):
+def _add_trunk(model: StitchedPuppet, joints: NamedJoints, places: NamedJoints) -> NamedJoints:
+    """Return the joints with the neck and the pelvis of somebody upright, if `places` have both shoulders.
+
+    Arms alone do not tell which way the trunk goes on below the shoulders.
+    """
+    if not all(name in places for name in SHOULDERS):
         return joints
     template = dict(zip(model.joint_names, model.joints(model.vertices(model.rest_state())), strict=True))
-    found, mean = (_stand_between(*(np.array(known[name][:3]) for name in SHOULDERS)) for known in (joints, template))
-    sure = min(joints[name][3] for name in SHOULDERS)
+    found, mean = (_stand_between(*(np.array(known[name][:3]) for name in SHOULDERS)) for known in (places, template))
+    sure = min(places[name][3] for name in SHOULDERS)
     added = {}
     for name in ("neck", "pelvis"):
         x, y, z = found[0] + found[1] @ mean[1].T @ (template[name] - mean[0])

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.multiview.camera import Camera
 
 # Cells, in pixels, within which the nearest point hides those behind it where camera and sensor stand apart.
@@ -52,6 +52,16 @@ class SeenCloud:
         if np.linalg.norm(camera.centre - viewpoint) > MAX_SAME_PLACE_M:
             seen[inside] = _find_unhidden(pixels[inside], depth[inside])
         return cls(points, np.where(seen[:, None], pixels, np.nan), depth, camera, inside, viewpoint)
+
+    def take(self, rows: I64) -> SeenCloud:
+        """Return the part of the cloud whose points are `rows`."""
+        return replace(
+            self,
+            points=self.points[rows],
+            pixels=self.pixels[rows],
+            depth=self.depth[rows],
+            in_view=self.in_view[rows],
+        )
 
     @property
     def seen(self) -> Bools:

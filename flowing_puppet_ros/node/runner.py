@@ -9,6 +9,7 @@ from importlib import import_module
 from typing import Any
 
 from flowing_puppet_ros.errors import PuppetError
+from flowing_puppet_ros.memory import limit_arenas
 from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
 
@@ -19,6 +20,7 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
     on stderr). `module` is the module of this package whose `make_node(name)` returns the node; it is imported here,
     so that a missing ROS gives that sentence.
     """
+    limit_arenas()
     try:
         import rclpy
         from rclpy.exceptions import NameValidationException, ParameterException

@@ -37,6 +37,10 @@ figure{margin:10px 0}img{max-width:100%;height:auto;border-radius:4px;vertical-a
 .row.views{flex-wrap:nowrap;overflow-x:auto}.row.views figure{flex:0 1 24%;min-width:150px}
 .frame{display:none}.frame.on{display:block}
 .frame img{height:min(62vh,420px);width:auto;object-fit:contain;object-position:left}
+.frame.pair.on{display:flex;gap:8px}.frame.pair figure{flex:1 1 0;min-width:0}
+.frame.pair img{width:100%;height:auto;max-height:min(62vh,420px)}
+.panes:has(.pair){width:min(94vw,1500px);margin-left:calc(50% - min(47vw,750px))}
+.panes:has(.pair) .pictures{max-width:66%}
 .panes{display:flex;gap:16px;align-items:stretch}.panes>*{flex:1 1 0;min-width:0}.pictures{flex:0 1 auto;max-width:58%}
 .space{display:flex;flex-direction:column}.space canvas{width:100%;flex:1 1 380px;min-height:380px;touch-action:none;
 border:1px solid var(--rule);border-radius:4px;cursor:grab}[hidden]{display:none!important}
@@ -59,7 +63,8 @@ svg .line{fill:none;stroke-width:1.8;stroke-linejoin:round}
 .key{display:inline-block;width:22px;height:4px;border-radius:2px;margin-right:7px;vertical-align:middle}
 .ramp{width:120px;height:10px;image-rendering:pixelated;vertical-align:middle}
 details{margin:10px 0}summary{cursor:pointer}
-@media(max-width:720px){.panes{flex-direction:column}.pictures{max-width:none}th[scope=row],td.n{white-space:normal;overflow-wrap:normal}table{font-size:.88rem}
+@media(max-width:720px){.panes{flex-direction:column}.pictures,.panes:has(.pair) .pictures{max-width:none}
+.panes:has(.pair){width:auto;margin-left:0}th[scope=row],td.n{white-space:normal;overflow-wrap:normal}table{font-size:.88rem}
 tr:has(>:nth-child(5))>*{white-space:nowrap}}
 """ + "".join(f".s{k}{{stroke:var(--c{k})}}.d{k}{{fill:var(--c{k})}}.k{k}{{background:var(--c{k})}}" for k in range(8))
 

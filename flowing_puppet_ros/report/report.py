@@ -140,7 +140,12 @@ def _make_time_section(data: ReportData) -> str:
             "of the puppet, nearer parts over farther ones; dots are joints: larger is more confident, hollow is "
             "below one half."
         )
-        frames = [(data.seconds(s), image, f"{data.shown_camera}, {data.seconds(s):.2f} s") for s, image in data.strip]
+        frames = [(data.seconds(stamp), _list_pictures(data, stamp, image)) for stamp, image in data.strip]
+        if data.overlaid:
+            notes.append(
+                "Beside it, the bodies of the nearest cloud over the same image, as its lens shows them; what the "
+                "sensor did not see of them is pale."
+            )
     elif data.cameras:
         notes.append("The input bag has no images at the stamps of the puppets, so the track cannot be drawn.")
     if data.scene is not None:
@@ -153,6 +158,16 @@ def _make_time_section(data: ReportData) -> str:
         return paragraph("There is nothing that changes over time in this bag.")
     shown = make_timeline(frames, data.scene, plots, "Time") if frames or data.scene is not None else plots
     return "".join(map(paragraph, notes)) + shown
+
+
+def _list_pictures(data: ReportData, stamp: int, image: np.ndarray) -> list[tuple[np.ndarray, str]]:
+    """Return the pictures of one moment with captions: the puppets, and the bodies over the same image if any."""
+    pictures = [(image, f"{data.shown_camera}, {data.seconds(stamp):.2f} s")]
+    if stamp in data.overlaid:
+        drawn, cloud = data.overlaid[stamp]
+        when = "no body" if cloud is None else f"bodies of the cloud at {data.seconds(cloud):.2f} s"
+        pictures.append((drawn, when))
+    return pictures
 
 
 def _make_plots(data: ReportData) -> str:

@@ -13,6 +13,9 @@ from flowing_puppet_ros.report.page import figure, json_block
 
 SCRIPTS = ("scene.js", "timeline.js")
 
+type TimelineFrame = tuple[float, Sequence[tuple[np.ndarray, str]]]
+"""Seconds, and the pictures that are shown side by side from then on, each with its caption."""
+
 _SCENE_VIEW = (
     '<div class="space"><canvas tabindex="0" role="application" aria-label="3D view of the bodies: drag or arrow keys '
     'turn, plus and minus zoom, Home resets"></canvas><div class="controls">'
@@ -24,17 +27,16 @@ _SCENE_VIEW = (
 )
 
 
-def make_timeline(
-    frames: Sequence[tuple[float, np.ndarray, str]], scene: Mapping[str, Any] | None, plots: str, label: str
-) -> str:
-    """Make pictures (seconds, image, caption) beside the 3D `scene`, plots below, and the slider for all of them.
+def make_timeline(frames: Sequence[TimelineFrame], scene: Mapping[str, Any] | None, plots: str, label: str) -> str:
+    """Make the pictures of `frames` beside the 3D `scene`, plots below, and the slider for all of them.
 
     `scene` is what `scene_3d.make_scene_data` returns; `label` is that of the slider.
     """
-    times = sorted({round(seconds, 6) for seconds, _, _ in frames} | {round(t, 6) for t in _scene_times(scene)})
+    times = sorted({round(seconds, 6) for seconds, _ in frames} | {round(t, 6) for t in _scene_times(scene)})
     pictures = "".join(
-        f'<div class="frame{"" if index else " on"}" data-t="{seconds:.6f}">{figure(image, caption, caption)}</div>'
-        for index, (seconds, image, caption) in enumerate(frames)
+        f'<div class="frame{" pair" if len(images) > 1 else ""}{"" if index else " on"}" data-t="{seconds:.6f}">'
+        f"{''.join(figure(image, caption, caption) for image, caption in images)}</div>"
+        for index, (seconds, images) in enumerate(frames)
     )
     panes = f'<div class="pictures">{pictures}</div>' if frames else ""
     if scene is not None:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,6 +40,16 @@ class PersonCloud:
     floor: float | None = None
     proven: bool = True
     field: SensorField | SensorRig | None = None
+
+    def thin(self, max_points: int) -> PersonCloud:
+        """Return the same person with every n-th point, `max_points` at most."""
+        count = len(self.points)
+        if count <= max_points:
+            return self
+        kept = np.arange(max_points) * count // max_points
+        normals = None if self.normals is None else self.normals[kept]
+        rows = None if self.rows is None else self.rows[kept]
+        return replace(self, points=self.points[kept], normals=normals, rows=rows)
 
     @property
     def middle(self) -> F64:

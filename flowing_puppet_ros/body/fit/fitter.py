@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -75,8 +76,12 @@ class BodyFitter:
         self.model = model
         self.settings = settings
         self.hypotheses = BodyHypotheses(model, settings)
-        self._nonrigid = NonRigidRefinement(model.faces, len(model.part_of_vertex), NonRigidWeights())
         self._beneath = BodyBeneath(model, self.gauss_newton)
+
+    @cached_property
+    def _nonrigid(self) -> NonRigidRefinement:
+        """The refinement beyond the model, made when a dense whole cloud first needs it."""
+        return NonRigidRefinement(self.model.faces, len(self.model.part_of_vertex), NonRigidWeights())
 
     @property
     def gauss_newton(self) -> GaussNewton:

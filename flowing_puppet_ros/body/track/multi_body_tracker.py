@@ -14,9 +14,9 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.assignment import assign_cheapest
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCloud
@@ -287,7 +287,7 @@ class MultiBodyTracker:
                 if distance < limit:
                     penalty = 0.0 if track.tracker.last else NO_BODY_PENALTY_M
                     cost[row, column] = penalty + distance * (OWNED_FACTOR if person.owner == row else 1.0)
-        rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
+        rows, columns = assign_cheapest(np.minimum(cost, 1e3))
         pairs = zip(rows, columns, strict=True)
         matched = {int(column): self._tracks[row] for row, column in pairs if cost[row, column] < np.inf}
         for column, middle in enumerate(middles):

@@ -20,6 +20,7 @@ from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.track.seen_free import SeenFree
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.person_finder import (
     FoundBody,
@@ -80,6 +81,7 @@ class SceneTracker:
         self._single_view: bool | None = None
         self._planes = PlaneCache()
         self._finder = PersonFinder(fitter, settings.people)
+        self._seen_free = SeenFree()
         self._searched = np.empty(0, dtype=np.int64)
         self._was_searched = False
         self._report = report or Report()
@@ -97,6 +99,7 @@ class SceneTracker:
         self._single_view = None
         self._planes = PlaneCache()
         self._finder.reset()
+        self._seen_free.reset()
         self._was_searched = False
 
     @property
@@ -238,6 +241,7 @@ class SceneTracker:
             MAX_NEW_FITS if live else None,
             MAX_NEW_FITS if remember else None,
             remember,
+            self._seen_free.add(points, cloud.viewpoint) if remember else None,
         )
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]

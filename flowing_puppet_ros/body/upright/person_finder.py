@@ -30,6 +30,9 @@ MIN_WORTHWHILE = 0.15
 """Probability by the bank's best body from which on its other bodies are refined too."""
 MIN_TRACKED = 0.5
 """Probability of a tracked body below which a new one is tried where few points show the person."""
+MIN_COME_SHARE, COME_ODDS, COME_FILTER = 0.15, 1.5, 0.3
+"""Share of the points, where the sensor once saw through, from which on something has come there; the log odds by which
+that makes it a person; and the share of the filter's limit that is asked of it. Cars and doors move too."""
 SAME_PERSON_M = 0.35  # between the middles of two bodies that are one person
 
 
@@ -95,6 +98,7 @@ class PersonFinder:
         self._rejected = RejectedPlaces(settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
         self._scan: tuple[SceneHeights, ScanRays] | None = None
+        self._come: np.ndarray | None = None
 
     def warm_up(self) -> None:
         """Do beforehand what the first scan would wait for."""
@@ -116,6 +120,7 @@ class PersonFinder:
         max_fits: int | None = None,
         max_misses: int | None = None,
         remember: bool = True,
+        come: np.ndarray | None = None,
     ) -> list[FoundBody]:
         """Find the people in a scan; the same scans give the same answer.
 
@@ -128,9 +133,10 @@ class PersonFinder:
             max_fits: bodies that are fitted at most, the likeliest first; None: as set.
             max_misses: so many fits in a row of which none is a person end it; None: none does.
             remember: whether what is no person is remembered, and what was none is left out.
+            come: which (N,) points lie where the scans before saw through; None where nothing is known.
         """
         self.last_rejected = []
-        self._scan = None
+        self._scan, self._come = None, come
         if len(points) < self._settings.min_points:
             return []
         scene = SceneHeights.of(points)
@@ -200,7 +206,7 @@ class PersonFinder:
             return JudgedFit(0.0, 0.0, fit)
         judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, scene, rays, window)
         if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
-            other = self.upright.fit(cloud, candidate.floor)
+            other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0])
             again = self._weigh(other, cloud, candidate, probability, scene, rays, window)
             judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
@@ -219,8 +225,13 @@ class PersonFinder:
     ) -> JudgedFit:
         evidence = weigh_fit(found, cloud, candidate.rows, scene, rays, window, self._fitter.model)
         model = PersonModel.load()
-        likely = 0.0 if evidence.between_others else model.combine(probability, evidence)
+        odds = COME_ODDS if self._has_come(candidate) else 0.0
+        likely = 0.0 if evidence.between_others else model.combine(probability, evidence, odds)
         return JudgedFit(likely, model.rate(likely, evidence), found.fit)
+
+    def _has_come(self, candidate: Candidate) -> bool:
+        """Return whether a candidate stands where the sensor once saw through."""
+        return self._come is not None and bool(self._come[candidate.rows].mean() > MIN_COME_SHARE)
 
     def _may_be_bent(self, candidate: Candidate, scene: SceneHeights, probability: float) -> bool:
         """Return whether a candidate may be a person who sits, bends or lifts the arms, for a full search to show."""
@@ -233,11 +244,12 @@ class PersonFinder:
         chosen = []
         for number in np.argsort(-probability, kind="stable"):
             candidate = candidates[number]
-            if probability[number] < self._settings.min_filter:
+            come = self._has_come(candidate)
+            if probability[number] < self._settings.min_filter * (COME_FILTER if come else 1.0):
                 self.last_rejected.append(
                     _describe_rejected(candidate, probability[number], "its shape is no person's")
                 )
-            elif remember and self._rejected.contains(candidate, stamp):
+            elif remember and not come and self._rejected.contains(candidate, stamp):
                 self.last_rejected.append(_describe_rejected(candidate, probability[number], "rejected before"))
             else:
                 chosen.append(int(number))

@@ -52,16 +52,21 @@ class UprightBank:
     normals: np.ndarray
     stature: np.ndarray
 
-    def find_best(self, cloud: SingleViewCloud, floor: float, count: int) -> list[tuple[float, BodyState]]:
+    def find_best(
+        self, cloud: SingleViewCloud, floor: float, count: int, facing: np.ndarray | None = None
+    ) -> list[tuple[float, BodyState]]:
         """Return the best bodies on a cloud with their costs in metres, at most two of a yaw and `count` of all.
 
         A few of them face the other way than the best: few points hardly tell front from back, and only the refined
-        bodies show which it is. `floor` is z of the floor, metres.
+        bodies show which it is. `floor` is z of the floor, metres. Where it is known to which side, `facing` (2,), all
+        face there.
         """
         rows = np.arange(len(self.points))
+        if facing is not None:
+            rows = rows[np.repeat(self.turns[:, :2, 0] @ facing > 0, POSES)]
         targets = cloud.points[farthest_points(cloud.points, FINE_TARGETS)]
         rough, _ = self._judge(cloud, floor, rows, targets[:ROUGH_TARGETS], ROUGH_POINTS)
-        rows = np.argsort(rough, kind="stable")[:FINE_BODIES]
+        rows = rows[np.argsort(rough, kind="stable")[:FINE_BODIES]]
         cost, shift = self._judge(cloud, floor, rows, targets, FINE_POINTS)
         order = np.argsort(cost, kind="stable")
         yaw = rows // POSES

@@ -93,9 +93,10 @@ class UprightFitter:
         """Return the bank's best bodies with their costs in metres."""
         return make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS)
 
-    def fit(self, cloud: SingleViewCloud, floor: float) -> UprightFit:
-        """Fit the best upright body to a cloud; `floor` is z of the floor, metres."""
-        return self.refine(self.find_rough(cloud, floor), cloud, floor)
+    def fit(self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None) -> UprightFit:
+        """Fit the best upright body to a cloud; `floor` is z of the floor, m; `facing` (2,) as in `UprightBank`."""
+        starts = make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS, facing)
+        return self.refine(starts, cloud, floor)
 
     def refine(self, starts: list[tuple[float, BodyState]], cloud: SingleViewCloud, floor: float) -> UprightFit:
         """Refine bodies and return the best; `floor` is z of the floor, metres."""

@@ -23,6 +23,7 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.settings import nested, setting
 from flowing_puppet_ros.stream.component import COMPRESSED_DEPTH, Component, Output, Port
+from flowing_puppet_ros.stream.components import warm_up
 from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyOutputSettings, id_sort_key
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriSettings
 from flowing_puppet_ros.stream.components.silhouette_bodies import SilhouetteBodies
@@ -148,8 +149,14 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self.outputs = self._outputs.ports
 
     def warm_up(self) -> None:
-        """Do beforehand what the first clouds of a live stream would wait for."""
+        """Do beforehand what the first clouds of a live stream would wait for: fit somebody made up, too."""
         self._scene.warm_up()
+        self._outputs.warm_up()
+        other = type(self)(replace(self.settings, up="auto", fixed_frame="", sensor_frame=""), self.factory)
+        for port in ("puppets", "puppets/camera_info"):
+            other.set_expected(port, True)
+        for port, message in warm_up.make_fitter_input(self.factory, self._model):
+            other.handle(port, message)
 
     def reset(self) -> None:
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""
