@@ -216,7 +216,7 @@ def _see_the_same(first: Any, second: Any, frames: FrameTree) -> bool:
     places = np.concatenate([depth * ahead for depth in RIG_DEPTHS_M]) @ pose[1].T + pose[0]
     pixels, depth = camera.project(places)
     with np.errstate(invalid="ignore"):
-        inside = ((pixels >= 0) & (pixels < camera.size)).all(axis=1) & (depth > 0)
+        inside = ((pixels >= 0) & (pixels < camera.size)).all(axis=1) & (depth > 0) & (depth < RIG_DEPTHS_M[-1])
     return bool(inside.mean() >= MIN_COMMON_SHARE)
 
 

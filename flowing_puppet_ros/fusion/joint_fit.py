@@ -23,10 +23,11 @@ from flowing_puppet_ros.body.fit.partial_view import measure_unknown_share, stre
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.fusion.lift import LiftedJoints
-from flowing_puppet_ros.fusion.limb_search import LimbSearcher
+from flowing_puppet_ros.fusion.limb_search import LimbSearcher, find_on_surface
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -46,6 +47,7 @@ HIDDEN_SHARE = 0.25
 MIN_START_CONFIDENCE, MIN_LIMB_CONFIDENCE = 0.1, 0.3
 """In a start: what joints of trunk and head count at least, since a puppet places them as the rest of the body
 suggests, and below which those of limbs do not count, since a hanging arm is a better guess."""
+MIN_GOOD_CONFIDENCE = 0.5  # of a body that is not fitted once more
 HELD_SHARE, HELD_UNKNOWN = 0.3, 0.15
 """Of the weight that seen joints keep in the last steps, and the share of the body out of sight from which on."""
 START_STEPS, FEW_STEPS = 15, 6
@@ -109,7 +111,23 @@ class JointFitter:
         return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, field=field)
 
     def fit(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
-        """Fit a body to the person's points, from `start` and with the sides exchanged, whichever is better."""
+        """Fit a body to the person's points, from `start`.
+
+        Joints of which the person has no points may be wrong: should the body be, the fit without them may be better.
+        """
+        fit = self._fit_either_way(cloud, start, joints)
+        on_surface = find_on_surface(joints) | ~self._is_limb
+        if fit.confidence >= MIN_GOOD_CONFIDENCE or not (joints.found & ~on_surface).any():
+            return fit
+        sure = replace(joints, points=np.where(on_surface[:, None], joints.points, np.nan))
+        try:
+            other = self._fit_either_way(cloud, self.start(sure), sure)
+        except InputError:
+            return fit
+        return other if other.confidence > fit.confidence else fit
+
+    def _fit_either_way(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
+        """Fit a body from `start` and with the sides exchanged, whichever is better."""
         coarse = CoarseCloud.of(cloud)
         unknown = measure_unknown_share(self.model, start, cloud)
         pulled, close, free = (strengthen_priors(weights, unknown) for weights in (PULLED, CLOSE, FREE))
@@ -126,7 +144,7 @@ class JointFitter:
             body, coarse, joints, self.limbs.find_doubtful(body, joints),
             lambda tried: run(tried, cloud, targets, close, terms),
         )  # fmt: skip
-        held = self._hold(joints, targets, unknown)
+        held = self.hold(joints, targets, unknown)
         fit = self.fitter.assess(run(body, cloud, held, free, terms), cloud)
         return replace(fit, reliable=fit.reliable and not self.limbs.contradicts(fit.state, joints))
 
@@ -142,7 +160,7 @@ class JointFitter:
         )  # fmt: skip
         return None if found is body else self.fitter.assess(found, cloud)
 
-    def _hold(self, joints: LiftedJoints, targets: JointTargets, unknown: float) -> JointTargets:
+    def hold(self, joints: LiftedJoints, targets: JointTargets, unknown: float) -> JointTargets:
         """Return the pull of joints in the last steps: of the hidden ones, and of all where the ends are out of sight.
 
         Nothing else would hold the hidden ones. Of a body that is cut off, the cloud holds no limb along its axis, and

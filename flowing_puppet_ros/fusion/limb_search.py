@@ -105,7 +105,7 @@ class LimbSearcher:
         """
         across, gap = self._measure_gaps(body, joints)
         open_or_off = _find_doubtful(joints) | (across > MAX_GAP_M) | (gap > MAX_SEEN_GAP_M)
-        return self._find_limbs(open_or_off & _find_on_surface(joints), joints)
+        return self._find_limbs(open_or_off & find_on_surface(joints), joints)
 
     def find_lost(self, body: BodyState, joints: LiftedJoints) -> list[int]:
         """Return the limbs of a tracked body of which a joint is certainly not where the puppet sees it."""
@@ -131,7 +131,7 @@ class LimbSearcher:
     def measure_cost(self, body: BodyState, coarse: CoarseCloud, joints: LiftedJoints) -> float:
         """Return the cost of a body in a cloud plus that of its joints, metres."""
         places = self._model.joints(self._model.vertices(body))
-        return self._bank.cost(body, coarse) + float(_measure_joint_cost(places[None], joints, _can_count(joints))[0])
+        return self._bank.cost(body, coarse) + float(measure_joint_cost(places[None], joints, _can_count(joints))[0])
 
     def _sample(
         self,
@@ -160,7 +160,7 @@ class LimbSearcher:
         cost = self._bank.coverage_cost(groups, coarse, limb, without.distance).cost
         counted = np.zeros(places.shape[1], dtype=bool)
         counted[rows[1:]] = True
-        cost = cost + _measure_joint_cost(places, joints, counted & _can_count(joints))
+        cost = cost + measure_joint_cost(places, joints, counted & _can_count(joints))
         chosen: list[int] = []
         for row in np.argsort(cost, kind="stable"):
             apart = [np.linalg.norm(places[row, rows] - places[other, rows], axis=1).max() for other in chosen]
@@ -227,7 +227,7 @@ def _is_doubtful(row: int, joints: LiftedJoints) -> bool:
     return bool(joints.hidden[row] or several or not sure)
 
 
-def _find_on_surface(joints: LiftedJoints) -> Bools:
+def find_on_surface(joints: LiftedJoints) -> Bools:
     """Return which joints (J,) have a surface at their pixels."""
     on = np.zeros(len(joints.points), dtype=bool)
     on[[row for row, choices in joints.choices.items() if choices.seen.any()]] = True
@@ -238,7 +238,7 @@ def _can_count(joints: LiftedJoints) -> Bools:
     return np.asarray(joints.found & (joints.confidence >= MIN_CONFIDENCE))
 
 
-def _measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F64:
+def measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F64:
     """Return what the `counted` (J,) joints of bodies, at `places` (P, J, 3) m, cost each of them (P,), metres."""
     cost = np.zeros(len(places))
     for row in np.flatnonzero(counted):

@@ -15,7 +15,7 @@ from flowing_puppet_ros.draw.pictures import join_row as joined
 from flowing_puppet_ros.draw.plots import Series, draw_heat_strip, draw_line_plot
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.report.data import BodiesData, ReportData, gather_data, make_energy_series, make_error_series
-from flowing_puppet_ros.report.page import build_page, details, figure, paragraph, row
+from flowing_puppet_ros.report.page import SCRIPTS, build_page, details, figure, make_timeline, paragraph, row
 from flowing_puppet_ros.report.people_in_space import make_space_section
 from flowing_puppet_ros.report.scene_above import make_above_section
 from flowing_puppet_ros.report.tables import (
@@ -25,7 +25,6 @@ from flowing_puppet_ros.report.tables import (
     make_joints_table,
     make_settings_tables,
 )
-from flowing_puppet_ros.report.timeline import SCRIPTS, make_timeline
 
 PICTURE_HEIGHT = 440  # of the collage, px
 

@@ -46,10 +46,12 @@ class DepthRigSettings(Settings):
         "",
         "depth cameras or LiDARs around the same people, separated by commas: each has <camera>/depth and"
         " <camera>/camera_info, or <camera>/points; empty: one sensor",
+        advanced=True,
     )
     slop: float = setting(
-        0.035, "maximum difference of stamps within one moment of several sensors", unit="s", low=0.0, high=1.0
-    )
+        0.035, "maximum difference of stamps within one moment of several sensors", unit="s", low=0.0, high=1.0,
+        advanced=True,
+    )  # fmt: skip
     max_waiting: int = setting(
         3, "clouds of one sensor that wait for another that is late or dead", low=1, high=50, advanced=True
     )

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -18,7 +18,7 @@ from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleVie
 from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings, Progress, sub_progress
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.quality import assess_fit
-from flowing_puppet_ros.body.fit.visibility import BodyVisibility, judge_visibility
+from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility, judge_visibility, rate_joints
 from flowing_puppet_ros.body.refine.body_beneath import BodyBeneath
 from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton
 from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
@@ -37,6 +37,7 @@ MIN_CLOUD_POINTS = 50  # finite and distinct
 WARM_UP_VIEWPOINT_M = np.array([3.0, 0.0, 0.0])  # relative to the body
 # Points that a cloud needs before it may shape the surface beyond the model.
 MIN_DENSE_POINTS = 3000
+MAX_CONTESTED_M = 0.15  # between the centres of a part in two bodies that are as likely
 MAX_COARSE_POINTS = 1500  # of a cloud whose frames are compared
 # Longest side of a cloud that may be a person or a part of one, with some surroundings.
 MIN_PERSON_EXTENT_M, MAX_PERSON_EXTENT_M = 0.1, 20.0
@@ -67,6 +68,11 @@ class BodyFit:
     reliable: bool
     two_way_distance: float
     visibility: BodyVisibility
+
+    @property
+    def joint_confidence(self) -> np.ndarray:
+        """Probability (J,) that each joint is within 10 cm."""
+        return rate_joints(self.visibility.joints, self.reliable, self.confidence)
 
 
 class BodyFitter:
@@ -139,10 +145,10 @@ class BodyFitter:
             if initial is not None:
                 return self._fit_from_joints(points, normals, initial, (viewpoint, field), rng, progress)
             cloud = self.prepare_cloud(points, normals, viewpoint, field)
-            state = self.hypotheses.search(cloud, rng, progress, quick)
+            state, *others = self.hypotheses.search(cloud, rng, progress, quick)
             progress(1.0)
             if not self._is_dense(cloud):
-                return self.assess(state, cloud)
+                return self._doubt(self.assess(state, cloud), others, cloud)
             state = refine_hand_pose(self.model, self.gauss_newton, state, cloud)
             fit = self.assess(state, cloud)
             return self._find_beneath(self._refine_nonrigid(fit, cloud), cloud) if nonrigid else fit
@@ -247,6 +253,18 @@ class BodyFitter:
         body = self.hypotheses.refine(found, cloud, targets, self.settings.gauss_newton_steps)
         progress(1.0)
         return self.assess(body, cloud)
+
+    def _doubt(self, fit: BodyFit, others: Sequence[BodyState], cloud: Cloud) -> BodyFit:
+        """Return the fit, unreliable if another body that is as likely has a part elsewhere that the sensor saw.
+
+        A part that it saw in neither body is a guess in any case, as the visibility says.
+        """
+        for other in others:
+            apart = np.linalg.norm(fit.state.center - other.center, axis=1) > MAX_CONTESTED_M
+            parts = np.maximum(fit.visibility.parts, self.assess(other, cloud).visibility.parts)
+            if (apart & (parts == Visibility.SEEN)).any():
+                return replace(fit, reliable=False)
+        return fit
 
     def _is_dense(self, cloud: Cloud) -> bool:
         """Return whether a cloud is dense and whole enough to refine hands and vertices."""

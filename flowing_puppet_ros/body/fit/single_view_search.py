@@ -30,7 +30,7 @@ from flowing_puppet_ros.threads import parallel_map
 
 STARTS, KEPT_STARTS = 16, 12  # bodies of the bank that are refined, and those of them that are refined further
 KEPT, FINISHED = (8, 6, 4), 3  # bodies whose limbs are sampled again in each round, and those that are finished
-LIMB_SAMPLES = 600  # poses sampled for each limb in a round
+LIMB_SAMPLES = 300  # poses sampled for each stage of a limb
 # Parts of an arm and of a leg from the trunk outwards, without the side; those of a stage are sampled at once.
 LIMB_CHAINS = (
     (("shoulder", "upper_arm"), ("lower_arm",), ("hand",)),
@@ -42,6 +42,8 @@ type Limb = tuple[tuple[int, ...], ...]
 """The parts of a limb by stages, from the trunk outwards."""
 MAX_COST_INCREASE_M = 0.003
 """Cost by which a sampled limb may exceed the present one and still be refined."""
+MAX_EQUAL_COST_M = 0.0015
+"""Cost by which another body may exceed the best one and still be as likely."""
 MIN_DENSE_POINTS = 2000
 """Points below which a cloud is a LiDAR's: a few hundred points with centimetres of noise."""
 # Two refinements of the bank's bodies, and that of a sampled limb.
@@ -74,17 +76,15 @@ class SingleViewSearch:
         self._bank = bank
         self._proposer = proposer
         self._refiner = refiner
-        limbs = [
+        self._limbs: list[Limb] = [
             tuple(tuple(model.tree.index(f"{side}_{name}") for name in stage) for stage in chain)
             for chain in LIMB_CHAINS
             for side in ("left", "right")
         ]
-        self._limbs = [(limb,) for limb in limbs]
-        self._pairs = [(limbs[0], limbs[1]), (limbs[2], limbs[3])]
 
     def run(
         self, cloud: SingleViewCloud, rng: np.random.Generator, steps: int, progress: Callable[[float], None]
-    ) -> BodyState:
+    ) -> list[BodyState]:
         """Find the body of a cloud in metres, z up, when only its up direction is known.
 
         Args:
@@ -92,23 +92,26 @@ class SingleViewSearch:
             rng: source of all randomness.
             steps: Gauss-Newton steps of the last refinement.
             progress: called with the fraction done, 0 to 1.
+
+        Returns:
+            The best body, and then others that explain the cloud nearly as well.
         """
         coarse = CoarseCloud.of(cloud)
         bodies = self._find_starts(cloud, coarse)
         progress(0.3)
-
-        for number, kept in enumerate(KEPT):
-
-            def improve(start: tuple[BodyState, np.random.Generator], paired: bool = number % 2 > 0) -> BodyState:
-                return self._improve_limbs(start[0], cloud, coarse, start[1], self._pairs if paired else self._limbs)
-
+        for number, (kept, improve) in enumerate(
+            zip(KEPT, (self._replace_limbs, self._improve_pairs, self._improve_limbs), strict=True)
+        ):
             starts = list(zip(bodies[:kept], rng.spawn(kept), strict=False))
-            bodies = self._rank(parallel_map(improve, starts, self._threads), coarse)
+            improved = parallel_map(partial(_apply, improve, cloud, coarse), starts, self._threads)
+            bodies = self._rank(improved, coarse)
             progress(0.3 + 0.5 * (number + 1) / len(KEPT))
         weights = _final_weights(cloud, steps)
         bodies = parallel_map(lambda body: self._refine(body, cloud, weights), bodies[:FINISHED], self._threads)
         progress(1.0)
-        return min(bodies, key=lambda body: self._bank.cost(body, coarse))
+        bodies.sort(key=lambda body: self._bank.cost(body, coarse))
+        limit = self._bank.cost(bodies[0], coarse) + MAX_EQUAL_COST_M
+        return [bodies[0], *(body for body in bodies[1:] if self._bank.cost(body, coarse) < limit)]
 
     def _find_starts(self, cloud: SingleViewCloud, coarse: CoarseCloud) -> list[BodyState]:
         """Return the bank's best bodies after a few steps of Gauss-Newton, the best first."""
@@ -126,13 +129,37 @@ class SingleViewSearch:
                 ranked.append(body)
         return ranked
 
+    def _replace_limbs(
+        self, body: BodyState, cloud: SingleViewCloud, coarse: CoarseCloud, rng: np.random.Generator
+    ) -> BodyState:
+        """Sample every limb again, one after the other, and refine once; return that body if it is better."""
+        replaced = body
+        for limb in self._limbs:
+            cost = self._bank.cost(replaced, coarse)
+            replaced = self._resample_limbs(replaced, (limb,), coarse, cost, rng) or replaced
+        if replaced is body:
+            return body
+        return min(body, self._refine(replaced, cloud, CLOSE), key=lambda each: self._bank.cost(each, coarse))
+
+    def _improve_pairs(
+        self, body: BodyState, cloud: SingleViewCloud, coarse: CoarseCloud, rng: np.random.Generator
+    ) -> BodyState:
+        """Improve both arms at once and both legs at once: where two limbs are exchanged, neither moves alone."""
+        return self._improve(body, (self._limbs[:2], self._limbs[2:]), cloud, coarse, rng)
+
     def _improve_limbs(
+        self, body: BodyState, cloud: SingleViewCloud, coarse: CoarseCloud, rng: np.random.Generator
+    ) -> BodyState:
+        """Improve limb after limb."""
+        return self._improve(body, [(limb,) for limb in self._limbs], cloud, coarse, rng)
+
+    def _improve(
         self,
         body: BodyState,
+        groups: Sequence[Sequence[Limb]],
         cloud: SingleViewCloud,
         coarse: CoarseCloud,
         rng: np.random.Generator,
-        groups: Sequence[tuple[Limb, ...]],
     ) -> BodyState:
         """Sample limbs again, those of each group at once, and keep what is better after Gauss-Newton."""
         cost = self._bank.cost(body, coarse)
@@ -147,7 +174,7 @@ class SingleViewSearch:
         return body
 
     def _resample_limbs(
-        self, body: BodyState, limbs: tuple[Limb, ...], coarse: CoarseCloud, max_cost: float, rng: np.random.Generator
+        self, body: BodyState, limbs: Sequence[Limb], coarse: CoarseCloud, max_cost: float, rng: np.random.Generator
     ) -> BodyState | None:
         """Return the body with the best of many samples of some limbs, None when all cost more than `max_cost`.
 
@@ -221,6 +248,16 @@ class SingleViewSearch:
         if cloud.field is not None:
             weights = strengthen_priors(weights, measure_unknown_share(self._model, body, cloud))
         return self._refiner.run(body, cloud, none, weights, terms=[cloud.free_space_term])
+
+
+def _apply(
+    improve: Callable[[BodyState, SingleViewCloud, CoarseCloud, np.random.Generator], BodyState],
+    cloud: SingleViewCloud,
+    coarse: CoarseCloud,
+    start: tuple[BodyState, np.random.Generator],
+) -> BodyState:
+    """Improve a body with random numbers of its own."""
+    return improve(start[0], cloud, coarse, start[1])
 
 
 def _final_weights(cloud: SingleViewCloud, steps: int) -> RefineWeights:

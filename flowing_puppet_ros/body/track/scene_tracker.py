@@ -37,9 +37,11 @@ from flowing_puppet_ros.settings import Settings, nested, setting
 MAX_HEIGHT_M = 2.6
 """A cloud that is no wider is a person, when nobody can be told from their surroundings in it."""
 _NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
-MAX_NEW_FITS = 8
-"""Candidates to which bodies are fitted in a cloud of a live stream, the likeliest first; the others come with the
-next. In a recording, which waits, so many in a row have to be nobody."""
+MAX_MISSES = 8
+"""Candidates in a row that have to be nobody until no more are fitted in a scan of a recording, the likeliest first."""
+MAX_LIVE_FITS = 4
+"""Candidates to which bodies are fitted in a scan of a live stream, so that the first body does not wait for others,
+which come with the next."""
 MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
 _UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
 MAX_REJECTED = 50  # candidates that are told of
@@ -238,8 +240,8 @@ class SceneTracker:
             cloud.viewpoint,
             cloud.stamp,
             known,
-            MAX_NEW_FITS if live else None,
-            MAX_NEW_FITS if remember else None,
+            MAX_LIVE_FITS if live else None,
+            MAX_MISSES if remember else None,
             remember,
             self._seen_free.add(points, cloud.viewpoint) if remember else None,
         )

@@ -272,7 +272,7 @@ class PersonFinder:
         judged = weigh(first)
         if judged.probability >= MIN_WORTHWHILE and len(starts) > 1:
             others = self.upright.refine(starts[1:], cloud, candidate.floor)
-            if others.cost < first.cost:
+            if others.score < first.score:
                 judged = weigh(others)
         return judged
 

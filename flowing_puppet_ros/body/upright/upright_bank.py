@@ -30,7 +30,7 @@ MEAN_STATURE_M, STATURE_DEVIATION_M, STATURE_COST_M = 1.72, 0.1, 0.002
 ROUGH_POINTS, FINE_POINTS = 90, 300  # surface points of a body
 ROUGH_TARGETS, FINE_TARGETS = 60, 250  # of the cloud
 FINE_BODIES, MAX_SAME_YAW = 96, 2
-TURNED = 2  # of the best bodies, that face the other way than the best
+TURNED = 3  # of the best bodies, that face the other way than the best
 SEEN_MARGIN_M = 0.08  # above and below a cloud within which a body's surface is taken for seen
 
 

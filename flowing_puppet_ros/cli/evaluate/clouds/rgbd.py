@@ -20,7 +20,7 @@ from flowing_puppet_ros.evaluate.moving.fitter_run import run_fitter
 from flowing_puppet_ros.evaluate.moving.robot_view import SENSINGS, RobotView
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
 from flowing_puppet_ros.evaluate.rgbd.methods import FusionMethod, RgbdMethod, SearchMethod
-from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summarise_rgbd
+from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summarise_rgbd, tabulate_calibration
 from flowing_puppet_ros.evaluate.rgbd.tracking import MotionScore, summarise_motions, track_motion
 from flowing_puppet_ros.evaluate.rgbd.views import CUTS, RgbdStudio, make_pair, make_registered
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
@@ -111,11 +111,12 @@ def run(arguments: argparse.Namespace) -> int:
         each = seconds / len(fits)
         scores += [score_body(fitter.model, fit, to_world, frame, k, cut, each) for k, fit in enumerate(fits)]
     figures = [summarise_rgbd([score for score in scores if score.cut == cut]) for cut in arguments.cuts]
+    printed = {"summary": figures, "calibration": tabulate_calibration(scores)}
     if arguments.out is not None:
         table = [asdict(score) for score in scores]
         write_csv(arguments.out / "rgbd.csv", table)
-        write_json(arguments.out / "rgbd.json", {"summary": figures, "bodies": table})
-    print(format_json({"summary": figures}) if arguments.json else format_table(figures))
+        write_json(arguments.out / "rgbd.json", {**printed, "bodies": table})
+    print(format_json(printed) if arguments.json else "\n\n".join(map(format_table, printed.values())))
     return 0
 
 
