@@ -47,7 +47,7 @@ HIDDEN_SHARE = 0.25
 MIN_START_CONFIDENCE, MIN_LIMB_CONFIDENCE = 0.1, 0.3
 """In a start: what joints of trunk and head count at least, since a puppet places them as the rest of the body
 suggests, and below which those of limbs do not count, since a hanging arm is a better guess."""
-MIN_GOOD_CONFIDENCE = 0.5  # of a body that is not fitted once more
+MIN_GOOD_CONFIDENCE = 0.4  # of a body that is not fitted once more
 HELD_SHARE, HELD_UNKNOWN = 0.3, 0.15
 """Of the weight that seen joints keep in the last steps, and the share of the body out of sight from which on."""
 START_STEPS, FEW_STEPS = 15, 6
