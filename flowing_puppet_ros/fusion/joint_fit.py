@@ -15,6 +15,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
@@ -24,8 +25,9 @@ from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.fusion.lift import LiftedJoints
-from flowing_puppet_ros.fusion.limb_search import LimbSearcher
+from flowing_puppet_ros.fusion.limb_search import LimbSearcher, find_on_surface
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -45,9 +47,13 @@ HIDDEN_SHARE = 0.25
 MIN_START_CONFIDENCE, MIN_LIMB_CONFIDENCE = 0.1, 0.3
 """In a start: what joints of trunk and head count at least, since a puppet places them as the rest of the body
 suggests, and below which those of limbs do not count, since a hanging arm is a better guess."""
+MIN_GOOD_CONFIDENCE = 0.5  # of a body that is not fitted once more
+HELD_SHARE, HELD_UNKNOWN = 0.3, 0.15
+"""Of the weight that seen joints keep in the last steps, and the share of the body out of sight from which on."""
 START_STEPS, FEW_STEPS = 15, 6
 """Of Gauss-Newton from the joints alone, for a start and where the body only needs to be about right."""
 SHOULDERS = ("left_shoulder", "right_shoulder")
+LOWER_TRUNK = ("left_hip", "right_hip", "pelvis", "belly")
 
 type NamedJoints = dict[str, tuple[float, float, float, float]]
 """x, y, z in metres and a weight, by name."""
@@ -70,10 +76,10 @@ class JointFitter:
         floor = np.where(self._is_limb, 0.0, MIN_START_CONFIDENCE)
         weight = np.where(joints.found, np.sqrt(np.maximum(joints.confidence, floor)), 0.0)
         certain = np.where(joints.hidden, HIDDEN_SHARE * weight, weight)
-        try:
-            targets = make_joint_targets(self.model, self._name(joints, certain))
-        except InputError:
-            targets = make_joint_targets(self.model, _add_trunk(self.model, self._name(joints, weight)))
+        named = self._name(joints, certain)
+        if not any(name in named for name in LOWER_TRUNK):
+            named = _add_trunk(self.model, named, self._name(joints, weight))
+        targets = make_joint_targets(self.model, named)
         return body_from_joints(self.model, self.fitter.gauss_newton, targets, steps)
 
     def _name(self, joints: LiftedJoints, weight: F64) -> NamedJoints:
@@ -91,17 +97,37 @@ class JointFitter:
         points, rays = np.nan_to_num(joints.points), np.nan_to_num(joints.rays)
         return JointTargets(points, self._strength * weight, rays)
 
-    def make_cloud(self, points: F64, field: SensorField | None, viewpoint: F64 | None = None) -> SingleViewCloud:
+    def make_cloud(
+        self, points: F64, field: SensorField | SensorRig | None, viewpoint: F64 | None = None
+    ) -> SingleViewCloud:
         """Return the person's points (N, 3) m of a sensor, and what that can know of the person.
 
         The sensor is at `viewpoint` (3,) m, or at the origin.
         """
+        if isinstance(field, SensorRig):
+            return RigCloud.seen_by(points, field)
         points = downsample(points, None, MAX_FIT_POINTS)[0]
         viewpoint = np.zeros(3) if viewpoint is None else viewpoint
         return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, field=field)
 
     def fit(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
-        """Fit a body to the person's points, from `start` and with the sides exchanged, whichever is better."""
+        """Fit a body to the person's points, from `start`.
+
+        Joints of which the person has no points may be wrong: should the body be, the fit without them may be better.
+        """
+        fit = self._fit_either_way(cloud, start, joints)
+        on_surface = find_on_surface(joints) | ~self._is_limb
+        if fit.confidence >= MIN_GOOD_CONFIDENCE or not (joints.found & ~on_surface).any():
+            return fit
+        sure = replace(joints, points=np.where(on_surface[:, None], joints.points, np.nan))
+        try:
+            other = self._fit_either_way(cloud, self.start(sure), sure)
+        except InputError:
+            return fit
+        return other if other.confidence > fit.confidence else fit
+
+    def _fit_either_way(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
+        """Fit a body from `start` and with the sides exchanged, whichever is better."""
         coarse = CoarseCloud.of(cloud)
         unknown = measure_unknown_share(self.model, start, cloud)
         pulled, close, free = (strengthen_priors(weights, unknown) for weights in (PULLED, CLOSE, FREE))
@@ -118,7 +144,7 @@ class JointFitter:
             body, coarse, joints, self.limbs.find_doubtful(body, joints),
             lambda tried: run(tried, cloud, targets, close, terms),
         )  # fmt: skip
-        held = self._hold_hidden(joints, targets)
+        held = self.hold(joints, targets, unknown)
         fit = self.fitter.assess(run(body, cloud, held, free, terms), cloud)
         return replace(fit, reliable=fit.reliable and not self.limbs.contradicts(fit.state, joints))
 
@@ -134,9 +160,14 @@ class JointFitter:
         )  # fmt: skip
         return None if found is body else self.fitter.assess(found, cloud)
 
-    def _hold_hidden(self, joints: LiftedJoints, targets: JointTargets) -> JointTargets:
-        """Return the pull of the hidden joints alone, which nothing else would hold."""
-        return replace(targets, weight=np.where(joints.hidden, targets.weight, 0.0))
+    def hold(self, joints: LiftedJoints, targets: JointTargets, unknown: float) -> JointTargets:
+        """Return the pull of joints in the last steps: of the hidden ones, and of all where the ends are out of sight.
+
+        Nothing else would hold the hidden ones. Of a body that is cut off, the cloud holds no limb along its axis, and
+        of a few centimetres there the shape would make many of the stature. `unknown` is the body's share out of sight.
+        """
+        share = HELD_SHARE * float(np.clip(unknown / HELD_UNKNOWN, 0.0, 1.0))
+        return replace(targets, weight=np.where(joints.hidden, 1.0, share) * targets.weight)
 
 
 def swap_lifted(model: StitchedPuppet, joints: LiftedJoints) -> LiftedJoints:
@@ -152,13 +183,16 @@ def swap_lifted(model: StitchedPuppet, joints: LiftedJoints) -> LiftedJoints:
     )
 
 
-def _add_trunk(model: StitchedPuppet, joints: NamedJoints) -> NamedJoints:
-    """Return joints that lie on a line, as shoulders do, with the neck and the pelvis of somebody upright."""
-    if not all(name in joints for name in SHOULDERS):
+def _add_trunk(model: StitchedPuppet, joints: NamedJoints, places: NamedJoints) -> NamedJoints:
+    """Return the joints with the neck and the pelvis of somebody upright, if `places` have both shoulders.
+
+    Arms alone do not tell which way the trunk goes on below the shoulders.
+    """
+    if not all(name in places for name in SHOULDERS):
         return joints
     template = dict(zip(model.joint_names, model.joints(model.vertices(model.rest_state())), strict=True))
-    found, mean = (_stand_between(*(np.array(known[name][:3]) for name in SHOULDERS)) for known in (joints, template))
-    sure = min(joints[name][3] for name in SHOULDERS)
+    found, mean = (_stand_between(*(np.array(known[name][:3]) for name in SHOULDERS)) for known in (places, template))
+    sure = min(places[name][3] for name in SHOULDERS)
     added = {}
     for name in ("neck", "pelvis"):
         x, y, z = found[0] + found[1] @ mean[1].T @ (template[name] - mean[0])

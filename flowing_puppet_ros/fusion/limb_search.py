@@ -37,6 +37,9 @@ MIN_APART_M = 0.15
 JOINT_COST_M, FULL_COST_M, ALONG_SHARE = 0.01, 0.12, 0.3
 """Cost of a certain joint that is as far as this from its ray, or farther, beside the cost of a body in a cloud; and
 the share that a gap along the ray counts."""
+HIDDEN_ALONG_SHARE = 0.2
+"""The same of a hidden joint from the depth that its limb makes likely: else it is hung along its ray, where the body
+hides it and nothing contradicts it."""
 MAX_GAP_M, MAX_SEEN_GAP_M = 0.06, 0.12
 """Between a joint and its ray, and its place on a surface, beyond which a limb may be in a wrong place."""
 LOST_GAP_M, LOST_SEEN_GAP_M = 0.09, 0.15
@@ -76,8 +79,12 @@ class LimbSearcher:
         limbs: Sequence[int],
         refine: Callable[[BodyState], BodyState],
     ) -> BodyState:
-        """Return the body with `limbs` hung anew, each if the body costs less after `refine`."""
+        """Return the body with `limbs` hung anew, each if the body costs less after `refine`; else `body` itself."""
+        if not limbs:
+            return body
         rng = np.random.default_rng(0)
+        given, refined_once = body, refine(body)
+        body = refined_once  # as those that it is compared with
         cost = self.measure_cost(body, coarse, joints)
         for limb in limbs:
             for tried in self._sample(body, *self._limbs[limb], coarse, joints, rng):
@@ -85,16 +92,20 @@ class LimbSearcher:
                 new_cost = self.measure_cost(refined, coarse, joints)
                 if new_cost < cost - MIN_GAIN_M:
                     body, cost = refined, new_cost
-        return body
+        return given if body is refined_once else body
 
     def list_parts(self, limb: int) -> tuple[int, ...]:
         """Return the parts of a limb."""
         return self._limbs[limb][0]
 
     def find_doubtful(self, body: BodyState, joints: LiftedJoints) -> list[int]:
-        """Return the limbs of a fitted body that may be in a wrong place: joints left them open, or it is off them."""
+        """Return the limbs of a fitted body that may be in a wrong place: joints left them open, or it is off them.
+
+        Where the cloud has nothing at a joint's pixel, it would tell no pose from another.
+        """
         across, gap = self._measure_gaps(body, joints)
-        return self._find_limbs(_find_doubtful(joints) | (across > MAX_GAP_M) | (gap > MAX_SEEN_GAP_M), joints)
+        open_or_off = _find_doubtful(joints) | (across > MAX_GAP_M) | (gap > MAX_SEEN_GAP_M)
+        return self._find_limbs(open_or_off & find_on_surface(joints), joints)
 
     def find_lost(self, body: BodyState, joints: LiftedJoints) -> list[int]:
         """Return the limbs of a tracked body of which a joint is certainly not where the puppet sees it."""
@@ -120,7 +131,7 @@ class LimbSearcher:
     def measure_cost(self, body: BodyState, coarse: CoarseCloud, joints: LiftedJoints) -> float:
         """Return the cost of a body in a cloud plus that of its joints, metres."""
         places = self._model.joints(self._model.vertices(body))
-        return self._bank.cost(body, coarse) + float(_measure_joint_cost(places[None], joints, _can_count(joints))[0])
+        return self._bank.cost(body, coarse) + float(measure_joint_cost(places[None], joints, _can_count(joints))[0])
 
     def _sample(
         self,
@@ -149,7 +160,7 @@ class LimbSearcher:
         cost = self._bank.coverage_cost(groups, coarse, limb, without.distance).cost
         counted = np.zeros(places.shape[1], dtype=bool)
         counted[rows[1:]] = True
-        cost = cost + _measure_joint_cost(places, joints, counted & _can_count(joints))
+        cost = cost + measure_joint_cost(places, joints, counted & _can_count(joints))
         chosen: list[int] = []
         for row in np.argsort(cost, kind="stable"):
             apart = [np.linalg.norm(places[row, rows] - places[other, rows], axis=1).max() for other in chosen]
@@ -216,11 +227,18 @@ def _is_doubtful(row: int, joints: LiftedJoints) -> bool:
     return bool(joints.hidden[row] or several or not sure)
 
 
+def find_on_surface(joints: LiftedJoints) -> Bools:
+    """Return which joints (J,) have a surface at their pixels."""
+    on = np.zeros(len(joints.points), dtype=bool)
+    on[[row for row, choices in joints.choices.items() if choices.seen.any()]] = True
+    return on
+
+
 def _can_count(joints: LiftedJoints) -> Bools:
     return np.asarray(joints.found & (joints.confidence >= MIN_CONFIDENCE))
 
 
-def _measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F64:
+def measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F64:
     """Return what the `counted` (J,) joints of bodies, at `places` (P, J, 3) m, cost each of them (P,), metres."""
     cost = np.zeros(len(places))
     for row in np.flatnonzero(counted):
@@ -229,12 +247,14 @@ def _measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F6
         along = gap @ ray
         cost += confidence**2 * _saturate(np.linalg.norm(gap - along[:, None] * ray, axis=1))
         choices = joints.choices.get(int(row))
-        if choices is not None:
+        if choices is not None and choices.seen.any():
             surfaces = (choices.points[choices.seen] - joints.points[row]) @ ray
             off_surface = np.abs(along[:, None] - surfaces).min(axis=1)
             cost += ALONG_SHARE * measure_seen_share(confidence, False) * _saturate(off_surface)
+        if joints.hidden[row]:
+            cost += HIDDEN_ALONG_SHARE * _saturate(along, SLOPE_M)
     return JOINT_COST_M * cost
 
 
-def _saturate(distance: F64) -> F64:
-    return np.asarray(np.minimum(distance / FULL_COST_M, 1.0) ** 2)
+def _saturate(distance: F64, full: float = FULL_COST_M) -> F64:
+    return np.asarray(np.minimum(np.abs(distance) / full, 1.0) ** 2)

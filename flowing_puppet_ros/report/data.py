@@ -38,7 +38,8 @@ from flowing_puppet_ros.evaluate.joints import (
     count_swapped,
     measure_joint_errors,
 )
-from flowing_puppet_ros.report.bag_pictures import (
+from flowing_puppet_ros.report.people_in_space import SpaceData, gather_space
+from flowing_puppet_ros.report.pictures.bag_pictures import (
     STRIP_HEIGHT,
     BodyShot,
     FlowShot,
@@ -50,12 +51,19 @@ from flowing_puppet_ros.report.bag_pictures import (
     fetch_messages,
     find_moving_stamps,
     find_people_box,
+    list_meshed,
     pick_evenly,
     read_body_meshes,
     read_messages,
 )
-from flowing_puppet_ros.report.people_in_space import SpaceData, gather_space
-from flowing_puppet_ros.report.scene_3d import SceneFrame, count_affordable_frames, make_scene_data
+from flowing_puppet_ros.report.pictures.bodies_over_colour import (
+    PAIR_HEIGHT,
+    BodiesAtStamp,
+    draw_bodies,
+    find_everybody_box,
+    find_nearest_stamp,
+)
+from flowing_puppet_ros.report.pictures.scene_3d import SceneFrame, count_affordable_frames, make_scene_data
 from flowing_puppet_ros.report.scene_above import AboveData, gather_above
 from flowing_puppet_ros.stream.messages.images import decode_image
 
@@ -106,6 +114,8 @@ class ReportData:
     cameras: list[CameraData] = field(default_factory=list)
     shown_camera: str = ""
     strip: list[tuple[int, np.ndarray]] = field(default_factory=list)  # (stamp, picture)
+    overlaid: dict[int, tuple[np.ndarray, int | None]] = field(default_factory=dict)
+    """By stamps of the strip: the bodies over the image, and the stamp of their cloud, None where nobody has one."""
     flow: list[FlowShot] = field(default_factory=list)
     bodies: BodiesData | None = None
     body_shots: list[BodyShot] = field(default_factory=list)
@@ -136,7 +146,7 @@ def gather_data(input_bag: Path, output_bag: Path, summary: Mapping[str, Any] | 
         if tracked:
             shown = max(tracked, key=lambda camera: frontality(camera.puppets))
             data.shown_camera = shown.name
-            _add_track(data, shown, given)
+            _add_track(data, recording, shown, given, made)
             if not data.strip:
                 _add_overlays(data, shown, made)
         data.space = gather_space(recording, given, made)
@@ -224,25 +234,59 @@ def _make_bodies_data(recording: Recording) -> BodiesData:
     )
 
 
-def _add_track(data: ReportData, camera: CameraRecord, given: Bag) -> None:
-    """Add the pictures of one camera: frames with puppets, and the flow at the frames with most motion."""
+def _add_track(data: ReportData, recording: Recording, camera: CameraRecord, given: Bag, made: Bag) -> None:
+    """Add the pictures of one camera: frames with puppets and bodies, and the flow at the frames with most motion."""
     stamps = sorted(camera.puppets)
     moving = find_moving_stamps(camera, MAX_FLOW_FRAMES)
     following = {stamp: stamps[stamps.index(stamp) + 1] for stamp in moving}
     tracked = [stamp for stamp in stamps if camera.puppets[stamp]]
     strip = pick_evenly([stamp for stamp in stamps if tracked and tracked[0] <= stamp <= tracked[-1]], MAX_STRIP_FRAMES)
+    _add_strip(data, camera, given, strip, _read_bodies_at(recording, camera, made, strip))
     people = [camera.puppets[stamp] for stamp in (*strip, *moving)]
-    for (_, stamp), message in read_messages(given, {camera.image_topic: strip}):
-        with suppress(InputError):
-            image = decode_image(message)
-            picture = draw_track(image, camera.puppets[stamp], find_people_box(people, image.shape))
-            data.strip.append((stamp, picture))
     images = fetch_messages(given, {camera.image_topic: {*following, *following.values()}})
     for stamp in moving:
         pair = [decode_picture(images, camera.image_topic, s) for s in (stamp, following[stamp])]
         if pair[0] is not None and pair[1] is not None and pair[0].shape == pair[1].shape:
             box = find_people_box(people, pair[0].shape)
             data.flow.append(draw_flow_shot(stamp, pair[0], pair[1], camera.puppets[stamp], box))
+
+
+def _add_strip(
+    data: ReportData, camera: CameraRecord, given: Bag, strip: list[int], bodies: Mapping[int, BodiesAtStamp]
+) -> None:
+    """Add the images at the stamps `strip` with puppets, and beside them with the `bodies` of their clouds."""
+    people = [camera.puppets[stamp] for stamp in strip]
+    for (_, stamp), message in read_messages(given, {camera.image_topic: strip}):
+        with suppress(InputError):
+            image = decode_image(message)
+            if camera.camera is None or not bodies:
+                picture = draw_track(image, camera.puppets[stamp], find_people_box(people, image.shape))
+            else:
+                box = find_everybody_box(camera.camera, bodies.values(), people, image.shape)
+                picture = draw_track(image, camera.puppets[stamp], box, PAIR_HEIGHT)
+                there = bodies.get(stamp)
+                drawn = draw_bodies(image, camera.camera, there, box)
+                data.overlaid[stamp] = (drawn, there.stamp if there else None)
+            data.strip.append((stamp, picture))
+
+
+def _read_bodies_at(
+    recording: Recording, camera: CameraRecord, made: Bag, strip: list[int]
+) -> dict[int, BodiesAtStamp]:
+    """Return the bodies of the nearest cloud for each stamp of an image that has some, if the camera is calibrated."""
+    if camera.camera is None:
+        return {}
+    there = {stamp: find_nearest_stamp(list(recording.bodies), stamp) for stamp in strip}
+    topic = recording.cloud_topics.get("body_vertices", "")
+    wanted = {stamp for stamp in there.values() if stamp is not None}
+    clouds = {stamp: one for (_, stamp), one in fetch_messages(made, {topic: wanted}).items()}
+    found: dict[int, BodiesAtStamp] = {}
+    for stamp, cloud in there.items():
+        bodies = [] if cloud is None else list_meshed(recording.bodies[cloud])
+        meshes = read_body_meshes(bodies, clouds.get(cloud or 0), recording.triangles, None)
+        if cloud is not None and meshes:
+            found[stamp] = BodiesAtStamp(cloud, [body.id for body in bodies], meshes)
+    return found
 
 
 def _add_overlays(data: ReportData, camera: CameraRecord, made: Bag) -> None:
@@ -261,14 +305,16 @@ def _add_bodies(data: ReportData, recording: Recording, given: Bag, made: Bag) -
     stamps = pick_evenly(list(bodies), MAX_BODY_FRAMES)
     clouds = _fetch_clouds(recording, given, made, stamps)
     views = [c for c in recording.cameras.values() if c.camera is not None and c.image_topic][:MAX_VIEWS]
-    images = fetch_messages(given, {camera.image_topic: stamps for camera in views})
+    at = {(c.name, stamp): find_nearest_stamp(list(c.puppets), stamp) for c in views for stamp in stamps}
+    wanted = {c.image_topic: [at[c.name, stamp] or stamp for stamp in stamps] for c in views}
+    images = fetch_messages(given, wanted)
     for stamp in stamps:
         meshes = read_body_meshes(
             [bodies[stamp]], clouds.vertices.get(stamp), recording.triangles, clouds.points.get(stamp)
         )
         if not meshes:
             continue
-        shown = [(c, decode_picture(images, c.image_topic, stamp)) for c in views]
+        shown = [(c, decode_picture(images, c.image_topic, at[c.name, stamp] or stamp)) for c in views]
         images_of = [(c.name, c.camera, image) for c, image in shown if c.camera is not None and image is not None]
         data.body_shots.append(draw_body_shot(stamp, bodies[stamp], meshes[0], images_of))
 
@@ -284,7 +330,7 @@ def _add_scene(data: ReportData, recording: Recording, given: Bag, made: Bag) ->
     frames = []
     for stamp in stamps:
         vertices, points = clouds.vertices.get(stamp), clouds.points.get(stamp)
-        meshes = read_body_meshes(recording.bodies[stamp], vertices, recording.triangles, points)
+        meshes = read_body_meshes(list_meshed(recording.bodies[stamp]), vertices, recording.triangles, points)
         if meshes:
             frames.append(SceneFrame(data.seconds(stamp), meshes))
     if frames:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from typing import Any
@@ -37,6 +37,10 @@ figure{margin:10px 0}img{max-width:100%;height:auto;border-radius:4px;vertical-a
 .row.views{flex-wrap:nowrap;overflow-x:auto}.row.views figure{flex:0 1 24%;min-width:150px}
 .frame{display:none}.frame.on{display:block}
 .frame img{height:min(62vh,420px);width:auto;object-fit:contain;object-position:left}
+.frame.pair.on{display:flex;gap:8px}.frame.pair figure{flex:1 1 0;min-width:0}
+.frame.pair img{width:100%;height:auto;max-height:min(62vh,420px)}
+.panes:has(.pair){width:min(94vw,1500px);margin-left:calc(50% - min(47vw,750px))}
+.panes:has(.pair) .pictures{max-width:66%}
 .panes{display:flex;gap:16px;align-items:stretch}.panes>*{flex:1 1 0;min-width:0}.pictures{flex:0 1 auto;max-width:58%}
 .space{display:flex;flex-direction:column}.space canvas{width:100%;flex:1 1 380px;min-height:380px;touch-action:none;
 border:1px solid var(--rule);border-radius:4px;cursor:grab}[hidden]{display:none!important}
@@ -59,9 +63,25 @@ svg .line{fill:none;stroke-width:1.8;stroke-linejoin:round}
 .key{display:inline-block;width:22px;height:4px;border-radius:2px;margin-right:7px;vertical-align:middle}
 .ramp{width:120px;height:10px;image-rendering:pixelated;vertical-align:middle}
 details{margin:10px 0}summary{cursor:pointer}
-@media(max-width:720px){.panes{flex-direction:column}.pictures{max-width:none}th[scope=row],td.n{white-space:normal;overflow-wrap:normal}table{font-size:.88rem}
+@media(max-width:720px){.panes{flex-direction:column}.pictures,.panes:has(.pair) .pictures{max-width:none}
+.panes:has(.pair){width:auto;margin-left:0}th[scope=row],td.n{white-space:normal;overflow-wrap:normal}table{font-size:.88rem}
 tr:has(>:nth-child(5))>*{white-space:nowrap}}
 """ + "".join(f".s{k}{{stroke:var(--c{k})}}.d{k}{{fill:var(--c{k})}}.k{k}{{background:var(--c{k})}}" for k in range(8))
+
+SCRIPTS = ("scene.js", "timeline.js")
+
+type TimelineFrame = tuple[float, Sequence[tuple[np.ndarray, str]]]
+"""Seconds, and the pictures that are shown side by side from then on, each with its caption."""
+
+_SCENE_VIEW = (
+    '<div class="space"><canvas tabindex="0" role="application" aria-label="3D view of the bodies: drag or arrow keys '
+    'turn, plus and minus zoom, Home resets"></canvas><div class="controls">'
+    '<label><input type="checkbox" checked data-shows="mesh"> bodies</label>'
+    '<label><input type="checkbox" checked data-shows="points"> points</label>'
+    '<button type="button" data-home>Reset view</button><span class="soft">drag: turn; two fingers, right button or '
+    'Shift: move; wheel: zoom</span></div></div><p class="no-space soft" hidden>This browser has no WebGL 2, so there '
+    "is no 3D view; the still pictures below show the bodies.</p>"
+)
 
 # Without scripts every frame is shown, one below the other, and what needs scripts is hidden.
 NO_SCRIPT = "<noscript><style>.frame{display:block}.scrub,.space,.timeline svg .now{display:none}</style></noscript>"
@@ -137,3 +157,31 @@ def json_block(name: str, value: Any) -> str:
 def details(summary: str, html: str) -> str:
     """Fold HTML away under a line of text."""
     return f"<details><summary>{escape(summary)}</summary>{html}</details>"
+
+
+def make_timeline(frames: Sequence[TimelineFrame], scene: Mapping[str, Any] | None, plots: str, label: str) -> str:
+    """Make the pictures of `frames` beside the 3D `scene`, plots below, and the slider for all of them.
+
+    `scene` is what `scene_3d.make_scene_data` returns; `label` is that of the slider.
+    """
+    times = sorted({round(seconds, 6) for seconds, _ in frames} | {round(t, 6) for t in _scene_times(scene)})
+    pictures = "".join(
+        f'<div class="frame{" pair" if len(images) > 1 else ""}{"" if index else " on"}" data-t="{seconds:.6f}">'
+        f"{''.join(figure(image, caption, caption) for image, caption in images)}</div>"
+        for index, (seconds, images) in enumerate(frames)
+    )
+    panes = f'<div class="pictures">{pictures}</div>' if frames else ""
+    if scene is not None:
+        panes += json_block("scene", scene) + _SCENE_VIEW
+    controls = (
+        f'<div class="controls scrub"{"" if len(times) > 1 else " hidden"}>'
+        '<button type="button" data-play>Play</button>'
+        f'<input type="range" min="0" max="{len(times) - 1}" value="0" aria-label="{escape(label)}">'
+        f"<output>{times[0]:.2f} s</output></div>"
+    )
+    panes = f'<div class="panes">{panes}</div>'
+    return f'<div class="timeline">{json_block("times", times)}{panes}{plots}{controls}</div>'
+
+
+def _scene_times(scene: Mapping[str, Any] | None) -> list[float]:
+    return [] if scene is None else [float(frame["t"]) for frame in scene["frames"]]

@@ -15,7 +15,7 @@ from flowing_puppet_ros.draw.pictures import join_row as joined
 from flowing_puppet_ros.draw.plots import Series, draw_heat_strip, draw_line_plot
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.report.data import BodiesData, ReportData, gather_data, make_energy_series, make_error_series
-from flowing_puppet_ros.report.page import build_page, details, figure, paragraph, row
+from flowing_puppet_ros.report.page import SCRIPTS, build_page, details, figure, make_timeline, paragraph, row
 from flowing_puppet_ros.report.people_in_space import make_space_section
 from flowing_puppet_ros.report.scene_above import make_above_section
 from flowing_puppet_ros.report.tables import (
@@ -25,7 +25,6 @@ from flowing_puppet_ros.report.tables import (
     make_joints_table,
     make_settings_tables,
 )
-from flowing_puppet_ros.report.timeline import SCRIPTS, make_timeline
 
 PICTURE_HEIGHT = 440  # of the collage, px
 
@@ -140,7 +139,12 @@ def _make_time_section(data: ReportData) -> str:
             "of the puppet, nearer parts over farther ones; dots are joints: larger is more confident, hollow is "
             "below one half."
         )
-        frames = [(data.seconds(s), image, f"{data.shown_camera}, {data.seconds(s):.2f} s") for s, image in data.strip]
+        frames = [(data.seconds(stamp), _list_pictures(data, stamp, image)) for stamp, image in data.strip]
+        if data.overlaid:
+            notes.append(
+                "Beside it, the bodies of the nearest cloud over the same image, as its lens shows them; what the "
+                "sensor did not see of them is pale."
+            )
     elif data.cameras:
         notes.append("The input bag has no images at the stamps of the puppets, so the track cannot be drawn.")
     if data.scene is not None:
@@ -153,6 +157,16 @@ def _make_time_section(data: ReportData) -> str:
         return paragraph("There is nothing that changes over time in this bag.")
     shown = make_timeline(frames, data.scene, plots, "Time") if frames or data.scene is not None else plots
     return "".join(map(paragraph, notes)) + shown
+
+
+def _list_pictures(data: ReportData, stamp: int, image: np.ndarray) -> list[tuple[np.ndarray, str]]:
+    """Return the pictures of one moment with captions: the puppets, and the bodies over the same image if any."""
+    pictures = [(image, f"{data.shown_camera}, {data.seconds(stamp):.2f} s")]
+    if stamp in data.overlaid:
+        drawn, cloud = data.overlaid[stamp]
+        when = "no body" if cloud is None else f"bodies of the cloud at {data.seconds(cloud):.2f} s"
+        pictures.append((drawn, when))
+    return pictures
 
 
 def _make_plots(data: ReportData) -> str:

@@ -52,15 +52,42 @@ def test_joints_lie_behind_the_surface_on_their_rays(
     assert lifted.depth == pytest.approx(2.5)
 
 
-def test_a_joint_without_points_has_no_depth_and_no_confidence(model: StitchedPuppet) -> None:
-    seen = SeenCloud.of(wall(2.5), camera())
-    usable = seen.points[:, 0] < 0.3  # what is to the right belongs to somebody else
-    lifted = lift_joints(model, puppet(model), seen, usable)
+def test_a_joint_in_a_hole_of_the_depth_has_no_depth_and_no_confidence(model: StitchedPuppet) -> None:
+    points = np.concatenate([wall(2.5, -1.5, 0.3), wall(2.5, 0.5, 1.5)])  # the wrist is at x = 0.4
+    seen = SeenCloud.of(points, camera())
+    lifted = lift_joints(model, puppet(model), seen, np.ones(len(points), dtype=bool))
     row = model.joint_names.index("left_wrist")
     assert not lifted.found[row]
     assert lifted.confidence[row] == 0
     assert np.isfinite(lifted.rays[row]).all()
     assert lifted.confidence[model.joint_names.index("right_wrist")] == 0.8
+
+
+@pytest.mark.parametrize("cut", [True, False])
+def test_a_joint_beyond_the_border_or_on_what_is_not_the_person_is_where_bones_say(
+    model: StitchedPuppet, cut: bool
+) -> None:
+    """The depth ends before the wrist, or its points are taken for the floor's: it is hidden, on its ray, in reach."""
+    points = wall(2.5, -1.5, 0.3 if cut else 1.5)
+    seen = SeenCloud.of(points, camera())
+    lifted = lift_joints(model, puppet(model), seen, seen.points[:, 0] < 0.3)
+    elbow, wrist = model.joint_names.index("left_elbow"), model.joint_names.index("left_wrist")
+    assert lifted.found[wrist] and lifted.hidden[wrist]
+    np.testing.assert_allclose(camera().project(lifted.points[wrist])[0], PLACES["left_wrist"], atol=1e-6)
+    assert 0.15 < np.linalg.norm(lifted.points[wrist] - lifted.points[elbow]) < 0.35
+    assert not lifted.hidden[model.joint_names.index("right_wrist")]
+
+
+def test_hidden_hips_do_not_pull_the_trunk_to_the_table(model: StitchedPuppet) -> None:
+    """Two shoulders and a neck on somebody at 3 m, two doubtful hips and a belly on a table at 2 m."""
+    person, table = wall(3.0), wall(2.0)
+    points = np.concatenate([person[person[:, 1] < -0.15], table[table[:, 1] > 0.0]])
+    given = puppet(model)
+    for name in ("left_hip", "right_hip", "belly"):
+        given.confidence[model.joint_names.index(name)] = 0.3
+    lifted = lift_joints(model, given, SeenCloud.of(points, camera()), np.ones(len(points), dtype=bool))
+    assert lifted.depth == pytest.approx(3.0)
+    assert lifted.found[model.joint_names.index("left_shoulder")]
 
 
 def test_what_lies_far_behind_the_trunk_is_not_the_person(model: StitchedPuppet) -> None:

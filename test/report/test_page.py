@@ -73,13 +73,13 @@ def test_the_slider_moves_picture_bodies_and_marks(report: Path, drawing_browser
     background = first[5, 5]
     drawn = np.abs(first - background).max(axis=2) > 30
     assert drawn.mean() > 0.02, "the 3D view is blank"
-    assert page.locator(".frame.on figcaption").text_content() == "front, 0.00 s"
+    assert page.locator(".frame.on figcaption").first.text_content() == "front, 0.00 s"
     marks = page.locator("svg .now")
     before = [marks.nth(k).get_attribute("x1") for k in range(marks.count())]
     move(page, 4)
     assert page.locator("output").text_content() == "0.40 s"
     assert page.locator(".frame.on").count() == 1
-    assert page.locator(".frame.on figcaption").text_content() == "front, 0.40 s"
+    assert page.locator(".frame.on figcaption").first.text_content() == "front, 0.40 s"
     assert np.abs(shot(page) - first).max() > 60, "the body stands where it stood"
     after = [marks.nth(k).get_attribute("x1") for k in range(marks.count())]
     assert len(after) >= 5 and all(float(a or 0) > float(b or 0) for a, b in zip(after, before, strict=True))
@@ -172,7 +172,7 @@ def test_without_webgl_the_still_pictures_are_named(report: Path, browser: Brows
     page = opener(context)
     assert page.locator(".no-space").is_visible() and not page.locator("canvas").is_visible()
     move(page, 2)
-    assert page.locator(".frame.on figcaption").text_content() == "front, 0.20 s"
+    assert page.locator(".frame.on figcaption").first.text_content() == "front, 0.20 s"
     context.close()
     assert opener.errors == []
 

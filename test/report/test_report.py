@@ -15,8 +15,8 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bag.recording import read_recording
-from flowing_puppet_ros.report.bag_pictures import ImageBox, body_axes
 from flowing_puppet_ros.report.data import gather_data
+from flowing_puppet_ros.report.pictures.bag_pictures import ImageBox, body_axes
 from flowing_puppet_ros.report.report import build_report_page, make_collage, write_report
 
 type Replay = Callable[..., tuple[Path, Path]]
@@ -68,8 +68,8 @@ def test_the_whole_page_stands_alone(replay: Replay) -> None:
     assert not re.search(r"https?:|@import|url\(|file:", html)
     assert all(image.get("alt") for image in page.images)
     assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
-    # 5 frames of the track, 3 pictures of each of 4 flows, for 3 bodies 2 sides and 2 cameras, 2 colour scales.
-    assert len(page.images) == 5 + 3 * 4 + 3 * (2 + 2) + 2
+    # 5 frames of track and bodies, 3 pictures of each of 4 flows, for 3 bodies 2 sides and 2 cameras, 2 colour scales.
+    assert len(page.images) == 2 * 5 + 3 * 4 + 3 * (2 + 2) + 2
     for image in page.images:
         data = base64.b64decode(str(image["src"]).split(",", 1)[1])
         assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None

@@ -135,8 +135,12 @@ class BodyHypotheses:
             model, self.pose_bank, self.proposer, self.gauss_newton, self._threads
         )
 
-    def search(self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False) -> BodyState:
+    def search(
+        self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False
+    ) -> list[BodyState]:
         """Find the body of a cloud in metres, z up, when only its up direction is known.
+
+        In a single view, bodies that explain it nearly as well follow the best one.
 
         Cases:
             single view: the search from the pose bank, by itself; what follows is for whole clouds.
@@ -155,15 +159,15 @@ class BodyHypotheses:
             shown = sub_progress(progress, number / tries, (number + 0.7) / tries)
             candidates = self._search_both_headings(cloud, grid, rng, shown, RESTART_SHARE if number else 1.0)
             if quick and self._is_close(candidates[0]):
-                return self.refine(candidates[0].state, cloud, none, steps)
+                return [self.refine(candidates[0].state, cloud, none, steps)]
             turned_is_near = candidates[1].cost < MAX_TURNED_RATIO * candidates[0].cost
             for candidate in candidates:
                 tried.append(self.repair_limbs(candidate, cloud, grid, rng))
                 best = min(tried, key=lambda candidate: candidate.cost)
                 contested = candidate is candidates[0] and best.cost > SURE_COST_M and turned_is_near
                 if self._is_close(best) and best.quality.reliable and not contested:
-                    return self.refine(best.state, cloud, none, steps)
-        return self.refine(best.state, cloud, none, steps)
+                    return [self.refine(best.state, cloud, none, steps)]
+        return [self.refine(best.state, cloud, none, steps)]
 
     def _is_close(self, candidate: BodyCandidate) -> bool:
         return candidate.cost < self._settings.restart_distance

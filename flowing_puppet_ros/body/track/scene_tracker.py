@@ -18,6 +18,7 @@ from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
+from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.seen_free import SeenFree
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
@@ -178,10 +179,9 @@ class SceneTracker:
         if not people:
             raise InputError(_NOBODY.format(len(cloud.points)))
         people = self._with_viewpoint(cloud, people, remember=False)
-        return [
-            TrackedBody(f"b{number}", self._fit(person, seed, progress))
-            for number, person in enumerate(people, start=1)
-        ]
+        fits = [(person, self._fit(person, seed, progress)) for person in people]
+        proven = [fit for person, fit in fits if person.proven or shows_person(person, fit)]
+        return [TrackedBody(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
         """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
@@ -199,6 +199,8 @@ class SceneTracker:
 
     def _is_one_sided(self, cloud: SceneCloud, remember: bool) -> bool:
         """Return whether people are seen from one side: known, set, decided before, or as the likeliest one looks."""
+        if cloud.is_merged:
+            return False
         if cloud.single_view or self._settings.view == "single":
             return True
         if self._settings.view == "full" or self._single_view is not None:
@@ -294,16 +296,19 @@ class SceneTracker:
     def _sensor(self, cloud: SceneCloud) -> F64 | None:
         """Return where the sensor is for the segmentation, unless people are seen from all sides."""
         full = self._settings.view == "full" or (self._settings.view == "auto" and self._single_view is False)
-        return None if full and not cloud.single_view else cloud.viewpoint
+        return None if cloud.is_merged or (full and not cloud.single_view) else cloud.viewpoint
 
     def _with_viewpoint(self, cloud: SceneCloud, people: list[PersonCloud], remember: bool = True) -> list[PersonCloud]:
         """Return the people with the viewpoint for their fits.
 
+        of several sensors         | that of each
         known to be a single view  | the sensor's place
         setting full or single     | none, or the sensor's place
         auto, decided before       | as before
         auto, not decided          | what the first person's points look like
         """
+        if cloud.is_merged:
+            return cloud.with_fields(people)
         single = (
             True if cloud.single_view else {"single": True, "full": False}.get(self._settings.view, self._single_view)
         )

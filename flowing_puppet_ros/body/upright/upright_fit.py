@@ -11,6 +11,7 @@ import numpy as np
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
@@ -23,6 +24,7 @@ from flowing_puppet_ros.body.upright.upright_bank import (
 )
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import parallel_map, usable_threads
@@ -89,7 +91,7 @@ class UprightFitter:
         points: np.ndarray,
         viewpoint: np.ndarray,
         unknown: np.ndarray | None,
-        field: SensorField | None = None,
+        field: SensorField | SensorRig | None = None,
     ) -> SingleViewCloud:
         """Return the cloud of a candidate; InputError when part of it lies behind the sensor.
 
@@ -99,6 +101,8 @@ class UprightFitter:
             unknown: (K, 3) m, see `ScanRays.find_unknown`; None where there is a field.
             field: what the sensor can know of the candidate.
         """
+        if isinstance(field, SensorRig):
+            return RigCloud.seen_by(points, field)
         points = downsample(points, None, MAX_FIT_POINTS)[0]
         return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, unknown, field)
 

@@ -278,8 +278,12 @@ def _select_detection(people: list[Any], camera: Camera, body: Joints) -> tuple[
 
 
 def select_first_bodies(recording: Recording) -> dict[int, Any]:
-    """Return the first body of each stamp that has one."""
-    return {stamp: bodies[0] for stamp, bodies in recording.bodies.items() if bodies}
+    """Return the first body of each stamp that has one; people whom colour alone shows come last."""
+    return {
+        stamp: next((body for body in bodies if body.parts), bodies[0])
+        for stamp, bodies in recording.bodies.items()
+        if bodies
+    }
 
 
 def frontality(people: Mapping[int, list[Any]]) -> float:

@@ -10,16 +10,19 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
-from flowing_puppet_ros.body.fit.visibility import Visibility
+from flowing_puppet_ros.body.fit.visibility import Visibility, rate_joints
 from flowing_puppet_ros.evaluate.body.bodies import is_flipped
 from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS
 from flowing_puppet_ros.evaluate.rgbd.views import RgbdFrame
+from flowing_puppet_ros.evaluate.scene.reliability import BIN_EDGES, CLOSE_M
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 MIN_WRONG_M = 0.06  # mean error of the vertices, or of the seen joints of people who are cut off, of a wrong body
 MIN_LOST_M = 0.15  # error of a seen elbow or wrist that is lost
 MAX_HIT_M = 0.10  # error of a joint that is where it is said to be; a joint's confidence is the probability of it
 MAX_SURFACE_GAP_M = 0.02  # from the true surface at its pixel to a vertex that is seen
+
+type CalibrationRow = dict[str, float | str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +40,7 @@ class RgbdScore:
         flipped: whether the body is nearer to the truth with left and right swapped.
         wrong: whether the vertices of a whole person, or the seen joints of others, are off by more than 6 cm.
         lost_arms, seen_arms: elbows and wrists in view that are off by more than 15 cm, and all in view.
-        reliable: as reported by the fit.
+        reliable, confidence: as reported by the fit.
         seconds: processor time of the fit.
         joints, hits: limbs' joints by `Visibility` (inferred, near, seen), and those of them that are off by less than
             10 cm.
@@ -57,6 +60,7 @@ class RgbdScore:
     lost_arms: int
     seen_arms: int
     reliable: bool
+    confidence: float
     seconds: float
     joints: tuple[int, int, int] = (0, 0, 0)
     hits: tuple[int, int, int] = (0, 0, 0)
@@ -75,7 +79,7 @@ def score_body(
     if fit is None:
         number = int(arms.sum())
         return RgbdScore(
-            cut, False, nan, nan, nan, nan, nan, nan, nan, False, True, number, number, False, seconds
+            cut, False, nan, nan, nan, nan, nan, nan, nan, False, True, number, number, False, 0.0, seconds
         )  # fmt: skip
     vertices = fit.vertices @ to_world[:3, :3].T + to_world[:3, 3]
     rows = [model.joint_names.index(name) for name in LIMB_JOINTS]
@@ -101,6 +105,7 @@ def score_body(
         lost_arms=int((error[arms] > MIN_LOST_M).sum()),
         seen_arms=int(arms.sum()),
         reliable=fit.reliable,
+        confidence=fit.confidence,
         seconds=seconds,
         joints=_count_levels(visibility),
         hits=_count_levels(visibility[error < MAX_HIT_M]),
@@ -137,6 +142,46 @@ def summarise_rgbd(scores: Sequence[RgbdScore]) -> dict[str, float | str]:
             f"{level.name.lower()}_hits": float(share[level]) if joints[level] else float("nan") for level in Visibility
         },
     }
+
+
+def tabulate_calibration(scores: Sequence[RgbdScore]) -> list[CalibrationRow]:
+    """Tabulate what confidence is said of joints and bodies, and the share of them that is right.
+
+    A joint is right within 10 cm, a body if its joints in view are in the mean. Joints are told apart by their
+    visibility, and by whether their body is reliable; bodies by their confidence, and by whether they are reliable.
+    """
+    found = [score for score in scores if score.found]
+    rows = [
+        row
+        for level in reversed(Visibility)
+        for reliable in (True, False)
+        if (row := _count_joints([score for score in found if score.reliable is reliable], level, reliable))
+    ]
+    known = [score for score in found if np.isfinite(score.seen_error)]
+    place = np.digitize([score.confidence for score in known], BIN_EDGES[1:-1])
+    for k in reversed(range(len(BIN_EDGES) - 1)):
+        for reliable in (True, False):
+            own = [score for score, bin_ in zip(known, place, strict=True) if bin_ == k and score.reliable is reliable]
+            if own:
+                right = float(np.mean([score.seen_error < CLOSE_M for score in own]))
+                said = float(np.mean([score.confidence for score in own]))
+                rows.append(_make_row(f"bodies from {BIN_EDGES[k]}", reliable, len(own), said, right))
+    return rows
+
+
+def _count_joints(scores: Sequence[RgbdScore], level: Visibility, reliable: bool) -> CalibrationRow | None:
+    """Return the row of the joints of one visibility; None without any."""
+    count = np.array([score.joints[level] for score in scores], dtype=float)
+    if not count.sum():
+        return None
+    hits = sum(score.hits[level] for score in scores)
+    said = [float(rate_joints(np.array([level]), score.reliable, score.confidence)[0]) for score in scores]
+    kind = f"{level.name.lower()} joints"
+    return _make_row(kind, reliable, int(count.sum()), float(count @ said / count.sum()), hits / float(count.sum()))
+
+
+def _make_row(kind: str, reliable: bool, count: int, said: float, right: float) -> CalibrationRow:
+    return {"kind": kind, "reliable": "yes" if reliable else "no", "count": count, "said": said, "within_10_cm": right}
 
 
 def _find_shown(frame: RgbdFrame, person: int, vertices: F64) -> np.ndarray:

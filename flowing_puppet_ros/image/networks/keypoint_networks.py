@@ -41,6 +41,7 @@ MAX_MOVE = 0.6  # median distance of joints, in shoulder widths, from a person t
 MAX_KNOWN_MOVE = 1.5  # the same from where a known person is expected
 MIN_PRESENCE = 0.3  # of BlazePose's landmarks
 MAX_LANDMARK_DISTANCE = 1.0  # shoulder widths between the landmarks and MoveNet's joints of one person
+MAX_OTHER_SHARE = 0.5  # of the distance from the landmarks to another person, from which on they are not surely of one
 LANDMARK_TRUST: F64 = np.array([{"elbow": 0.5, "knee": 0.3}.get(name.partition("_")[2], 1.0) for name in COCO_17])
 """Weight of BlazePose's joints relative to MoveNet's of the same score: it is worse at elbows and knees."""
 MAX_PEOPLE = 6
@@ -130,7 +131,11 @@ class KeypointNetworks:
         # Of two in one place the one who is nearer to where expected.
         ranked = sorted((person for person in people if person.poses), key=lambda person: person.rank)
         kept = drop_repeated(ranked, lambda person: person.poses[-1])[:max_people]
-        return [FoundPerson(self._finish(image, person), person.score) for person in kept]
+        found = [person.poses[-1] for person in kept]
+        return [
+            FoundPerson(self._finish(image, person, found[:k] + found[k + 1 :]), person.score)
+            for k, person in enumerate(kept)
+        ]
 
     def _look_again(self, image: Image, expected: NetworkPose, candidates: list[NetworkPose]) -> list[NetworkPose]:
         """Return the pose of a known person: in the square, or else one of the `candidates`, who is then taken."""
@@ -160,15 +165,20 @@ class KeypointNetworks:
         nearest = min(found, key=lambda one: pose_distance(one, pose))
         return nearest if pose_distance(nearest, pose) <= max_move and nearest.score >= MIN_SCORE else None
 
-    def _finish(self, image: Image, person: _Person) -> Keypoints:
-        """Return the keypoints of a person from MoveNet's poses and BlazePose's landmarks."""
+    def _finish(self, image: Image, person: _Person, others: Sequence[NetworkPose]) -> Keypoints:
+        """Return the keypoints of a person from MoveNet's poses and BlazePose's landmarks.
+
+        Among people side by side, landmarks may be those of one of the `others`, or half of each.
+        """
         landmarks = self.blazepose.locate(image, person.poses[-1])
         poses, seen = [*person.poses], [landmarks.pose]
         if self.thorough:
             more, again = self._look_in_mirror(image, person.poses[-1])
             poses, seen = [*poses, *more], [again, *seen]
         turned = turn_sides([*poses, *seen], None if person.expected is None else person.expected.joints)
-        agree = landmarks.presence >= MIN_PRESENCE and pose_distance(turned[-1], turned[0]) <= MAX_LANDMARK_DISTANCE
+        away = pose_distance(turned[-1], turned[0])
+        apart = min((_distance_either_way(turned[-1], other) for other in others), default=np.inf)
+        agree = landmarks.presence >= MIN_PRESENCE and away <= min(MAX_LANDMARK_DISTANCE, MAX_OTHER_SHARE * apart)
         networks = [turned[: len(poses)], turned[len(poses) :]] if agree else [turned[: len(poses)]]
         trusts = [np.ones(len(COCO_17)), LANDMARK_TRUST][: len(networks)]
         joints, confidence = combine(networks, trusts, turned[0].size)
@@ -186,6 +196,11 @@ class KeypointNetworks:
         same = self._find_in_square(mirrored, expected, MAX_MOVE)
         landmarks = self.blazepose.locate(mirrored, expected)
         return [] if same is None else [same.mirror(width)], landmarks.pose.mirror(width)
+
+
+def _distance_either_way(one: NetworkPose, other: NetworkPose) -> float:
+    """Return the distance of two poses, whichever sides are called left."""
+    return min(pose_distance(one, other), pose_distance(one, other.exchange_sides()))
 
 
 def _is_small(pose: NetworkPose, image: Image, side: int) -> bool:

@@ -20,13 +20,6 @@ if TYPE_CHECKING:
 
 _MESSAGES = "flowing_puppet_msgs/msg/"
 
-JOINT_CONFIDENCE = np.array([0.48, 0.97, 0.97])
-"""Probability that a joint that is inferred, near the cloud, or seen is within 10 cm.
-
-Measured on 60 synthetic people in colour and depth, whole and cut off, who are not those that tables are made of.
-`evaluate rgbd` prints such shares.
-"""
-
 type JointPosition = tuple[float, float, float, float]
 """x, y, z in metres, and a confidence in [0, 1]."""
 
@@ -112,8 +105,6 @@ def make_body(factory: MessageFactory, model: StitchedPuppet, body: TrackedBody)
             )
         )
     visibility = fit.visibility.joints
-    # That of a body that may be wrong as a whole lowers it further.
-    confidence = (1.0 if fit.reliable else fit.confidence) * JOINT_CONFIDENCE[visibility]
     return factory.make(
         _MESSAGES + "Body",
         id=body.id,
@@ -124,7 +115,7 @@ def make_body(factory: MessageFactory, model: StitchedPuppet, body: TrackedBody)
         reliable=fit.reliable,
         height=model.measure_height(state.shape),
         velocity=make_vector(factory, body.velocity),
-        joints=make_joints(factory, model.joint_names, fit.joints, confidence, visibility),
+        joints=make_joints(factory, model.joint_names, fit.joints, fit.joint_confidence, visibility),
         parts=parts,
     )
 

@@ -210,6 +210,16 @@ def test_landmarks_of_nobody_or_of_somebody_else_are_left_out() -> None:
         np.testing.assert_allclose(found.keypoints.confidence, 0.6 / 0.65)
 
 
+def test_landmarks_between_two_people_are_of_neither() -> None:
+    """Of somebody alone landmarks 0.6 widths away still count; not of one of two who are 1.5 widths apart."""
+    shifts = dict.fromkeys(MEDIAPIPE_33, 0.6 * WIDTH)
+    (alone,) = find(Seeing([pose(300)], [], shifts=shifts))
+    assert necks([alone])[0] > 310
+    both = find(Seeing([pose(300, 0.9), pose(390, 0.7)], [], shifts=shifts))
+    assert necks(both)[0] == 300
+    np.testing.assert_allclose(both[0].keypoints.confidence, 1.0)
+
+
 def test_where_the_networks_disagree_a_joint_is_unknown_and_its_hand_too() -> None:
     (found,) = find(Seeing([pose(300)], [], shifts={"left_wrist": 5 * WIDTH, "right_wrist": 0.2 * WIDTH}))
     place, confidence = at(found, "left_wrist")

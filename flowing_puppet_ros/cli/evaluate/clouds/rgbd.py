@@ -15,11 +15,12 @@ from tqdm import tqdm
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
+from flowing_puppet_ros.evaluate.moving.camera_ring import CameraRing, RingScore, compare_cameras, summarise_ring
 from flowing_puppet_ros.evaluate.moving.fitter_run import run_fitter
 from flowing_puppet_ros.evaluate.moving.robot_view import SENSINGS, RobotView
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
 from flowing_puppet_ros.evaluate.rgbd.methods import FusionMethod, RgbdMethod, SearchMethod
-from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summarise_rgbd
+from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summarise_rgbd, tabulate_calibration
 from flowing_puppet_ros.evaluate.rgbd.tracking import MotionScore, summarise_motions, track_motion
 from flowing_puppet_ros.evaluate.rgbd.views import CUTS, RgbdStudio, make_pair, make_registered
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
@@ -67,6 +68,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--robot", type=float, metavar="SECONDS", help="feed body_fitter with what a robot sees instead, which stands,"
         " drives and nods, hangs upside down, or whose colour and depth stand apart or are not of one time; no --mocap",
     )  # fmt: skip
+    parser.add_argument(
+        "--cameras", type=int, metavar="N", help="compare N depth cameras around the people with each of them alone"
+    )
     parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture that the poses are from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for rgbd.csv and rgbd.json")
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
@@ -94,6 +98,10 @@ def run(arguments: argparse.Namespace) -> int:
         motions = _track_motions(arguments, fitter, studio)
         print(format_json({"motions": motions}) if arguments.json else format_table(motions))
         return 0
+    if arguments.cameras is not None:
+        rings = _look_from_around(arguments, fitter, studio)
+        print(format_json({"cameras": rings}) if arguments.json else format_table(rings))
+        return 0
     scores: list[RgbdScore] = []
     rows = [(cut, number) for cut in arguments.cuts for number in range(arguments.count)]
     for cut, number in tqdm(rows, file=sys.stderr, disable=arguments.json):
@@ -103,11 +111,12 @@ def run(arguments: argparse.Namespace) -> int:
         each = seconds / len(fits)
         scores += [score_body(fitter.model, fit, to_world, frame, k, cut, each) for k, fit in enumerate(fits)]
     figures = [summarise_rgbd([score for score in scores if score.cut == cut]) for cut in arguments.cuts]
+    printed = {"summary": figures, "calibration": tabulate_calibration(scores)}
     if arguments.out is not None:
         table = [asdict(score) for score in scores]
         write_csv(arguments.out / "rgbd.csv", table)
-        write_json(arguments.out / "rgbd.json", {"summary": figures, "bodies": table})
-    print(format_json({"summary": figures}) if arguments.json else format_table(figures))
+        write_json(arguments.out / "rgbd.json", {**printed, "bodies": table})
+    print(format_json(printed) if arguments.json else "\n\n".join(map(format_table, printed.values())))
     return 0
 
 
@@ -125,6 +134,20 @@ def _track_motions(arguments: argparse.Namespace, fitter: BodyFitter, studio: Rg
         for each, score in zip(scores, found, strict=True):
             each.append(score)
     return [summarise_motions(each) for each in reversed(scores)]
+
+
+def _look_from_around(
+    arguments: argparse.Namespace, fitter: BodyFitter, studio: RgbdStudio
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Return the figures of one camera and of all around the people."""
+    if not 2 <= arguments.cameras <= 8:
+        raise InputError(f"--cameras is {arguments.cameras}; 2 to 8 can be compared with one")
+    ring, scores = CameraRing(studio, arguments.cameras), dict[int, list[RingScore]]()
+    for number in tqdm(range(arguments.count), file=sys.stderr, disable=arguments.json):
+        rng = np.random.default_rng([arguments.people_seed, 500, number])
+        for count, found in compare_cameras(fitter, ring, rng, arguments.people).items():
+            scores.setdefault(count, []).extend(found)
+    return [summarise_ring(count, found) for count, found in scores.items()]
 
 
 def _see_from_robot(arguments: argparse.Namespace) -> list[dict[str, Any]]:

@@ -143,10 +143,10 @@ def find_people_box(people: Iterable[Sequence[Any]], shape: tuple[int, ...], mar
     return ImageBox.around(np.array(joints, float).reshape(-1, 2), shape, margin)
 
 
-def draw_track(image: np.ndarray, people: Sequence[Any], box: ImageBox) -> np.ndarray:
-    """Draw the puppets over the part `box` of an image, the first one with labels; STRIP_HEIGHT rows."""
+def draw_track(image: np.ndarray, people: Sequence[Any], box: ImageBox, height: int = STRIP_HEIGHT) -> np.ndarray:
+    """Draw the puppets over the part `box` of an image, the first one with labels; `height` rows."""
     part = box.crop(image)
-    small = scale_to_height(part, STRIP_HEIGHT)
+    small = scale_to_height(part, height)
     factor = small.shape[0] / part.shape[0]
     drawn = [DrawnPuppet.from_message(person).transform(factor, (box.left, box.top)) for person in people]
     return draw_puppets(draw_puppets(small, drawn[:0:-1], labels=False), drawn[:1])
@@ -200,6 +200,11 @@ class BodyMesh:
     points: np.ndarray  # (N, 3), may be empty
 
 
+def list_meshed(bodies: Sequence[Any]) -> list[Any]:
+    """Return the Body messages that have a mesh: people whom colour alone shows have joints only."""
+    return [body for body in bodies if body.parts]
+
+
 def read_body_meshes(bodies: Sequence[Any], vertices: Any, triangles: np.ndarray, cloud: Any | None) -> list[BodyMesh]:
     """Return the meshes of `bodies` from the clouds of all their `vertices` and of the points they were fitted to.
 
@@ -241,13 +246,14 @@ def draw_body_shot(stamp: int, body: Any, mesh: BodyMesh, images: Sequence[tuple
         box = ImageBox.around(camera.project(mesh.vertices)[0], image.shape, 0.08, VIEW_ASPECT)
         small = shrink(box.crop(image), VIEW_HEIGHT)
         size = (small.shape[1], small.shape[0])
-        canvas = Canvas(_crop_camera(camera, box).resize(size), size)
+        canvas = Canvas(crop_camera(camera, box).resize(size), size)
         canvas.draw_mesh(mesh.vertices, mesh.faces, mesh.colours)
         views.append((name, canvas.compose(small, opacity=0.7).rgb))
     return BodyShot(stamp, front, side, views)
 
 
-def _crop_camera(camera: Camera, box: ImageBox) -> Camera:
+def crop_camera(camera: Camera, box: ImageBox) -> Camera:
+    """Return the camera of the part `box` of a camera's image."""
     matrix = camera.matrix.copy()
     matrix[:2, 2] -= (box.left, box.top)
     return replace(camera, matrix=matrix, size=(box.right - box.left, box.bottom - box.top))
