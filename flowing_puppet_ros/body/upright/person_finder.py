@@ -23,6 +23,7 @@ from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS, Upright
 from flowing_puppet_ros.body.upright.verification import weigh_fit
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.threads import one_blas_thread
 
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
 """Points, probability by shape, and score of what a full search is made for though no upright body explains it."""
@@ -110,6 +111,7 @@ class PersonFinder:
         self._rejected.clear()
         self._scan = None
 
+    @one_blas_thread()
     def find(
         self,
         points: np.ndarray,
@@ -187,6 +189,7 @@ class PersonFinder:
                 people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
         return people
 
+    @one_blas_thread()
     def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
 

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--up", choices=UP_AXES, default="z", help="axis that points up in scans without labels [z]")
     parser.add_argument(
-        "--max-fits", type=int, default=10, help="people, and things that look like people, fitted in a scan [10]"
+        "--max-fits", type=int, default=10, help="bodies fitted to what looks like a person, a scan [10]"
     )
     parser.add_argument("--seed", type=int, default=0, help="of all random draws [0]")
     parser.add_argument("--out", type=Path, required=True, help=f"folder for people_{MODEL}.npz and its model card")

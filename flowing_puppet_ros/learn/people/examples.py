@@ -74,11 +74,10 @@ def read_scenes(folders: list[Path], turn: np.ndarray) -> Iterator[tuple[np.ndar
 def collect_examples(
     fitter: BodyFitter, scenes: Iterator[tuple[np.ndarray, LabelledScene]], max_fits: int, seed: int
 ) -> CandidateExamples:
-    """Make the examples of scans; of each, at most `max_fits` people are fitted, and as many things that look like one.
+    """Make the examples of scans; of each, people are fitted, and at most `max_fits` others that look like people.
 
     How much something looks like a person is what forests say that have not seen its scan.
     """
-    rng = np.random.default_rng(seed)
     upright = UprightFitter(fitter)
     seen: list[_SeenScan] = [_SeenScan.of(points, truth) for points, truth in scenes]
     shape = np.concatenate([scan.shape for scan in seen])
@@ -94,8 +93,7 @@ def collect_examples(
         first += len(rows)
         others = rows[(own[rows] == 0) & (alike[rows] > MIN_ALIKE)]
         others = others[np.argsort(-alike[others], kind="stable")][:max_fits]
-        people = rng.permutation(rows[own[rows] == 1])[:max_fits]
-        for row in np.sort(np.concatenate([people, others])):
+        for row in np.sort(np.concatenate([rows[own[rows] == 1], others])):
             evidence[row], joint_error[row] = scan.weigh(upright, fitter, int(row - rows[0]))
     return CandidateExamples(shape[clear], evidence[clear], own[clear], number[clear], joint_error[clear])
 
