@@ -140,6 +140,13 @@ def test_two_sensors_of_one_name_are_refused() -> None:
         make_rig("cam0, cam0")
 
 
+@pytest.mark.slow
+def test_a_rig_can_be_warmed_up() -> None:
+    component = BodyFitterComponent(BodyFitterSettings.from_mapping({"rig.cameras": "cam0,cam1"}), FACTORY)
+    component.warm_up()
+    assert not component.counters and not component.report.drain_warnings()
+
+
 def measure(angles: tuple[float, ...], frames: Any = None) -> tuple[list[float], BodyFitterComponent]:
     """Return the mean error, m, of the man's limbs in each body that cameras at some angles give together."""
     points = cloud_of(MAN, 60_000)[0]
