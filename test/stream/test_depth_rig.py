@@ -140,6 +140,16 @@ def test_two_sensors_of_one_name_are_refused() -> None:
         make_rig("cam0, cam0")
 
 
+def test_a_rig_is_warmed_up_by_the_images_of_one_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    component = BodyFitterComponent(BodyFitterSettings.from_mapping({"rig.cameras": "cam0,cam1"}), FACTORY)
+    warmed: list[Any] = []
+    monkeypatch.setattr("flowing_puppet_ros.stream.components.warm_up.run", lambda made, _: warmed.append(made))
+    monkeypatch.setattr(component._scene, "warm_up", lambda: None)
+    monkeypatch.setattr(component._outputs, "warm_up", lambda: None)
+    component.warm_up()
+    assert {"depth", "puppets"} <= {port.name for port in warmed[0].inputs}
+
+
 def measure(angles: tuple[float, ...], frames: Any = None) -> tuple[list[float], BodyFitterComponent]:
     """Return the mean error, m, of the man's limbs in each body that cameras at some angles give together."""
     points = cloud_of(MAN, 60_000)[0]

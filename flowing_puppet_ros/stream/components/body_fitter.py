@@ -147,7 +147,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         """Do beforehand what the first clouds of a live stream would wait for: fit somebody made up, too."""
         self._scene.warm_up()
         self._outputs.warm_up()
-        other = type(self)(replace(self.settings, up="auto", fixed_frame="", sensor_frame=""), self.factory)
+        alone = replace(self.settings, up="auto", fixed_frame="", sensor_frame="", rig=DepthRigSettings())
+        other = type(self)(alone, self.factory)
         warm_up.run(other, warm_up.make_fitter_input(self.factory, self._model))
 
     def reset(self) -> None:
