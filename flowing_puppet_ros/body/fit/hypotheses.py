@@ -150,7 +150,8 @@ class BodyHypotheses:
             repair: suspect limbs of each candidate are searched again before it is compared.
         """
         if isinstance(cloud, SingleViewCloud):
-            return self._single_view_search.run(cloud, rng, self._settings.gauss_newton_steps, progress)
+            found = self._single_view_search.run(cloud, rng, self._settings.gauss_newton_steps, progress)
+            return found if len(found) == 1 else sorted(found, key=lambda body: self._measure_uncovered(body, cloud))
         grid = CloudGrid.build(cloud.points, cloud.normals)
         none, steps = JointTargets.none(self._model), self._settings.gauss_newton_steps
         tries = 1 + self._settings.restarts
@@ -168,6 +169,10 @@ class BodyHypotheses:
                 if self._is_close(best) and best.quality.reliable and not contested:
                     return [self.refine(best.state, cloud, none, steps)]
         return [self.refine(best.state, cloud, none, steps)]
+
+    def _measure_uncovered(self, body: BodyState, cloud: Cloud) -> float:
+        """Return the share of a cloud that a body leaves uncovered: of bodies that are as likely, it tells best."""
+        return assess_fit(self._model, self._model.vertices(body), cloud).uncovered
 
     def _is_close(self, candidate: BodyCandidate) -> bool:
         return candidate.cost < self._settings.restart_distance
