@@ -166,8 +166,11 @@ def make_bag() -> None:
 
 
 def read_results(path: Path) -> dict[str, Any]:
-    """Read the joints of a replayed bag by topic and stamp: {"puppets": ..., "bodies": ...}, pixels and metres."""
-    found: dict[str, Any] = {"puppets": {}, "bodies": {}}
+    """Read the joints of a replayed bag by topic and stamp, pixels and metres, and the version of OpenCV.
+
+    {"puppets": ..., "bodies": ..., "opencv": "MAJOR.MINOR"}
+    """
+    found: dict[str, Any] = {"puppets": {}, "bodies": {}, "opencv": ".".join(cv2.__version__.split(".")[:2])}
     with open_bag(path) as bag:
         for record in bag.messages([f"/{name}/puppets" for name in make_cameras()] + ["/bodies"]):
             stamp = str(geometry.stamp_ns(record.message))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes live over loopback DDS, timed: images of a drawn person, clouds of a body, RGB-D of two people."""
+"""The nodes live over loopback DDS, timed: a drawn person, clouds of one and three bodies, RGB-D of two people."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,42 +25,46 @@ from flowing_puppet_ros.evaluate.rgbd.motions import pose_motion
 from flowing_puppet_ros.evaluate.rgbd.views import RgbdStudio, look_along
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
-IMAGE_RATE_HZ, CLOUD_RATE_HZ = 30.0, 10.0
+RATE_HZ = 30.0  # of images and of clouds
 IMAGE_COUNT, CLOUD_COUNT = 90, 40  # played back and forth
-CLOUD_POINTS, NOISE_M, STEP_M, TURN_RAD = 5000, 0.003, 0.03, 0.02  # noise is a deviation; step and turn are per cloud
+CLOUD_POINTS, NOISE_M, STEP_M, TURN_RAD = 5000, 0.003, 0.01, 0.007  # noise is a deviation; step and turn are per cloud
+APART_M = 1.5  # between the ways of people
 RGBD = "puppet_tracker, body_fitter"
 RGBD_COUNT = 45  # moments, played back and forth
+CLOUD_PEOPLE = (1, 3)  # in a cloud
 TARGETS = {
-    RGBD: "15 Hz, median 120 ms, first body 0.6 s",
-    "puppet_tracker": "15 Hz, median 150 ms, lock-on 10 s",
-    "body_fitter": "5 Hz, lock-on 10 s",
+    (RGBD, 2): "15 Hz, median 120 ms, first body 0.6 s",
+    ("puppet_tracker", 1): "15 Hz, median 150 ms, lock-on 10 s",
+    ("body_fitter", 1): "20 Hz, lock-on 10 s",
+    ("body_fitter", 3): "10 Hz, lock-on 10 s",
 }
 # The networks find no drawn person, our own detector does.
-_ARGUMENTS = {
-    "puppet_tracker": ("-p", "flow.preset:=fast", "-p", "detection.source:=own"),
-    "body_fitter": ("-p", "track:=true"),
-}
+_TRACKER_ARGUMENTS = ("-p", "flow.preset:=fast", "-p", "detection.source:=own")
 _BOOTSTRAP_GUARD = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 
 
 def make_images() -> np.ndarray:
     """Draw images (N, 480, 640, 3) of a person who waves, one image period apart."""
     person = DrawnPerson((640, 480))
-    return np.stack([person.draw(number / IMAGE_RATE_HZ) for number in range(IMAGE_COUNT)])
+    return np.stack([person.draw(number / RATE_HZ) for number in range(IMAGE_COUNT)])
 
 
-def make_clouds(seed: int = 0) -> np.ndarray:
-    """Sample clouds (N, P, 3) m of a random body of the shipped model that walks and turns."""
+def make_clouds(seed: int = 0, people: int = 1) -> np.ndarray:
+    """Sample clouds (N, P, 3) m of random bodies of the shipped model that walk side by side and turn."""
     model, rng = StitchedPuppet.load(), np.random.default_rng(seed)
-    body = model.sample(rng)
+    bodies = [model.sample(rng) for _ in range(people)]
     found = []
     for number in range(CLOUD_COUNT):
         angle = TURN_RAD * number
         turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
-        center = (body.center - body.center[0]) @ turn.T + body.center[0] + np.array([STEP_M * number, 0.0, 0.0])
-        state = replace(body, center=center, rotation=turn @ body.rotation)
-        points, _ = sample_surface(model.vertices(state), model.faces, rng, CLOUD_POINTS)
-        found.append(points + NOISE_M * rng.standard_normal(points.shape))
+        clouds = []
+        for place, body in enumerate(bodies):
+            step = np.array([STEP_M * number, APART_M * place, 0.0])
+            center = (body.center - body.center[0]) @ turn.T + body.center[0] + step
+            state = replace(body, center=center, rotation=turn @ body.rotation)
+            points, _ = sample_surface(model.vertices(state), model.faces, rng, CLOUD_POINTS)
+            clouds.append(points + NOISE_M * rng.standard_normal(points.shape))
+        found.append(np.concatenate(clouds))
     return np.stack(found).astype(np.float32)
 
 
@@ -72,7 +77,7 @@ def make_rgbd(seed: int = 0) -> dict[str, Any]:
     rng = np.random.default_rng(seed)
     places = {"waving": (np.array([0.2, 0.7, 0.0]), np.pi), "walking": (np.array([0.2, -0.5, 0.0]), 0.8 * np.pi)}
     people = [
-        [body.translate(place) for body in pose_motion(source, name, rng, RGBD_COUNT, IMAGE_RATE_HZ, yaw)]
+        [body.translate(place) for body in pose_motion(source, name, rng, RGBD_COUNT, RATE_HZ, yaw)]
         for name, (place, yaw) in places.items()
     ]
     studio = RgbdStudio(source)
@@ -95,18 +100,22 @@ def run(seconds: float, seed: int = 0) -> list[dict[str, Any]]:
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "input.npz"
-        for node, array, rate in (
-            ("puppet_tracker", "images", IMAGE_RATE_HZ),
-            ("body_fitter", "clouds", CLOUD_RATE_HZ),
-        ):
-            arrays: Any = {array: make_images() if array == "images" else make_clouds(seed)}
-            np.savez(file, **arrays)
-            command = ["benchmarks.live_node", node, str(file), "--rate", str(rate), "--seconds", str(seconds)]
-            rows.append(_measure([*command, "--", *_ARGUMENTS[node]]) | {"target": TARGETS[node]})
+        np.savez(file, images=make_images())
+        rows.append(_measure_node("puppet_tracker", file, seconds, _TRACKER_ARGUMENTS, 1))
+        for people in CLOUD_PEOPLE:
+            np.savez(file, clouds=make_clouds(seed, people))
+            rows.append(_measure_node("body_fitter", file, seconds, ("-p", "track:=true"), people))
         np.savez(file, **make_rgbd(seed))
-        command = ["benchmarks.live_rgbd", str(file), "--rate", str(IMAGE_RATE_HZ), "--seconds", str(seconds)]
-        rows.append({"node": RGBD} | _measure(command) | {"target": TARGETS[RGBD]})
+        command = ["benchmarks.live_rgbd", str(file), "--rate", str(RATE_HZ), "--seconds", str(seconds)]
+        rows.append({"node": RGBD} | _measure(command) | {"target": TARGETS[RGBD, 2]})
     return rows
+
+
+def _measure_node(node: str, file: Path, seconds: float, given: Sequence[str], people: int) -> dict[str, Any]:
+    """Measure a node with parameters `given` on input that shows so many people."""
+    command = ["benchmarks.live_node", node, str(file), "--rate", str(RATE_HZ), "--seconds", str(seconds)]
+    figures = _measure([*command, "--people", str(people), "--", *given])
+    return figures | {"target": TARGETS[node, people]}
 
 
 def _measure(command: list[str]) -> dict[str, Any]:

@@ -77,8 +77,10 @@ class Feeder(Node):
         self.arrivals.append((time.monotonic(), latency, len(getattr(message, self.people))))
 
 
-def measure(name: str, arrays: Any, rate: float, seconds: float, ros_arguments: list[str]) -> dict[str, Any]:
-    """Run the node on `seconds` of input and return the figures; RuntimeError if it does not start."""
+def measure(
+    name: str, arrays: Any, rate: float, seconds: float, people: int, ros_arguments: list[str]
+) -> dict[str, Any]:
+    """Run the node on `seconds` of input that shows so many people; RuntimeError if it does not start."""
     reliable = f"qos_overrides.{NAMESPACE}/{STREAMS[name][1]}.subscription.reliability:=reliable"
     command = [sys.executable, "-m", "flowing_puppet_ros.node.main", name, "--ros-args"]
     command += ["-r", f"__ns:={NAMESPACE}", "-p", reliable]
@@ -87,21 +89,27 @@ def measure(name: str, arrays: Any, rate: float, seconds: float, ros_arguments: 
     executor.add_node(feeder)
     with subprocess.Popen([*command, *ros_arguments], stdin=subprocess.DEVNULL) as process:
         try:
-            _wait_for_node(feeder, executor, process)
-            return {"node": name, "input_hz": rate, **_feed(feeder, executor, process.pid, rate, seconds)}
+            ready = _wait_for_node(feeder, executor, process)
+            start = {"node": name, "people": people, "input_hz": rate, "ready_s": round(ready, 2)}
+            return start | _feed(feeder, executor, process.pid, rate, seconds, people)
         finally:
             process.send_signal(signal.SIGINT)
 
 
-def _wait_for_node(feeder: Feeder, executor: SingleThreadedExecutor, process: subprocess.Popen[bytes]) -> None:
-    until = time.monotonic() + START_TIMEOUT_S
+def _wait_for_node(feeder: Feeder, executor: SingleThreadedExecutor, process: subprocess.Popen[bytes]) -> float:
+    """Return the seconds until the node takes input."""
+    begin = time.monotonic()
+    until = begin + START_TIMEOUT_S
     while not feeder.feed.get_subscription_count():
         if process.poll() is not None or time.monotonic() > until:
             raise RuntimeError("the node did not start")
-        executor.spin_once(timeout_sec=0.1)
+        executor.spin_once(timeout_sec=0.05)
+    return time.monotonic() - begin
 
 
-def _feed(feeder: Feeder, executor: SingleThreadedExecutor, pid: int, rate: float, seconds: float) -> dict[str, Any]:
+def _feed(
+    feeder: Feeder, executor: SingleThreadedExecutor, pid: int, rate: float, seconds: float, wanted: int
+) -> dict[str, Any]:
     memory: list[tuple[float, float]] = []
     start = time.monotonic()
     while (now := time.monotonic()) < start + seconds:
@@ -111,7 +119,7 @@ def _feed(feeder: Feeder, executor: SingleThreadedExecutor, pid: int, rate: floa
         if not memory or now > memory[-1][0] + 1.0:
             memory.append((now, _resident_megabytes(pid)))
         executor.spin_once(timeout_sec=max(0.0, min(due - now, 0.05)))
-    found = [arrival for arrival, _, people in feeder.arrivals if people]
+    found = [arrival for arrival, _, people in feeder.arrivals if people >= wanted]
     lock_on = found[0] if found else float("inf")
     steady = [(arrival, latency) for arrival, latency, _ in feeder.arrivals if arrival > lock_on]
     latencies = sorted(1000 * latency for _, latency in steady)
@@ -156,10 +164,13 @@ def main() -> int:
     parser.add_argument("input", type=Path)
     parser.add_argument("--rate", type=float, required=True)
     parser.add_argument("--seconds", type=float, required=True)
+    parser.add_argument("--people", type=int, default=1, help="in the input; results with fewer are not counted")
     split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
     given, ros_arguments = parser.parse_args(sys.argv[1:split]), sys.argv[split + 1 :]
     return print_figures(
-        given.node, given.input, lambda arrays: measure(given.node, arrays, given.rate, given.seconds, ros_arguments)
+        given.node,
+        given.input,
+        lambda arrays: measure(given.node, arrays, given.rate, given.seconds, given.people, ros_arguments),
     )
 
 

@@ -104,6 +104,8 @@ def running_node(name: str) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "flowing_puppet_ros.node.main", name, "--ros-args", "-r", f"__ns:={NAMESPACE}"]
     for topic in NODES[name]:
         command += ["-p", f"qos_overrides.{NAMESPACE}/{topic}.subscription.reliability:=reliable"]
+    if name == "puppet_tracker":
+        command += ["-p", "flow.preset:=fast"]  # as rgbd.launch.py starts it
     if name == "body_fitter":
         command += ["-r", f"puppets/camera_info:={NAMESPACE}/camera_info"]
     with subprocess.Popen(command, stdin=subprocess.DEVNULL) as process:

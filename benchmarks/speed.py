@@ -17,7 +17,7 @@ import numpy as np
 from numba import njit
 from scipy.spatial import cKDTree
 
-from benchmarks import plain_search, replays, stages, streams
+from benchmarks import plain_search, replays, scenes, stages, streams
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.body.fit.initialisation import sample_bodies
@@ -167,6 +167,10 @@ class Bench:
                 runs.append(spent)
             rows += stages.make_rows(path, runs[1:])
         return rows
+
+    def measure_scene(self) -> list[Row]:
+        """Measure milliseconds of each stage of a scan of a scene with 90,000 points and five people."""
+        return scenes.measure_scene(self._seed)
 
     def measure_fits(self) -> list[Row]:
         """Measure seconds of whole fits to 10,000 points: the defaults, and the thesis's particles and iterations."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure speed as ratios in one run: look-ups, steps, search, growth, tracking, stages, fits, images, replay, memory.
+"""Measure speed as ratios in one run: look-ups, steps, search, growth, tracking, stages, scene, fits and more.
 
 `bench peers` compares with common alternatives; the part `live` runs the nodes over DDS.
 """
@@ -23,6 +23,7 @@ PARTS = {
     "growth": Bench.measure_growth,
     "tracking": Bench.measure_tracking,
     "stages": Bench.measure_stages,
+    "scene": Bench.measure_scene,
     "fits": Bench.measure_fits,
     "images": Bench.measure_images,
     "replay": Bench.measure_replay,

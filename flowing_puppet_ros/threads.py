@@ -7,6 +7,7 @@ may be entered from several threads at once, and give the former count back when
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -84,7 +85,11 @@ def one_opencv_thread() -> Iterator[None]:
 
 def _limit_blas() -> Restore | None:
     # Only what is changed is given back: what another caller limited for the whole process is theirs to give back.
-    former = [(library, count) for library in _find_libraries() if (count := library.get_num_threads()) > 1]
+    former = [
+        (library, count)
+        for library in _find_libraries("scipy.linalg" in sys.modules)
+        if (count := library.get_num_threads()) > 1
+    ]
     if not former:
         return None
 
@@ -117,10 +122,8 @@ def _limit_opencv() -> Restore | None:
 
 
 @cache
-def _find_libraries() -> tuple[threadpoolctl.LibController, ...]:
-    # To look for the libraries takes milliseconds; those of both packages must be loaded when it is done.
-    import scipy.linalg  # noqa: F401
-
+def _find_libraries(_with_scipy: bool) -> tuple[threadpoolctl.LibController, ...]:
+    # To look for the libraries takes milliseconds; done again once SciPy, which brings a BLAS of its own, is loaded.
     return tuple(threadpoolctl.ThreadpoolController().lib_controllers)
 
 

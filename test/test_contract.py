@@ -30,7 +30,8 @@ ROS_PACKAGES = {
     "std_srvs",
 }
 FOUNDATION = {
-    "arrays", "errors", "extras", "ids", "images", "kernel_cache", "reporting", "settings", "threads", "units",
+    "arrays", "assignment", "errors", "extras", "ids", "images", "kernel_cache", "memory", "reporting", "settings",
+    "threads", "units",
 }  # fmt: skip
 """Modules beside the rooms, which everything may import."""
 OPTIONAL_PACKAGES = {

@@ -3,21 +3,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from flowing_puppet_ros.bag.reader import RecordingLike
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.stream.component import base_topic, is_compressed_depth_topic
 from flowing_puppet_ros.stream.messages.camera_info import describe_images
 from flowing_puppet_ros.stream.messages.compressed_depth import decode_compressed_depth, source_encoding
+from flowing_puppet_ros.stream.messages.geometry import FrameTree
 from flowing_puppet_ros.stream.messages.images import is_depth_encoding
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, IMAGE
 
 PREFERRED_NAMES = ("depth", "image_rect", "image_rect_raw", "image_raw")
 """Names of depth images in order of preference within a namespace: the driver's rectified one comes first."""
+RIG_DEPTHS_M, RIG_GRID, MIN_COMMON_SHARE = (1.0, 2.0, 3.0, 4.0, 5.0), 5, 0.1
+"""Depths and pixels of the places by which it is told whether two cameras see the same, and the share of those that one
+of them sees and the other could."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +47,11 @@ class DepthTopic:
 
     image: str
     info: str
+
+    @property
+    def name(self) -> str:
+        """The camera's name among several: the namespace of its images without the leading slash."""
+        return base_topic(self.image).rpartition("/")[0].lstrip("/") or "camera"
 
 
 def read_samples(bag: RecordingLike) -> dict[str, ImageSample]:
@@ -168,6 +180,44 @@ def _info_size(info: Any, size: tuple[int, int]) -> tuple[int, int]:
     """Return width and height of the images of a CameraInfo, which are `size` if it does not say."""
     described = describe_images(info, size)
     return int(described.width), int(described.height)
+
+
+def find_rig(depths: Sequence[DepthTopic], infos: Mapping[str, Any], frames: FrameTree) -> list[DepthTopic]:
+    """Return the depth cameras that look at the same people: their static frames are connected, and their views meet.
+
+    Empty without two of them.
+    """
+    usable = [depth for depth in depths if depth.info in infos]
+    found = [
+        depth
+        for depth in usable
+        if any(_see_the_same(infos[depth.info], infos[other.info], frames) for other in usable if other is not depth)
+    ]
+    return found if len(found) > 1 else []
+
+
+def _see_the_same(first: Any, second: Any, frames: FrameTree) -> bool:
+    """Return whether two cameras, by their CameraInfo, stand apart and much of what one could see the other could."""
+    own, others = (info.header.frame_id.lstrip("/") for info in (first, second))
+    pose = None
+    with suppress(InputError):
+        pose = None if own == others else frames.lookup_pose(own, others)
+    if pose is None:
+        return False
+    try:
+        own_camera, camera = (
+            Camera.from_info(info.k, [], info.width, info.height, np.eye(3), np.zeros(3)) for info in (first, second)
+        )
+    except InputError:
+        return False
+    columns, rows = (np.linspace(0, side - 1, RIG_GRID) for side in own_camera.size)
+    rays = own_camera.undistort(np.stack(np.meshgrid(columns, rows), axis=-1))
+    ahead = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], axis=-1).reshape(-1, 3)
+    places = np.concatenate([depth * ahead for depth in RIG_DEPTHS_M]) @ pose[1].T + pose[0]
+    pixels, depth = camera.project(places)
+    with np.errstate(invalid="ignore"):
+        inside = ((pixels >= 0) & (pixels < camera.size)).all(axis=1) & (depth > 0) & (depth < RIG_DEPTHS_M[-1])
+    return bool(inside.mean() >= MIN_COMMON_SHARE)
 
 
 def count_common(first: str, second: str) -> int:

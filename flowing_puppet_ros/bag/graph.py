@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flowing_puppet_ros.bag.colour_topics import ColourTopics, choose_colour, find_colour_topics
-from flowing_puppet_ros.bag.depth_topics import DepthTopic, ImageSample, holds_depth, select_depth_topics
+from flowing_puppet_ros.bag.depth_topics import DepthTopic, ImageSample, find_rig, holds_depth, select_depth_topics
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.settings import Settings
@@ -119,7 +119,8 @@ def build_graph(
     - One tracker per camera.
     - One visual hull of two or more cameras that `frames` connects (`infos`: topic -> its first CameraInfo), and one
       body fitter for its silhouettes.
-    - One body fitter for every topic of clouds or depth images (`samples`: image topic -> its first image;
+    - One body fitter for all depth cameras that `frames` connects and that look at the same people.
+    - One body fitter for every other topic of clouds or depth images (`samples`: image topic -> its first image;
       `cloud_frames`: cloud topic -> its frame), joined with the puppets of a colour camera that looks there too.
 
     `moving` connects frames that move against each other too, as a camera on a head and a LiDAR do.
@@ -140,6 +141,10 @@ def build_graph(
         if len(calibrated) >= MIN_CAMERAS:
             graph.instances += _make_hull_and_fitter(calibrated, settings, factory)
     made = graph.find_outputs()
+    rig = find_rig(depths, infos, frames)
+    if rig:
+        graph.instances.append(_make_rig_fitter(rig, "/bodies" in made, settings, factory))
+        depths = [depth for depth in depths if depth not in rig]
     sources: list[str | DepthTopic] = [*(cloud for cloud in clouds if cloud not in made), *depths]
     trackers = {tracker.resolve("image"): tracker for tracker in graph.instances if "image" in tracker.remapped}
     colours = find_colour_topics(list(trackers), samples, infos)
@@ -295,6 +300,21 @@ def _make_scene_fitter(
     instance = Instance(f"{topic.lstrip('/')}/body_fitter", fitter, topic.rpartition("/")[0], remapped)
     fitter.set_expected("initial", topics.get(instance.resolve("initial")) == BODIES)
     return instance
+
+
+def _make_rig_fitter(
+    rig: list[DepthTopic], has_bodies: bool, settings: Mapping[str, Mapping[str, Any]], factory: MessageFactory
+) -> Instance:
+    """Return the body fitter for several depth cameras together; below `depth_cameras` where others make /bodies."""
+    fixed = {"rig.cameras": ",".join(depth.name for depth in rig)}
+    chosen = {"": {**fixed, **settings.get("body_fitter", {})}}
+    remapped = {"silhouettes": ""}
+    for depth in rig:
+        remapped |= {f"{depth.name}/depth": depth.image, f"{depth.name}/camera_info": depth.info}
+        remapped[f"{depth.name}/points"] = ""
+    fitter = BodyFitterComponent(_make_settings(BodyFitterSettings, "", chosen), factory)
+    namespace = "/depth_cameras" if has_bodies else ""
+    return Instance(f"{namespace}/body_fitter".lstrip("/"), fitter, namespace, remapped)
 
 
 def _find_frame(topic: str, samples: Mapping[str, ImageSample], cloud_frames: Mapping[str, str]) -> str:

@@ -21,7 +21,8 @@ def count_used(instances: Iterable[Instance]) -> int:
     for instance in instances:
         counters = instance.component.counters
         used += counters["images"]
-        received = sum(counters[f"received {port}"] for port in _SENSOR_PORTS)
+        ports = [port.name for port in instance.component.inputs if port.name.rpartition("/")[2] in _SENSOR_PORTS]
+        received = sum(counters[f"received {port}"] for port in ports)
         used += max(0, received - counters["unusable"]) if received else 0
     return used
 

@@ -26,9 +26,7 @@ from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.cli.scans.fit_file import fit_file, list_files
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions
-from flowing_puppet_ros.cli.scans.fit_sequence import fit_sequence
 from flowing_puppet_ros.cli.scans.given_joints import read_joints
-from flowing_puppet_ros.cli.scans.track_scene import track_scene
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.exchange.files import FORMATS, write_people
 from flowing_puppet_ros.exchange.motion import read_fit
@@ -129,8 +127,51 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fit every input; one that fails is reported and the others go on."""
+    options = _make_options(arguments)
+    sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in _find_scans(given)]
+    several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
+    tracked = arguments.scene and arguments.camera_info is None and any(given.is_dir() for given in arguments.inputs)
+    _refuse_contradictions(arguments, several, tracked)
+    if arguments.rerun is not None:
+        from flowing_puppet_ros.report.rerun_file import import_rerun
+
+        import_rerun()
+    finished: list[dict[str, Any]] = []
+
+    def tell(summary: dict[str, Any]) -> None:
+        _tell(summary, arguments.json)
+        if arguments.export and "error" not in summary:
+            _export(summary, arguments.export)
+        finished.extend([] if "error" in summary else [summary])
+
+    verb = runner.Verb("fit", fit_file, list_files, tell)
+    if arguments.sequence:
+        from flowing_puppet_ros.cli.scans.fit_sequence import (
+            fit_sequence,  # the trackers are loaded for those who track
+        )
+
+        make_out_folder(options.out)
+        fit_sequence(sources, options, tell)
+        status = 0
+    elif tracked:
+        from flowing_puppet_ros.cli.scans.track_scene import track_scene
+
+        make_out_folder(options.out)
+        status = track_scene(sources, arguments.scan_rate, options, tell)
+    elif several:
+        status = runner.run_batch(verb, sources, options, arguments.out, arguments)
+    else:
+        status = _one(verb, sources[0], options)
+    if arguments.rerun is not None and finished:
+        from flowing_puppet_ros.report.rerun_file import write_fits
+
+        write_fits(_fits(finished), arguments.rerun)
+    return status
+
+
+def _make_options(arguments: argparse.Namespace) -> FitOptions:
     settings = FitVerbSettings.from_arguments(arguments)
-    options = FitOptions(
+    return FitOptions(
         out=runner.resolve_path(arguments.out, arguments),
         model=arguments.model,
         up=arguments.up,
@@ -146,55 +187,20 @@ def run(arguments: argparse.Namespace) -> int:
         measure=arguments.measure,
         joints=() if arguments.joints is None else tuple(read_joints(arguments.joints).items()),
     )
-    sources = [runner.resolve_path(source, arguments) for given in arguments.inputs for source in _find_scans(given)]
-    several = sources != arguments.inputs or len(sources) > 1 or arguments.scheduler is not None
-    finished: list[dict[str, Any]] = []
+
+
+def _refuse_contradictions(arguments: argparse.Namespace, several: bool, tracked: bool) -> None:
+    """Raise InputError where flags contradict one another or the inputs."""
     if arguments.sequence and (arguments.scene or arguments.scheduler is not None):
         raise InputError("--sequence fits one person in scans one after another; leave --scene and --scheduler")
     if arguments.joints is not None and (arguments.scene or (several and not arguments.sequence)):
         raise InputError("--joints are those of the person in one scan; give one INPUT, and leave --scene")
-    folders = [given for given in arguments.inputs if given.is_dir()] if arguments.scene else []
-    tracked = bool(folders) and options.camera_info is None
-    if tracked:
-        _refuse_untrackable(arguments)
-    if arguments.rerun is not None:
-        from flowing_puppet_ros.report.rerun_file import import_rerun
-
-        import_rerun()
-
-    def tell(summary: dict[str, Any]) -> None:
-        _tell(summary, arguments.json)
-        if arguments.export and "error" not in summary:
-            _export(summary, arguments.export)
-        finished.extend([] if "error" in summary else [summary])
-
-    verb = runner.Verb("fit", fit_file, list_files, tell)
-    if arguments.sequence:
-        make_out_folder(options.out)
-        fit_sequence(sources, options, tell)
-        status = 0
-    elif tracked:
-        make_out_folder(options.out)
-        status = track_scene(sources, arguments.scan_rate, options, tell)
-    elif several:
-        status = runner.run_batch(verb, sources, options, arguments.out, arguments)
-    else:
-        status = _one(verb, sources[0], options)
-    if arguments.rerun is not None and finished:
-        from flowing_puppet_ros.report.rerun_file import write_fits
-
-        write_fits(_fits(finished), arguments.rerun)
-    return status
-
-
-def _refuse_untrackable(arguments: argparse.Namespace) -> None:
-    """Raise InputError where the scans of a folder cannot be tracked."""
-    if len(arguments.inputs) > 1 or arguments.scheduler is not None:
+    if tracked and (len(arguments.inputs) > 1 or arguments.scheduler is not None):
         raise InputError(
             "--scene tracks people through the scans of one folder, one after another; give one folder and no"
             " --scheduler, or the files in it to fit each by itself"
         )
-    if not 0 < arguments.scan_rate < np.inf:
+    if tracked and not 0 < arguments.scan_rate < np.inf:
         raise InputError(f"--scan-rate is {arguments.scan_rate:g}; give the scans a second, such as 10")
 
 

@@ -99,6 +99,8 @@ class _NodeAdvice:
         kind = instance.name.rpartition("/")[2]
         if kind == "visual_hull":
             words.insert(0, f"-p cameras:={instance.component.settings.values()['cameras']}")
+        if rig := instance.component.settings.values().get("rig.cameras"):
+            words.insert(0, f"-p rig.cameras:={rig}")
         return " ".join([kind, *(["--ros-args", *words] if words else [])])
 
     def rename(self, old: str, new: str) -> str:

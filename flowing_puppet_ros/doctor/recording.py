@@ -135,6 +135,9 @@ def _describe(instance: Instance, recorded: Mapping[str, str], samples: Mapping[
             port.name.removesuffix("/image") for port in instance.component.inputs if port.name.endswith("/image")
         ]
         return f"silhouettes, visual hull and triangulated joints from the cameras {', '.join(cameras)}"
+    if isinstance(rig := instance.component.settings.values().get("rig.cameras"), str) and rig:
+        seen = sorted(name for port, name in recorded.items() if port.endswith(("/depth", "/points")))
+        return f"one body a person from {' and '.join(seen) or rig} together, joined by /tf"
     if "points" in recorded:
         return f"bodies in the clouds on {rated('points')}"
     if "depth" in recorded:

@@ -8,6 +8,7 @@ have colours too, by their ids.
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -63,6 +64,10 @@ def list_person_colours(ids: Iterable[str]) -> dict[str, tuple[int, int, int]]:
 
 
 def person_colour(identity: str) -> tuple[int, int, int]:
-    """Return the RGB colour of a person by the number that the id (`a1`, `a2`, ...) ends with; they repeat."""
+    """Return the RGB colour of a person by the number that the id (`a1`, `a2`, ...) ends with, or by its letters.
+
+    Neighbouring numbers differ; ids of letters alone, as REP-155 has them, may share a colour, but each keeps its own.
+    """
     number = re.search(r"\d*$", identity)
-    return PERSON_COLOURS[(int(number[0]) - 1 if number and number[0] else 0) % len(PERSON_COLOURS)]
+    place = int(number[0]) - 1 if number and number[0] else zlib.crc32(identity.encode())
+    return PERSON_COLOURS[place % len(PERSON_COLOURS)]

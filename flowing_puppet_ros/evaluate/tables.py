@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Any
 
 Row = dict[str, Any]
-"""Figures by name; all rows of a table have the same names."""
+"""Figures by name."""
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format rows of one form as a table with a heading; numbers right-aligned, rounded to 4 digits."""
-    heads = list(rows[0])
-    cells = [heads, *([_format_cell(row[head]) for head in heads] for row in rows)]
+    """Format rows as a table with a heading; numbers right-aligned, rounded to 4 digits.
+
+    The columns are those of all rows in the order of their first appearance; a figure that a row lacks stays empty.
+    """
+    heads = list(dict.fromkeys(head for row in rows for head in row))
+    cells = [heads, *([_format_cell(row.get(head, "")) for head in heads] for row in rows)]
     widths = [max(len(line[column]) for line in cells) for column in range(len(heads))]
-    right = [not isinstance(rows[0][head], str) for head in heads]
+    right = [not any(isinstance(row.get(head), str) for row in rows) for head in heads]
     lines = []
     for line in cells:
         padded = (

@@ -15,6 +15,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
@@ -24,6 +25,7 @@ from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.fusion.lift import LiftedJoints
 from flowing_puppet_ros.fusion.limb_search import LimbSearcher, find_on_surface
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
@@ -95,11 +97,15 @@ class JointFitter:
         points, rays = np.nan_to_num(joints.points), np.nan_to_num(joints.rays)
         return JointTargets(points, self._strength * weight, rays)
 
-    def make_cloud(self, points: F64, field: SensorField | None, viewpoint: F64 | None = None) -> SingleViewCloud:
+    def make_cloud(
+        self, points: F64, field: SensorField | SensorRig | None, viewpoint: F64 | None = None
+    ) -> SingleViewCloud:
         """Return the person's points (N, 3) m of a sensor, and what that can know of the person.
 
         The sensor is at `viewpoint` (3,) m, or at the origin.
         """
+        if isinstance(field, SensorRig):
+            return RigCloud.seen_by(points, field)
         points = downsample(points, None, MAX_FIT_POINTS)[0]
         viewpoint = np.zeros(3) if viewpoint is None else viewpoint
         return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, field=field)

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from flowing_puppet_ros.arrays import F64, Bools
 from flowing_puppet_ros.fusion.limb_depths import (
@@ -80,11 +81,8 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
         cloud: the cloud with pixels.
         usable: (N,) which points may be the person's.
     """
-    rows = np.flatnonzero(cloud.seen)
-    rows = rows[_find_near(puppet, cloud, rows)]
-    rows, others = rows[usable[rows]], rows[~usable[rows]]
     offsets = np.array([BEHIND_SURFACE_M.get(_kind(name), 0.0) for name in model.joint_names])
-    samples, beyond = (_collect_samples(puppet, cloud, some) for some in (rows, others))
+    samples, beyond = _collect_samples(puppet, cloud, usable)
     outside = _find_outside(puppet, cloud)
     trunk = trunk_rows(model)
     depth = _find_trunk_depth(puppet, samples, trunk)
@@ -117,21 +115,9 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
 
 def _find_outside(puppet: PuppetJoints, cloud: SeenCloud) -> Bools:
     """Return which joints (J,) of a puppet lie outside of the rectangle of a cloud's pixels."""
-    if not cloud.seen.any():
-        return np.zeros(len(puppet.pixels), dtype=bool)
-    pixels = cloud.pixels[cloud.seen]
+    low, high = cloud.rectangle
     with np.errstate(invalid="ignore"):
-        return np.asarray(((puppet.pixels < pixels.min(axis=0)) | (puppet.pixels > pixels.max(axis=0))).any(axis=1))
-
-
-def _find_near(puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray) -> Bools:
-    """Return which of the `rows` (N,) of a cloud may lie around a joint of a puppet."""
-    if not puppet.known.any() or not len(rows):
-        return np.zeros(len(rows), dtype=bool)
-    known = puppet.pixels[puppet.known]
-    outside = np.maximum(known.min(axis=0) - cloud.pixels[rows], cloud.pixels[rows] - known.max(axis=0)).max(axis=1)
-    depth = np.maximum(cloud.depth[rows], 1e-3)
-    return np.asarray(outside < np.maximum(MIN_RADIUS_PX, RADIUS_M * cloud.camera.focal / depth))
+        return np.asarray(((puppet.pixels < low) | (puppet.pixels > high)).any(axis=1))
 
 
 def _may_be_there(own: F64, others: F64, outside: bool, depth: float) -> bool:
@@ -154,27 +140,57 @@ def _may_be_there(own: F64, others: F64, outside: bool, depth: float) -> bool:
     return len(seen) >= MIN_POINTS and bool(seen.max() < depth + MAX_LIMB_DEPTH_M)
 
 
+@njit(cache=True, nogil=True)
 def _find_surfaces(depth: F64) -> F64:
     """Return the depths (K,) of the surfaces to which depths (N,) belong, the one with the most points first."""
     if len(depth) < MIN_POINTS:
         return np.empty(0)
     ordered = np.sort(depth)
-    groups = np.split(ordered, np.flatnonzero(np.diff(ordered) > SURFACE_GAP_M) + 1)
-    size = np.array([len(group) for group in groups])
-    chosen = [k for k in np.argsort(-size, kind="stable") if size[k] >= max(MIN_POINTS, MIN_SURFACE_SHARE * size.sum())]
-    return np.array([np.median(groups[k]) for k in chosen[:MAX_SURFACES]] or [np.median(ordered)])
-
-
-def _collect_samples(puppet: PuppetJoints, cloud: SeenCloud, rows: np.ndarray) -> dict[int, F64]:
-    """Return for every known joint the depths, in metres, of the points around it."""
-    pixels, depth = cloud.pixels[rows], cloud.depth[rows]
-    radius = np.maximum(MIN_RADIUS_PX, RADIUS_M * cloud.camera.focal / np.maximum(depth, 1e-3))
-    found = {}
-    for joint in np.flatnonzero(puppet.known):
-        x, y = puppet.pixels[joint]
-        near = (np.abs(pixels[:, 0] - x) < radius) & (np.abs(pixels[:, 1] - y) < radius)
-        found[int(joint)] = depth[near]
+    ends = np.append(np.flatnonzero(np.diff(ordered) > SURFACE_GAP_M) + 1, len(ordered))
+    size = np.diff(np.append(np.zeros(1, np.int64), ends))
+    chosen = np.argsort(-size, kind="mergesort")
+    chosen = chosen[size[chosen] >= max(float(MIN_POINTS), MIN_SURFACE_SHARE * len(ordered))][:MAX_SURFACES]
+    if not len(chosen):
+        return np.full(1, np.median(ordered))
+    found = np.empty(len(chosen))
+    for k, group in enumerate(chosen):
+        found[k] = np.median(ordered[ends[group] - size[group] : ends[group]])
     return found
+
+
+def _collect_samples(puppet: PuppetJoints, cloud: SeenCloud, usable: Bools) -> tuple[dict[int, F64], dict[int, F64]]:
+    """Return for every known joint the depths, in metres, of the `usable` (N,) points around it, and of the others."""
+    known = np.flatnonzero(puppet.known)
+    if not len(known):
+        return {}, {}
+    joint, row = _find_around(puppet.pixels[known], cloud.pixels, cloud.depth, cloud.camera.focal)
+    own, depth = usable[row], cloud.depth[row]
+    return (
+        {int(number): depth[(joint == k) & own] for k, number in enumerate(known)},
+        {int(number): depth[(joint == k) & ~own] for k, number in enumerate(known)},
+    )
+
+
+@njit(cache=True, nogil=True)
+def _find_around(joints, pixels, depth, focal):  # type: ignore[no-untyped-def]
+    """Return the joint and the row of every pair of one of `joints` (K, 2) and one of the `pixels` (N, 2) around it."""
+    found_joint, found_row, count = np.empty(1024, np.int64), np.empty(1024, np.int64), 0
+    low_x, high_x = joints[:, 0].min(), joints[:, 0].max()
+    low_y, high_y = joints[:, 1].min(), joints[:, 1].max()
+    for row in range(len(pixels)):
+        x, y = pixels[row, 0], pixels[row, 1]
+        radius = max(MIN_RADIUS_PX, RADIUS_M * focal / max(depth[row], 1e-3))
+        # Not so for points that are not seen, whose pixels are NaN.
+        if not (low_x - radius < x < high_x + radius and low_y - radius < y < high_y + radius):
+            continue
+        for k in range(len(joints)):
+            if abs(x - joints[k, 0]) < radius and abs(y - joints[k, 1]) < radius:
+                if count == len(found_row):
+                    found_joint = np.append(found_joint, np.empty(count, np.int64))
+                    found_row = np.append(found_row, np.empty(count, np.int64))
+                found_joint[count], found_row[count] = k, row
+                count += 1
+    return found_joint[:count], found_row[:count]
 
 
 def _find_trunk_depth(puppet: PuppetJoints, samples: dict[int, F64], trunk: list[int]) -> float:

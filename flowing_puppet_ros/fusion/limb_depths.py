@@ -10,16 +10,21 @@ sizes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
+from numba import njit
+from numba.extending import register_jitable
 
 from flowing_puppet_ros.arrays import F64, Bools
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
-CORNERS = ("left_shoulder", "right_shoulder", "left_hip", "right_hip")
 CHAINS = (("shoulder", "elbow", "wrist", "hand"), ("hip", "knee", "ankle", "foot"))
+"""Of each limb, from the trunk's corner outwards."""
+LIMB_JOINTS = tuple(f"{side}_{name}" for chain in CHAINS for side in ("left", "right") for name in chain)
+CHAIN_JOINTS = 4
 SCALES, SCALE_DEVIATION = (0.9, 1.0, 1.1), 0.08
 """Sizes of people relative to the model's mean that are tried, and their standard deviation."""
 BONE_DEVIATION_M, BONE_DEVIATION_SHARE = 0.03, 0.1
@@ -104,52 +109,128 @@ def measure_seen_share(confidence: float, hidden: bool) -> float:
 
 def choose_depths(model: StitchedPuppet, choices: Mapping[int, DepthChoices]) -> dict[int, int]:
     """Return which of its `choices` each joint takes, by the joint's number."""
-    named = {model.joint_names[joint]: joint for joint in choices}
-    template = model.joints(model.vertices(model.rest_state()))
-    place = dict(zip(model.joint_names, template, strict=True))
-    best: tuple[float, dict[str, int]] = (np.inf, {})
+    rows = [model.joint_names.index(name) for name in LIMB_JOINTS]
+    count = np.array([len(choices[row].depth) if row in choices else 0 for row in rows])
+    if not count.any():
+        return {}
+    place, lists = np.zeros((len(rows), count.max(), 3)), np.zeros((3, len(rows), count.max()))
+    for slot, row in enumerate(rows):
+        if row in choices:
+            own = choices[row]
+            place[slot, : count[slot]] = own.points
+            lists[:, slot, : count[slot]] = own.depth, own.cost, own.spread
+    template = _find_template(model)[rows]
+    best, cost = np.full(len(rows), -1), np.inf
     for scale in SCALES:
-        cost, taken = _choose_for_size({name: choices[row] for name, row in named.items()}, place, scale)
-        cost += 0.5 * ((scale - 1) / SCALE_DEVIATION) ** 2
-        if cost < best[0]:
-            best = (cost, taken)
-    return {named[name]: choice for name, choice in best[1].items()}
+        total, taken = _choose_for_size(count, place, lists, scale * template)
+        total += 0.5 * ((scale - 1) / SCALE_DEVIATION) ** 2
+        if total < cost:
+            best, cost = taken, total
+    return {row: int(choice) for row, choice in zip(rows, best, strict=True) if choice >= 0}
 
 
-def _choose_for_size(
-    choices: Mapping[str, DepthChoices], place: Mapping[str, F64], scale: float
-) -> tuple[float, dict[str, int]]:
-    """Return the least cost of a person of one size, and what each joint takes; `place` (3,) m of the mean body."""
-    limbs = {}
-    for side in ("left", "right"):
-        for chain in CHAINS:
-            names = [f"{side}_{name}" for name in chain if f"{side}_{name}" in choices]
-            if names:
-                limbs[names[0]] = (names, *_fold(names, choices, place, scale))
-    own = {first: cost for first, (_, cost, _) in limbs.items()}
-    total, picked = _choose_corners([name for name in CORNERS if name in own], choices, own, place, scale)
-    taken = {}
-    for first, (names, cost, back) in limbs.items():
-        choice = picked.get(first, int(cost.argmin()))
-        total += 0.0 if first in picked else float(cost[choice])
-        taken[first] = choice
-        for name, step in zip(names[1:], back, strict=True):
-            taken[name] = int(step[taken[names[names.index(name) - 1]]])
+@lru_cache(maxsize=3)
+def _find_template(model: StitchedPuppet) -> F64:
+    """Return the joints (J, 3) m of the mean body."""
+    return model.joints(model.vertices(model.rest_state()))
+
+
+@njit(cache=True, nogil=True)
+def _choose_for_size(count, place, lists, template):  # type: ignore[no-untyped-def]
+    """Return the least cost of a person of one size, and what each joint (16,) takes, -1 for those without choices.
+
+    `count` (16,) are the numbers of choices, `place` (16, C, 3) m theirs, `lists` (3, 16, C) their depths, costs and
+    spreads, and `template` (16, 3) m the joints of the mean body.
+    """
+    cost, back = lists[1].copy(), np.zeros((len(count), place.shape[1]), np.int64)
+    first, after = np.full(len(count) // CHAIN_JOINTS, -1), np.full(len(count), -1)
+    for limb in range(len(first)):
+        for near in range(CHAIN_JOINTS * (limb + 1) - 1, CHAIN_JOINTS * limb - 1, -1):
+            if count[near] == 0:
+                continue
+            far = first[limb]
+            first[limb], after[near] = near, far
+            if far >= 0:
+                _fold(near, far, count, (place, lists, template), cost, back)
+    total, taken = _choose_corners(first, count, (place, lists, template), cost)
+    for limb in range(len(first)):
+        near = first[limb]
+        if near >= 0 and taken[near] < 0:
+            taken[near] = cost[near, : count[near]].argmin()
+            total += cost[near, taken[near]]
+        while near >= 0 and after[near] >= 0:
+            taken[after[near]] = back[near, taken[near]]
+            near = after[near]
     return total, taken
 
 
-def _fold(
-    names: Sequence[str], choices: Mapping[str, DepthChoices], place: Mapping[str, F64], scale: float
-) -> tuple[F64, list[np.ndarray]]:
-    """Return the least cost (C,) of a limb for each choice of its first joint, and the way along it."""
-    cost = choices[names[-1]].cost
-    back: list[np.ndarray] = []
-    for near, far in zip(names[-2::-1], names[:0:-1], strict=True):
-        length = scale * float(np.linalg.norm(place[near] - place[far]))
-        table = measure_limb_cost(choices[near], choices[far], length) + cost
-        back.insert(0, table.argmin(axis=1))
-        cost = choices[near].cost + table.min(axis=1)
-    return cost, back
+@njit(cache=True, nogil=True)
+def _fold(near, far, count, joints, cost, back):  # type: ignore[no-untyped-def]
+    """Add the cost (16, C) of the limb from `far` on to each choice of `near`, and note the choice of `far`."""
+    place, lists, template = joints
+    length = _measure_gap(template[near], template[far])
+    for i in range(count[near]):
+        least = np.inf
+        for j in range(count[far]):
+            spread = np.hypot(lists[2, near, i], lists[2, far, j])
+            own = cost[far, j] + _cost_bone(_measure_gap(place[near, i], place[far, j]), length, spread)
+            own += 0.5 * ((lists[0, near, i] - lists[0, far, j]) / SLOPE_M) ** 2
+            if own < least:
+                least, back[near, i] = own, j
+        cost[near, i] += least
+
+
+@njit(cache=True, nogil=True)
+def _choose_corners(first, count, joints, cost):  # type: ignore[no-untyped-def]
+    """Return the least cost of the trunk's corners with their limbs, and what they take (16,), -1 elsewhere.
+
+    `first` (4,) are the first joints of the limbs, of which those that are corners count, and `cost` (16, C).
+    """
+    place, lists, template = joints
+    most, limbs = place.shape[1], len(first)
+    sizes, own = np.ones(limbs, np.int64), np.zeros((limbs, most))
+    pair = np.zeros((limbs, limbs, most, most))
+    is_corner = first == CHAIN_JOINTS * np.arange(limbs)
+    for a in range(limbs):
+        if not is_corner[a]:
+            continue
+        sizes[a], own[a] = count[first[a]], cost[first[a]]
+        for b in range(a):
+            if not is_corner[b]:
+                continue
+            length = _measure_gap(template[first[a]], template[first[b]])
+            for i in range(count[first[a]]):
+                for j in range(count[first[b]]):
+                    spread = np.hypot(lists[2, first[a], i], lists[2, first[b], j])
+                    apart = _measure_gap(place[first[a], i], place[first[b], j])
+                    pair[a, b, i, j] = _cost_bone(apart, length, spread)
+    least, found = np.inf, np.zeros(limbs, np.int64)
+    for i in range(sizes[0]):
+        for j in range(sizes[1]):
+            two = own[0, i] + own[1, j] + pair[1, 0, j, i]
+            for k in range(sizes[2]):
+                three = two + own[2, k] + pair[2, 0, k, i] + pair[2, 1, k, j]
+                for m in range(sizes[3]):
+                    total = three + own[3, m] + pair[3, 0, m, i] + pair[3, 1, m, j] + pair[3, 2, m, k]
+                    if total < least:
+                        least = total
+                        found[0], found[1], found[2], found[3] = i, j, k, m
+    taken = np.full(len(count), -1)
+    for a in range(limbs):
+        if is_corner[a]:
+            taken[first[a]] = found[a]
+    return least, taken
+
+
+@register_jitable
+def _measure_gap(a, b):  # type: ignore[no-untyped-def]
+    return np.sqrt((a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2)
+
+
+@register_jitable
+def _cost_bone(apart, length, spread):  # type: ignore[no-untyped-def]
+    variance = (BONE_DEVIATION_M + BONE_DEVIATION_SHARE * length) ** 2 + spread**2
+    return np.minimum(0.5 * (apart - length) ** 2 / variance, MAX_BONE_COST)
 
 
 def measure_bone_cost(a: F64, b: F64, length: float, spread: F64) -> F64:
@@ -157,38 +238,11 @@ def measure_bone_cost(a: F64, b: F64, length: float, spread: F64) -> F64:
 
     `spread` (A, B) m is the standard deviation of their places on their rays' pixels.
     """
-    apart = np.linalg.norm(a[:, None] - b, axis=2)
-    variance = (BONE_DEVIATION_M + BONE_DEVIATION_SHARE * length) ** 2 + spread**2
-    return np.asarray(np.minimum(0.5 * (apart - length) ** 2 / variance, MAX_BONE_COST))
+    return np.asarray(_cost_bone(np.linalg.norm(a[:, None] - b, axis=2), length, spread))
 
 
 def measure_limb_cost(near: DepthChoices, far: DepthChoices, length: float) -> F64:
     """Return what the choices (A, B) of two joints next to each other along a limb cost, for a bone of `length` m."""
     slope = (near.depth[:, None] - far.depth) / SLOPE_M
-    return np.asarray(_measure_pair_cost(near, far, length) + 0.5 * slope**2)
-
-
-def _measure_pair_cost(a: DepthChoices, b: DepthChoices, length: float) -> F64:
-    return measure_bone_cost(a.points, b.points, length, np.hypot(a.spread[:, None], b.spread))
-
-
-def _choose_corners(
-    corners: Sequence[str],
-    choices: Mapping[str, DepthChoices],
-    own: Mapping[str, F64],
-    place: Mapping[str, F64],
-    scale: float,
-) -> tuple[float, dict[str, int]]:
-    """Return the least cost and what each of the trunk's `corners` takes; `own` are their costs (C,) with limbs."""
-    if not corners:
-        return 0.0, {}
-    total = np.zeros([1] * len(corners))
-    for i, name in enumerate(corners):
-        total = total + own[name].reshape([-1 if k == i else 1 for k in range(len(corners))])
-        for j in range(i):
-            length = scale * float(np.linalg.norm(place[name] - place[corners[j]]))
-            table = _measure_pair_cost(choices[corners[j]], choices[name], length)
-            shape = [len(own[corner]) if k in (i, j) else 1 for k, corner in enumerate(corners)]
-            total = total + table.reshape(shape)
-    index = np.unravel_index(int(total.argmin()), total.shape)
-    return float(total[index]), {name: int(choice) for name, choice in zip(corners, index, strict=True)}
+    spread = np.hypot(near.spread[:, None], far.spread)
+    return measure_bone_cost(near.points, far.points, length, spread) + 0.5 * slope**2

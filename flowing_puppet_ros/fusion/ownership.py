@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.arrays import F64, I32
 
@@ -29,21 +28,47 @@ def assign_points(points: F64, people: Sequence[F64]) -> I32:
     for number, capsules in enumerate(people):
         if len(capsules):
             _claim(points, capsules, number, best, owner)
-    sure = (owner >= 0) & (best < MAX_RADII)
-    maybe = np.flatnonzero((owner >= 0) & ~sure)
-    for _ in range(MAX_GROWTH_STEPS):
-        if not len(maybe) or not sure.any():
-            break
-        rows = np.flatnonzero(sure)
-        near, index = cKDTree(points[rows]).query(points[maybe], distance_upper_bound=GROWTH_STEP_M)
-        grown = np.isfinite(near)
-        grown[grown] = owner[rows[index[grown]]] == owner[maybe[grown]]
-        if not grown.any():
-            break
-        sure[maybe[grown]] = True
-        maybe = maybe[~grown]
-    owner[~sure] = -1
+    claimed = np.flatnonzero(owner >= 0)
+    claimed = claimed[np.argsort(points[claimed, 0], kind="stable")]
+    sure = _grow(points[claimed], owner[claimed], best[claimed] < MAX_RADII)
+    owner[claimed[~sure]] = -1
     return owner
+
+
+@njit(cache=True, nogil=True)
+def _grow(points, owner, sure):  # type: ignore[no-untyped-def]
+    """Return which points (N,), in the order of x, are sure: those that are, and those where a person goes on up to.
+
+    In every round a point becomes sure whose nearest sure point is within a step and of the same person.
+    """
+    sure, low = sure.copy(), 0
+    maybe = np.flatnonzero(~sure)
+    for _ in range(MAX_GROWTH_STEPS):
+        grown, left = np.empty(len(maybe), np.int64), np.empty(len(maybe), np.int64)
+        grown_count, left_count, low = 0, 0, 0
+        for own in maybe:
+            x, y, z = points[own, 0], points[own, 1], points[own, 2]
+            while points[low, 0] < x - GROWTH_STEP_M:
+                low += 1
+            nearest, least, place = -1, GROWTH_STEP_M**2, low
+            while place < len(points) and points[place, 0] <= x + GROWTH_STEP_M:
+                if sure[place]:
+                    dx, dy, dz = points[place, 0] - x, points[place, 1] - y, points[place, 2] - z
+                    squared = dx * dx + dy * dy + dz * dz
+                    if squared < least:
+                        nearest, least = place, squared
+                place += 1
+            if nearest >= 0 and owner[nearest] == owner[own]:
+                grown[grown_count] = own
+                grown_count += 1
+            else:
+                left[left_count] = own
+                left_count += 1
+        if grown_count == 0:
+            break
+        sure[grown[:grown_count]] = True
+        maybe = left[:left_count]
+    return sure
 
 
 @njit(cache=True, nogil=True)

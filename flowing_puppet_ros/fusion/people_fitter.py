@@ -13,7 +13,7 @@ from flowing_puppet_ros.body.cloud.limb_crop import list_capsules
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.segmentation.planes import PlaneCache, find_planes, is_clear_of_planes
+from flowing_puppet_ros.body.segmentation.planes import PlaneCache, find_planes, is_clear_of_planes, subsample
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.fusion.joint_fit import FEW_STEPS, HIDDEN_SHARE, MIN_LIMB_CONFIDENCE, JointFitter
@@ -27,6 +27,8 @@ from flowing_puppet_ros.threads import one_blas_thread, parallel_map, usable_thr
 
 MAX_LIMB_M = 0.6
 """Length of a limb that takes points by itself."""
+MIN_PLACES, PLACE_WEIGHT = 4, 0.1
+"""Joints by whose places a body is moved, at least, and the weight of a certain one."""
 CLAIM_ROUNDS = 2
 """In the first, joints that a neighbour hides are lifted onto the neighbour."""
 
@@ -112,14 +114,13 @@ class PeopleFitter:
     def find_clear(self, points: F64, cache: PlaneCache | None = None) -> tuple[Bools, Bools]:
         """Return which points (N,) are neither floor nor wall, and which are floor; `cache` has those of before."""
         origin, clearance = np.zeros(3), self._settings.plane_clearance
-        known = cache.get(points, clearance, origin) if cache else None
+        few = subsample(points)
+        known = cache.get(few, clearance, origin) if cache else None
         floor, walls = known or find_planes(points, clearance)
         if cache and known is None:
-            cache.put(points, clearance, floor, walls, origin)
-        clear = is_clear_of_planes(points, self._settings.plane_clearance, floor, walls)
-        on_floor = np.zeros(len(points), dtype=bool) if floor is None else (
-            floor.height(points) <= self._settings.plane_clearance
-        )  # fmt: skip
+            cache.put(few, clearance, floor, walls, origin)
+        clear = is_clear_of_planes(points, clearance, floor, walls)
+        on_floor = np.zeros(len(points), dtype=bool) if floor is None else floor.height(points) <= clearance
         return clear, on_floor
 
     def claim(
@@ -207,6 +208,15 @@ class PeopleFitter:
             np.where(missing, weight, targets.weight),
             rays,
         )
+
+    def find_places(self, claim: Claim) -> JointTargets | None:
+        """Return where the joints that are surely seen are, with their depths; None where they are too few."""
+        joints = claim.joints
+        seen = joints.found & ~joints.hidden & (joints.confidence >= MIN_LIMB_CONFIDENCE)
+        if np.count_nonzero(seen) < MIN_PLACES:
+            return None
+        weight = np.where(seen, PLACE_WEIGHT * joints.confidence, 0.0)
+        return JointTargets(np.nan_to_num(joints.points), weight)
 
     def is_proven(self, fit: BodyFit) -> bool:
         """Return whether a body shows that the puppet is a person: a reliable one, or one that is not all wrong."""

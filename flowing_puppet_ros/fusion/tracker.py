@@ -32,26 +32,47 @@ from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.threads import one_blas_thread, parallel_map
 
-REFIT_INTERVAL_NS = 1_000_000_000
-"""From one fit of an unreliable body from its joints to the next."""
-LIMB_INTERVAL_NS = 250_000_000
-"""From one search for a lost limb to the next."""
+REFIT_INTERVAL_NS, LIMB_INTERVAL_NS = 1_000_000_000, 250_000_000
+"""From one fit of an unreliable body from its joints to the next, and from one search for a lost limb to the next."""
+MAX_PATIENCE = 16
+"""Times that interval: it doubles with every attempt that finds nothing better, which takes as long as ten clouds."""
+BETTER_SHARE = 0.95
+"""Two-way distance of a new fit, relative to the tracked body's, below which it is better."""
+MAX_PLANE_CLOUDS = 40
+"""Clouds after which floor and walls are searched again though they are still there."""
 MAX_SAME_PERSON_M = 0.6
 """Between the trunks of a puppet without an id and of the known body that it is."""
 
 
+@dataclass(slots=True)
+class _Retry:
+    """When something that takes long is worth another attempt: `stamp` ns of the last one, and the interval to it."""
+
+    interval: int
+    stamp: int | None = None
+    patience: int = 1
+
+    def is_due(self, stamp: int) -> bool:
+        """Return whether it is time for another attempt."""
+        return self.stamp is None or stamp - self.stamp >= self.patience * self.interval
+
+    def record(self, stamp: int, success: bool) -> None:
+        """Take note of an attempt."""
+        self.stamp, self.patience = stamp, 1 if success else min(2 * self.patience, MAX_PATIENCE)
+
+
 @dataclass(slots=True, eq=False)
 class _PuppetTrack:
-    """One person: the `stamp` ns of the last sign, that of the last fit from joints, whether it is `proven`.
+    """One person: the `stamp` ns of the last sign, whether it is `proven`, and what was tried for it.
 
-    `searched` are the stamps at which each limb was last searched for.
+    `refit` from joints, and a search for each limb by its number.
     """
 
     id: str
     tracker: BodyTracker
     stamp: int
-    fitted: int = 0
-    searched: dict[int, int] = field(default_factory=dict)
+    refit: _Retry = field(default_factory=lambda: _Retry(REFIT_INTERVAL_NS))
+    searches: dict[int, _Retry] = field(default_factory=dict)
     proven: bool = False
     motion: TorsoMotion = field(default_factory=TorsoMotion)
 
@@ -91,7 +112,7 @@ class FusedTracker:
     def reset(self) -> None:
         """Forget everybody; made-up ids go on, so that none is used twice."""
         self._tracks: dict[str, _PuppetTrack] = {}
-        self._planes = PlaneCache()
+        self._planes = PlaneCache(MAX_PLANE_CLOUDS)
         self._stamp: int | None = None
         self._shown: set[str] = set()
 
@@ -178,15 +199,17 @@ class FusedTracker:
         tracker, claim = job.track.tracker, job.claim
         try:
             targets = None if claim is None else self._make_targets(claim, tracker.predict(stamp))
-            fit = tracker.track(job.person, targets)
+            places = None if claim is None else self._people.find_places(claim)
+            fit = tracker.track(job.person, targets, places)
             if claim is None:
                 return None if tracker.lost else fit
-            doubtful = fit is not None and not fit.reliable and not tracker.hidden
-            doubtful = doubtful and stamp - job.track.fitted >= REFIT_INTERVAL_NS
+            doubtful = fit is not None and not fit.reliable and not tracker.hidden and job.track.refit.is_due(stamp)
             if fit is None or tracker.lost or doubtful:
-                job.track.fitted = stamp
                 fresh = self._people.fit_claim(claim, job.person)
-                if fit is None or (fresh is not None and fresh.two_way_distance < fit.two_way_distance):
+                limit = np.inf if fit is None else BETTER_SHARE * fit.two_way_distance
+                better = fresh is not None and fresh.two_way_distance < limit
+                job.track.refit.record(stamp, better)
+                if fit is None or better:
                     if fresh is not None:
                         tracker.start(job.person, fresh)
                     return fresh
@@ -199,16 +222,15 @@ class FusedTracker:
     def _find_lost_limbs(self, job: _TrackJob, fit: BodyFit, claim: Claim, stamp: int) -> BodyFit:
         """Return the body with the limbs hung anew that the puppet sees elsewhere."""
         track, fitter = job.track, self._people.joint_fitter
-        lost = [
-            limb
-            for limb in fitter.limbs.find_lost(fit.state, claim.joints)
-            if stamp - track.searched.get(limb, -LIMB_INTERVAL_NS) >= LIMB_INTERVAL_NS
-        ]
+        lost = fitter.limbs.find_lost(fit.state, claim.joints)
+        tries = {limb: track.searches.setdefault(limb, _Retry(LIMB_INTERVAL_NS)) for limb in lost}
+        lost = [limb for limb in lost if tries[limb].is_due(stamp)]
         if not lost or track.tracker.hidden:
             return fit
-        track.searched.update(dict.fromkeys(lost, stamp))
         cloud = fitter.make_cloud(job.person.points, job.person.field)
         found = fitter.hang_anew(cloud, fit.state, claim.joints, lost)
+        for limb in lost:
+            tries[limb].record(stamp, found is not None)
         if found is None:
             return fit
         track.tracker.correct(found, [part for limb in lost for part in fitter.limbs.list_parts(limb)])

@@ -121,6 +121,8 @@ class Camera:
         local = self.to_camera(points)
         depth = local[..., 2]
         plane = local[..., :2] / np.where(depth > 0, depth, np.nan)[..., None]
+        if not self.distortion.any():
+            return self.to_pixels(plane), depth
         radius2 = plane[..., :1] ** 2 + plane[..., 1:] ** 2
         plane = np.where(radius2 <= self.max_squared_radius, plane, np.nan)
         return self.to_pixels(distort(plane, self.distortion)), depth

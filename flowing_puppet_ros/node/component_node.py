@@ -18,6 +18,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.memory import return_start_memory
 from flowing_puppet_ros.node.diagnostics import Diagnostics, NodeStatus
 from flowing_puppet_ros.node.factory import RosMessageFactory
 from flowing_puppet_ros.node.parameters import apply_changes, convert_to_floats, declare
@@ -136,6 +137,7 @@ class ComponentNode[C: Component[Any]](LifecycleNode):
         component: C = kind(self._settings, RosMessageFactory())
         component.node = self.get_fully_qualified_name()
         component.warm_up()
+        return_start_memory()
         settings = self._node_settings
         self.session = Session(self, component, settings.queue, self._diagnostics, settings.image_transport)
 

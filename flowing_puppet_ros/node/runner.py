@@ -9,6 +9,8 @@ from importlib import import_module
 from typing import Any
 
 from flowing_puppet_ros.errors import PuppetError
+from flowing_puppet_ros.memory import limit_arenas
+from flowing_puppet_ros.stream.pipeline import SWITCH_INTERVAL_S
 from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
 
@@ -19,6 +21,7 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
     on stderr). `module` is the module of this package whose `make_node(name)` returns the node; it is imported here,
     so that a missing ROS gives that sentence.
     """
+    limit_arenas()
     try:
         import rclpy
         from rclpy.exceptions import NameValidationException, ParameterException
@@ -41,6 +44,8 @@ def run(name: str, description: str | None, module: str, arguments: list[str] | 
     except KeyboardInterrupt:  # while it starts
         rclpy.try_shutdown()
         return 0
+    # While people are fitted on several threads, the one that receives messages waits for its turn.
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     # The node's own workers use the cores; threads of BLAS and OpenCV beside them would only slow them down.
     with one_blas_thread(), one_opencv_thread():
         _spin(node)

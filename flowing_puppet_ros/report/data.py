@@ -38,7 +38,8 @@ from flowing_puppet_ros.evaluate.joints import (
     count_swapped,
     measure_joint_errors,
 )
-from flowing_puppet_ros.report.bag_pictures import (
+from flowing_puppet_ros.report.people_in_space import SpaceData, gather_space
+from flowing_puppet_ros.report.pictures.bag_pictures import (
     STRIP_HEIGHT,
     BodyShot,
     FlowShot,
@@ -55,15 +56,14 @@ from flowing_puppet_ros.report.bag_pictures import (
     read_body_meshes,
     read_messages,
 )
-from flowing_puppet_ros.report.bodies_over_colour import (
+from flowing_puppet_ros.report.pictures.bodies_over_colour import (
     PAIR_HEIGHT,
     BodiesAtStamp,
     draw_bodies,
     find_everybody_box,
     find_nearest_stamp,
 )
-from flowing_puppet_ros.report.people_in_space import SpaceData, gather_space
-from flowing_puppet_ros.report.scene_3d import SceneFrame, count_affordable_frames, make_scene_data
+from flowing_puppet_ros.report.pictures.scene_3d import SceneFrame, count_affordable_frames, make_scene_data
 from flowing_puppet_ros.report.scene_above import AboveData, gather_above
 from flowing_puppet_ros.stream.messages.images import decode_image
 

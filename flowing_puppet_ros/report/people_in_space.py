@@ -21,8 +21,8 @@ from flowing_puppet_ros.evaluate.bag.reprojection import (
     read_people_in_space,
 )
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.report.bag_pictures import ImageBox, decode_picture, fetch_messages, pick_evenly
 from flowing_puppet_ros.report.page import figure, paragraph, row, table
+from flowing_puppet_ros.report.pictures.bag_pictures import ImageBox, decode_picture, fetch_messages, pick_evenly
 
 _MOMENTS, _MAX_CAMERAS = 3, 8
 _HEIGHT = 400  # of the pictures, px

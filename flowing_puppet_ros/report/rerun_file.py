@@ -27,7 +27,7 @@ from flowing_puppet_ros.evaluate.bag.recording import (
     to_cloud,
 )
 from flowing_puppet_ros.extras import import_extra
-from flowing_puppet_ros.report.bag_pictures import read_body_meshes
+from flowing_puppet_ros.report.pictures.bag_pictures import read_body_meshes
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image

@@ -16,8 +16,8 @@ from flowing_puppet_ros.draw.palette import list_person_colours
 from flowing_puppet_ros.draw.plots import ticks
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bag.recording import Recording, body_joints, sensor_cloud_topics, to_cloud
-from flowing_puppet_ros.report.bag_pictures import body_axes, read_messages
 from flowing_puppet_ros.report.page import paragraph, table
+from flowing_puppet_ros.report.pictures.bag_pictures import body_axes, read_messages
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 
 WIDTH, MAX_HEIGHT = 820, 700  # of the picture, px

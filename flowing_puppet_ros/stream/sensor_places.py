@@ -17,6 +17,7 @@ from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.scans.scan_frame import parse_axis, rotation_to_z_up
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.messages.geometry import FrameTree
+from flowing_puppet_ros.stream.messages.puppets import JointPosition
 
 OPTICAL = re.compile(r"optical(_frame)?$")
 """Frames that look along z with y down (REP-103)."""
@@ -49,6 +50,11 @@ class SensorPlace:
         """Return points (..., 3) m of the data in the frame of the tracks."""
         return np.asarray(points @ self.rotation.T + self.translation)
 
+    def put_joints(self, joints: dict[str, JointPosition]) -> dict[str, JointPosition]:
+        """Return joints of the data in the frame of the tracks."""
+        places = {name: self.put(np.array(joint[:3])) for name, joint in joints.items()}
+        return {name: (float(p[0]), float(p[1]), float(p[2]), joints[name][3]) for name, p in places.items()}
+
     @property
     def back(self) -> tuple[F64, F64]:
         """Rotation (3, 3) and translation (3,) m from the frame of the tracks to that of the data."""
@@ -66,6 +72,7 @@ class SensorPlaces:
         self._frames = frames
         self._up = up
         self._fixed, self._sensor = fixed_frame.lstrip("/"), sensor_frame.lstrip("/")
+        self._is_given, self._level = bool(self._fixed), np.eye(3)
         self._report = report
         self.reset()
 
@@ -110,6 +117,7 @@ class SensorPlaces:
             self._report.warn(f"{self._frames.describe_missing(frame, self._fixed, stamp)}: {rest}")
             self._report.counters["clouds without fixed_frame"] += 1
             return None if alone else place
+        pose = self._level @ pose[0], self._level @ pose[1]
         if self._anchor is None:
             self._anchor = ANCHOR_GRID_M * np.round(pose[0] / ANCHOR_GRID_M)
         turn = pose[1] @ place.rotation.T  # from the data's frame with z up
@@ -117,6 +125,31 @@ class SensorPlaces:
         return SensorPlace(
             pose[1], shift, turn @ place.viewpoint + shift, place.to_sensor @ turn.T, is_fixed=True
         )  # fmt: skip
+
+    def fix(self, frame: str) -> str:
+        """Track people in the root of a frame's tree where no fixed frame is set; return the frame of the tracks.
+
+        The root is taken to be level; that of a rig whose transforms begin at a camera's optical frame has y down.
+        """
+        if self._is_given:
+            return self._fixed
+        root = self._frames.find_root(frame)
+        if root != self._fixed:
+            self._fixed, self._anchor = root, None
+            self._level = rotation_to_z_up(parse_axis("-y" if OPTICAL.search(root) else "z"))
+        return root
+
+    def find_fixed(self) -> SensorPlace:
+        """Return the place of the fixed frame itself in that of the tracks."""
+        anchor = np.zeros(3) if self._anchor is None else self._anchor
+        return SensorPlace(self._level, -anchor, np.zeros(3), np.eye(3), is_fixed=True)
+
+    def describe_missing(self, frame: str, stamp: int) -> str:
+        """Return why data of a frame have no place in the fixed frame at a stamp, ns; "" where they have one."""
+        frame = frame.lstrip("/")
+        if self._frames.lookup_pose(frame, self._fixed, stamp) is not None:
+            return ""
+        return self._frames.describe_missing(frame, self._fixed, stamp)
 
     def find_alone(self, header: Any, stamp: int, points: F64, of_depth: bool) -> SensorPlace:
         """Return the place of the sensor in the frame of its data, turned so that z points up."""

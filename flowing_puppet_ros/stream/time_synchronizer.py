@@ -53,16 +53,18 @@ class TimeSynchronizer:
     up), `dropped` (more than `depth` items waited), `disordered` (stamp not after the previous one of the same
     input), `restarts` (stamp more than BACKWARD_JUMP_NS back: everything later is dropped).
 
-    With `patience` > 0, sets of at least two items are made without the inputs that have no item near enough
+    With `patience` > 0, sets of at least `min_items` are made without the inputs that have no item near enough
     (counted in `incomplete`): as soon as that is certain, or when more than `patience` items of the leading input
     wait. While the inputs before it have no items, the first input that has some leads.
     """
 
-    def __init__(self, names: tuple[str, ...], slop_ns: int = 0, depth: int = 60, patience: int = 0) -> None:
+    def __init__(
+        self, names: tuple[str, ...], slop_ns: int = 0, depth: int = 60, patience: int = 0, min_items: int = 2
+    ) -> None:
         """Synchronise the inputs `names`, of which the first leads; without `patience` every set is complete."""
         self._queues = {name: _Queue() for name in names}
         self._leader = names[0]
-        self._patience = patience
+        self._patience, self._min_items = patience, min(min_items, len(names))
         self._slop = slop_ns
         self._depth = depth
         self.counters: Counter[str] = Counter()
@@ -109,7 +111,7 @@ class TimeSynchronizer:
                     return sets
                 if queue.is_near(index, stamp, self._slop):
                     indices[name] = index
-            if len(indices) < (min(2, len(self._queues)) if self._patience else len(self._queues)):
+            if len(indices) < (self._min_items if self._patience else len(self._queues)):
                 leader.drop(1)
                 self.counters["unpaired"] += 1
                 continue

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from google.protobuf import descriptor_pb2, descriptor_pool, json_format, message_factory
+from google.protobuf import descriptor_pb2, descriptor_pool, json_format
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from flowing_puppet_ros.bag.foreign.foxglove import find_schema
+from flowing_puppet_ros.bag.foreign.payloads import make_protobuf_class
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
@@ -174,7 +175,7 @@ def test_protobuf(kind: str, tmp_path: Path) -> None:
     for file in reversed(files.file):
         pool.Add(file)  # type: ignore[no-untyped-call]
     words = json.dumps(MESSAGES[kind]).replace('"sec"', '"seconds"').replace('"nsec"', '"nanos"')
-    message = message_factory.GetMessageClass(pool.FindMessageTypeByName(f"foxglove.{kind}"))()
+    message = make_protobuf_class(pool.FindMessageTypeByName(f"foxglove.{kind}"))()
     data = json_format.Parse(words, message, descriptor_pool=pool).SerializeToString()
     schema = ("protobuf", files.SerializeToString())
     check(kind, read(recorded(tmp_path / "a.mcap", f"foxglove.{kind}", "protobuf", schema, data), kind))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import peer_runs, speed, stages, streams
+from benchmarks import peer_runs, scenes, speed, stages, streams
 from benchmarks.verb import PARTS
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.cli import main
@@ -81,6 +81,20 @@ def test_the_stages_of_a_tracked_cloud_and_of_a_fit_make_up_their_time(monkeypat
         assert sum(row["percent"] for row in own) == pytest.approx(100)
         assert {"normal equations", "hands"} & {row["stage"] for row in own}
         assert all(row["milliseconds"] > -0.1 for row in own)
+
+
+@pytest.mark.slow
+def test_the_stages_of_a_scan_are_those_of_everybody_in_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("open3d")
+    monkeypatch.setattr(scenes, "SCANS", 2)
+    monkeypatch.setattr(scenes, "PEOPLE", 2)
+    monkeypatch.setattr(scenes, "RANGE_M", (5.0, 6.0))
+    rows = scenes.measure_scene(0)
+    assert {row["points"] for row in rows} == {scenes.POINTS} and {row["people"] for row in rows} == {2}
+    for path, stage in (("first scan", "new bodies"), ("tracked", "tracked bodies")):
+        spent = {str(row["stage"]): float(row["percent"]) for row in rows if row["path"] == path}
+        assert sum(spent.values()) == pytest.approx(100)
+        assert spent[stage] > spent["filter"] > 0
 
 
 def test_a_stage_does_not_count_the_stages_in_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A capsule man tracked through dropouts of puppets and of depth."""
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 from capsule_man import joints_of  # type: ignore[import-not-found]
@@ -12,12 +15,15 @@ from watched_people import (  # type: ignore[import-not-found]
     watch,
 )
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
-from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
+from flowing_puppet_ros.fusion.people_fitter import Claim, FusionSettings, PeopleFitter
 from flowing_puppet_ros.fusion.tracker import FusedTracker
 from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.units import NANOSECONDS
 
 pytestmark = pytest.mark.slow
 
@@ -26,9 +32,9 @@ HOLD_S = 0.3
 CAMERA = make_colour_camera()
 
 
-def tracker(model: StitchedPuppet) -> FusedTracker:
+def tracker(model: StitchedPuppet, hold: float = HOLD_S) -> FusedTracker:
     people = PeopleFitter(BodyFitter(model, FitterSettings()), FusionSettings())
-    return FusedTracker(people, MultiBodyTrackerSettings(), HOLD_S)
+    return FusedTracker(people, MultiBodyTrackerSettings(), hold)
 
 
 class Walk:
@@ -43,6 +49,13 @@ class Walk:
         seen: Watched = watch([self.man] if depth else [], seed=frame)
         puppets = [] if identity is None else [find_puppet(self.model, self.man, CAMERA, identity, 5.0, frame)]
         return self.tracker.step(seen.seen_by(CAMERA), seen.image, puppets, (1 + frame) * FRAME_NS)[0]
+
+    def stand(self, second: int) -> list[TrackedBody]:
+        """Track the man of frame 0, who stands still, at a time in seconds."""
+        self.man = stand_at(joints_of(raise_left=0.3), 2.4, -0.3)
+        seen: Watched = watch([self.man], seed=0)
+        puppets = [find_puppet(self.model, self.man, CAMERA, "a1", 5.0, 0)]
+        return self.tracker.step(seen.seen_by(CAMERA), seen.image, puppets, (1 + second) * NANOSECONDS)[0]
 
     def error(self, body: TrackedBody) -> float:
         """Return the mean error of the arms' joints, metres."""
@@ -68,6 +81,37 @@ def test_a_man_is_tracked_under_his_puppets_id_whatever_drops_out(model: Stitche
         assert walk.see(frame, identity=None, depth=False) == []
     assert walk.tracker.occluded_ids == []  # given up after 0.3 s
     assert walk.see(12, identity=None) == []  # and nobody is new without a puppet
+
+
+def test_after_a_gap_a_body_moves_to_its_joints(model: StitchedPuppet, monkeypatch: pytest.MonkeyPatch) -> None:
+    walk = Walk(model)
+    walk.see(0)
+    walk.see(1)
+    fits: list[Claim] = []
+    monkeypatch.setattr(PeopleFitter, "fit_claim", lambda self, claim, person: fits.append(claim))
+    (body,) = walk.see(7)  # 0.4 s later, and 36 cm on
+    assert walk.error(body) < 0.045
+    assert not fits
+
+
+def test_fits_that_find_nothing_better_become_rare(model: StitchedPuppet, monkeypatch: pytest.MonkeyPatch) -> None:
+    walk, found, fitted = Walk(model), PeopleFitter.fit_claim, list[int]()
+    track = BodyTracker.track
+
+    def fit(people: PeopleFitter, claim: Claim, person: PersonCloud) -> BodyFit | None:
+        made = None if fitted else found(people, claim, person)
+        fitted.append(person.stamp // NANOSECONDS - 1)
+        return made
+
+    def doubt(*given: Any) -> BodyFit | None:
+        tracked = track(*given)
+        return None if tracked is None else replace(tracked, reliable=False)
+
+    monkeypatch.setattr(PeopleFitter, "fit_claim", fit)
+    monkeypatch.setattr(BodyTracker, "track", doubt)
+    for second in range(9):
+        assert len(walk.stand(second)) == 1
+    assert fitted == [0, 1, 3, 7]
 
 
 def test_puppets_without_ids_get_some_that_stay(model: StitchedPuppet) -> None:

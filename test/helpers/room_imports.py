@@ -155,8 +155,11 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "evaluate.moving": {
         "bag",
+        "body.fit",
+        "body.track",
         "evaluate.body",
         "evaluate.rgbd",
+        "evaluate.scene",
         "fusion",
         "model",
         "multiview",
@@ -262,8 +265,9 @@ MAY_IMPORT: dict[str, set[str]] = {
     "node": {"stream", "stream.components", "stream.messages"},
     "node.launching": set(),
     "node.live": {"bag", "doctor", "node"},
-    "report": {"bag", "draw", "evaluate", "evaluate.bag", "flow", "model", "model.ds", "multiview", "stream.messages"},
-    "stream": {"body.scans", "fusion", "model", "multiview", "stream.messages"},
+    "report": {"bag", "draw", "evaluate", "evaluate.bag", "multiview", "report.pictures", "stream.messages"},
+    "report.pictures": {"bag", "draw", "evaluate.bag", "flow", "model", "model.ds", "multiview", "stream.messages"},
+    "stream": {"body.scans", "body.track", "fusion", "model", "multiview", "stream.messages"},
     "stream.components": {
         "body.fit",
         "body.measurements",

@@ -87,6 +87,10 @@ def _check_node(name: str, given: list[str]) -> None:
     ports = {port.name for port in (*getattr(component, "inputs", ()), *component.outputs)}
     if given[:1] not in ([], ["--ros-args"], ["--help"]):
         raise WrongCommand(f"{name} takes no {given[0]!r} before --ros-args")
+    for word in given:
+        if word.startswith("rig.cameras:="):
+            cameras = word.partition(":=")[2].split(",")
+            ports |= {f"{camera}/{port}" for camera in cameras for port in ("depth", "camera_info", "points")}
     options = iter(given[1:])
     for option in options:
         value = next(options, "")

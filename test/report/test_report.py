@@ -15,8 +15,8 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bag.recording import read_recording
-from flowing_puppet_ros.report.bag_pictures import ImageBox, body_axes
 from flowing_puppet_ros.report.data import gather_data
+from flowing_puppet_ros.report.pictures.bag_pictures import ImageBox, body_axes
 from flowing_puppet_ros.report.report import build_report_page, make_collage, write_report
 
 type Replay = Callable[..., tuple[Path, Path]]

@@ -39,7 +39,7 @@ def make_decoder(topic: StoredTopic, known: Typestore) -> Decoder:
 
 
 def _make_protobuf_decoder(topic: StoredTopic) -> Decoder:
-    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+    from google.protobuf import descriptor_pb2, descriptor_pool
 
     pool = descriptor_pool.DescriptorPool()
     waiting = list(descriptor_pb2.FileDescriptorSet.FromString(topic.schema).file)
@@ -52,8 +52,17 @@ def _make_protobuf_decoder(topic: StoredTopic) -> Decoder:
         for file in ready:
             pool.Add(file)
         waiting = [file for file in waiting if names & set(file.dependency)]
-    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(topic.type))
+    kind = make_protobuf_class(pool.FindMessageTypeByName(topic.type))
     return lambda raw: kind.FromString(raw)
+
+
+def make_protobuf_class(descriptor: Any) -> Any:
+    """Return the class of a protobuf message; Ubuntu 24.04 has a version of protobuf with another name for it."""
+    from google.protobuf import message_factory
+
+    if hasattr(message_factory, "GetMessageClass"):
+        return message_factory.GetMessageClass(descriptor)
+    return message_factory.MessageFactory(descriptor.file.pool).GetPrototype(descriptor)
 
 
 def read_bytes(value: Any) -> U8:

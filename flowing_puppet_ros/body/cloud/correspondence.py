@@ -13,6 +13,7 @@ from numba.extending import register_jitable
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 
 # Weight of a pair's squared length beside its squared distance along the cloud's normal.
 TANGENTIAL_WEIGHT = 0.05
@@ -32,14 +33,14 @@ class Cloud:
         normals: (N, 3) unit normals, outward.
         nearest: index of `points`.
         viewpoint: (3,) position of the sensor in metres, None when the body was seen from all sides.
-        field: what the sensor at the viewpoint can know, None where it sees everything.
+        field: what the sensor at the viewpoint, or those around the body, can know; None where one sees everything.
     """
 
     points: np.ndarray
     normals: np.ndarray
     nearest: NearestPoints
     viewpoint: np.ndarray | None
-    field: SensorField | None
+    field: SensorField | SensorRig | None
 
     @classmethod
     def of(cls, points: np.ndarray, normals: np.ndarray, viewpoint: np.ndarray | None = None) -> Cloud:
@@ -50,6 +51,8 @@ class Cloud:
         """Return which vertices (V,) face the viewpoint and are in its field; all when there is no viewpoint."""
         if self.viewpoint is None:
             return np.ones(len(vertices), dtype=bool)
+        if isinstance(self.field, SensorRig):
+            return self.field.find_facing(vertices, normals)
         facing = ((self.viewpoint - vertices) * normals).sum(axis=1) > 0
         return facing if self.field is None else facing & ~self.field.find_unknown(vertices)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, I64
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,7 +26,8 @@ class PersonCloud:
         owner: index of the known body in these points, None for a new person.
         floor: metres, z of the floor under the person, None where it is not known.
         proven: whether it is known to be a person; else a reliable fit has to show it.
-        field: what the sensor at the viewpoint can know of the person; None where it is taken to see everything.
+        field: what the sensor at the viewpoint can know of the person, or several sensors; None where it is taken to
+            see everything.
     """
 
     points: F64
@@ -37,7 +39,7 @@ class PersonCloud:
     owner: int | None = None
     floor: float | None = None
     proven: bool = True
-    field: SensorField | None = None
+    field: SensorField | SensorRig | None = None
 
     @property
     def middle(self) -> F64:

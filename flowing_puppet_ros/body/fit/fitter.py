@@ -4,19 +4,21 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, two_way_distance
 from flowing_puppet_ros.body.cloud.limb_crop import crop_to_limbs
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleViewCloud
 from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings, Progress, sub_progress
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.quality import assess_fit
-from flowing_puppet_ros.body.fit.visibility import BodyVisibility, judge_visibility, rate_joints
+from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility, judge_visibility, rate_joints
 from flowing_puppet_ros.body.refine.body_beneath import BodyBeneath
 from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton
 from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
@@ -25,6 +27,7 @@ from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, ExactCloud
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import one_blas_thread
 
@@ -34,6 +37,7 @@ MIN_CLOUD_POINTS = 50  # finite and distinct
 WARM_UP_VIEWPOINT_M = np.array([3.0, 0.0, 0.0])  # relative to the body
 # Points that a cloud needs before it may shape the surface beyond the model.
 MIN_DENSE_POINTS = 3000
+MAX_CONTESTED_M = 0.15  # between the centres of a part in two bodies that are as likely
 MAX_COARSE_POINTS = 1500  # of a cloud whose frames are compared
 # Longest side of a cloud that may be a person or a part of one, with some surroundings.
 MIN_PERSON_EXTENT_M, MAX_PERSON_EXTENT_M = 0.1, 20.0
@@ -78,8 +82,12 @@ class BodyFitter:
         self.model = model
         self.settings = settings
         self.hypotheses = BodyHypotheses(model, settings)
-        self._nonrigid = NonRigidRefinement(model.faces, len(model.part_of_vertex), NonRigidWeights())
         self._beneath = BodyBeneath(model, self.gauss_newton)
+
+    @cached_property
+    def _nonrigid(self) -> NonRigidRefinement:
+        """The refinement beyond the model, made when a dense whole cloud first needs it."""
+        return NonRigidRefinement(self.model.faces, len(self.model.part_of_vertex), NonRigidWeights())
 
     @property
     def gauss_newton(self) -> GaussNewton:
@@ -99,7 +107,7 @@ class BodyFitter:
         *,
         initial: Mapping[str, tuple[float, float, float, float]] | None = None,
         viewpoint: np.ndarray | None = None,
-        field: SensorField | None = None,
+        field: SensorField | SensorRig | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
         nonrigid: bool = True,
@@ -121,7 +129,7 @@ class BodyFitter:
                 person is upright with unknown yaw.
             viewpoint: (3,) position of the sensor in metres, for a cloud that shows one side only.
             field: what the sensor at the viewpoint can know of the person; without it, all that is not in the cloud
-                counts as free.
+                counts as free; of several sensors what all can know, and which of them saw each point.
             seed: overrides the settings' seed.
             progress: called with the fraction done, 0 to 1.
             nonrigid: refine the vertices beyond the model where a whole cloud is dense.
@@ -137,10 +145,10 @@ class BodyFitter:
             if initial is not None:
                 return self._fit_from_joints(points, normals, initial, (viewpoint, field), rng, progress)
             cloud = self.prepare_cloud(points, normals, viewpoint, field)
-            state = self.hypotheses.search(cloud, rng, progress, quick)
+            state, *others = self.hypotheses.search(cloud, rng, progress, quick)
             progress(1.0)
             if not self._is_dense(cloud):
-                return self.assess(state, cloud)
+                return self._doubt(self.assess(state, cloud), others, cloud)
             state = refine_hand_pose(self.model, self.gauss_newton, state, cloud)
             fit = self.assess(state, cloud)
             return self._find_beneath(self._refine_nonrigid(fit, cloud), cloud) if nonrigid else fit
@@ -150,9 +158,12 @@ class BodyFitter:
         points: np.ndarray,
         normals: np.ndarray | None,
         viewpoint: np.ndarray | None,
-        field: SensorField | None = None,
+        field: SensorField | SensorRig | None = None,
     ) -> Cloud:
         """Downsample and index a cloud; InputError when it cannot be the surface of a person."""
+        if isinstance(field, SensorRig):
+            self.prepare_points(points, None, viewpoint)
+            return RigCloud.seen_by(points, field)
         points, normals = self.prepare_points(points, normals, viewpoint)
         if normals is None:
             normals = estimate_normals(points, viewpoint)
@@ -210,7 +221,7 @@ class BodyFitter:
         points: np.ndarray,
         normals: np.ndarray | None,
         initial: Mapping[str, tuple[float, float, float, float]],
-        sensor: tuple[np.ndarray | None, SensorField | None],
+        sensor: tuple[np.ndarray | None, SensorField | SensorRig | None],
         rng: np.random.Generator,
         progress: Progress,
     ) -> BodyFit:
@@ -242,6 +253,18 @@ class BodyFitter:
         body = self.hypotheses.refine(found, cloud, targets, self.settings.gauss_newton_steps)
         progress(1.0)
         return self.assess(body, cloud)
+
+    def _doubt(self, fit: BodyFit, others: Sequence[BodyState], cloud: Cloud) -> BodyFit:
+        """Return the fit, unreliable if another body that is as likely has a part elsewhere that the sensor saw.
+
+        A part that it saw in neither body is a guess in any case, as the visibility says.
+        """
+        for other in others:
+            apart = np.linalg.norm(fit.state.center - other.center, axis=1) > MAX_CONTESTED_M
+            parts = np.maximum(fit.visibility.parts, self.assess(other, cloud).visibility.parts)
+            if (apart & (parts == Visibility.SEEN)).any():
+                return replace(fit, reliable=False)
+        return fit
 
     def _is_dense(self, cloud: Cloud) -> bool:
         """Return whether a cloud is dense and whole enough to refine hands and vertices."""

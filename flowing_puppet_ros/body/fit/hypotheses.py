@@ -135,8 +135,12 @@ class BodyHypotheses:
             model, self.pose_bank, self.proposer, self.gauss_newton, self._threads
         )
 
-    def search(self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False) -> BodyState:
+    def search(
+        self, cloud: Cloud, rng: np.random.Generator, progress: Progress, quick: bool = False
+    ) -> list[BodyState]:
         """Find the body of a cloud in metres, z up, when only its up direction is known.
+
+        In a single view, bodies that explain it nearly as well follow the best one.
 
         Cases:
             single view: the search from the pose bank, by itself; what follows is for whole clouds.
@@ -146,7 +150,8 @@ class BodyHypotheses:
             repair: suspect limbs of each candidate are searched again before it is compared.
         """
         if isinstance(cloud, SingleViewCloud):
-            return self._single_view_search.run(cloud, rng, self._settings.gauss_newton_steps, progress)
+            found = self._single_view_search.run(cloud, rng, self._settings.gauss_newton_steps, progress)
+            return found if len(found) == 1 else sorted(found, key=lambda body: self._measure_uncovered(body, cloud))
         grid = CloudGrid.build(cloud.points, cloud.normals)
         none, steps = JointTargets.none(self._model), self._settings.gauss_newton_steps
         tries = 1 + self._settings.restarts
@@ -155,15 +160,19 @@ class BodyHypotheses:
             shown = sub_progress(progress, number / tries, (number + 0.7) / tries)
             candidates = self._search_both_headings(cloud, grid, rng, shown, RESTART_SHARE if number else 1.0)
             if quick and self._is_close(candidates[0]):
-                return self.refine(candidates[0].state, cloud, none, steps)
+                return [self.refine(candidates[0].state, cloud, none, steps)]
             turned_is_near = candidates[1].cost < MAX_TURNED_RATIO * candidates[0].cost
             for candidate in candidates:
                 tried.append(self.repair_limbs(candidate, cloud, grid, rng))
                 best = min(tried, key=lambda candidate: candidate.cost)
                 contested = candidate is candidates[0] and best.cost > SURE_COST_M and turned_is_near
                 if self._is_close(best) and best.quality.reliable and not contested:
-                    return self.refine(best.state, cloud, none, steps)
-        return self.refine(best.state, cloud, none, steps)
+                    return [self.refine(best.state, cloud, none, steps)]
+        return [self.refine(best.state, cloud, none, steps)]
+
+    def _measure_uncovered(self, body: BodyState, cloud: Cloud) -> float:
+        """Return the share of a cloud that a body leaves uncovered: of bodies that are as likely, it tells best."""
+        return assess_fit(self._model, self._model.vertices(body), cloud).uncovered
 
     def _is_close(self, candidate: BodyCandidate) -> bool:
         return candidate.cost < self._settings.restart_distance

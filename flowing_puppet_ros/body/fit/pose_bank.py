@@ -194,7 +194,8 @@ class PoseBank:
         middle = coarse.targets.mean(axis=0)
         seen = np.ones((*points.shape[:2], 1), dtype=bool)
         if isinstance(coarse.cloud, SingleViewCloud):
-            seen = (normals @ (middle - coarse.cloud.view.viewpoint) < 0)[:, :, None]
+            away = middle - coarse.cloud.view.viewpoints
+            seen = (normals @ away.T < 0).any(axis=2, keepdims=True)
             seen &= _find_same_height(points[:, :, 2], coarse)[:, :, None]
         return np.asarray(middle - (points * seen).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
 

@@ -133,21 +133,17 @@ class GaussNewton:
     def _add_joints(
         self, targets: JointTargets, width: float, posed: PosedPoints, rotation: np.ndarray, system: System
     ) -> None:
-        hessian, gradient = system
         chosen = np.flatnonzero(targets.weight > 0)
         if not len(chosen):
             return
         gap = self._joints.find_joints(chosen, posed.vertices) - targets.points[chosen]
-        rows = self._joints.derive(chosen, posed, rotation)
+        stays = np.tile(np.eye(3), (len(chosen), 1, 1))
         if targets.rays is not None:
             ray = targets.rays[chosen]
-            squeeze = np.eye(3) - (1 - RAY_SHARE) * ray[:, :, None] * ray[:, None, :]
-            gap, rows = np.squeeze(squeeze @ gap[:, :, None], axis=2), squeeze @ rows
+            stays -= (1 - RAY_SHARE) * ray[:, :, None] * ray[:, None, :]
+            gap = (stays @ gap[:, :, None])[:, :, 0]
         trust = geman_mcclure((gap**2).sum(axis=1), width**2)
-        flat = rows.reshape(-1, len(gradient))
-        weight = np.repeat(trust * targets.weight[chosen], 3)
-        hessian += (flat * weight[:, None]).T @ flat
-        gradient += flat.T @ (weight * gap.reshape(-1))
+        self._joints.add(chosen, (gap, trust * targets.weight[chosen], stays), posed, rotation, system)
 
     def _add_priors(self, state: BodyState, weights: RefineWeights, system: System) -> None:
         hessian, gradient = system

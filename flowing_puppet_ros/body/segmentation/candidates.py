@@ -14,11 +14,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
-from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.body.segmentation.column_index import ColumnIndex
 from flowing_puppet_ros.body.segmentation.floor_grid import FloorGrid
-from flowing_puppet_ros.body.segmentation.head_columns import MIN_UPPER_M, find_columns
+from flowing_puppet_ros.body.segmentation.head_columns import MIN_UPPER_M, find_columns, find_nearest_column
 from flowing_puppet_ros.body.segmentation.linkage import link_points, thin_points
 from flowing_puppet_ros.body.segmentation.people import assign_to_known
 
@@ -139,8 +138,8 @@ def _list_clusters(
         if small:
             groups.append((members, True))
         if len(peaks) > small:
-            distance, owner = cKDTree(peaks).query(thin[members, :2], distance_upper_bound=COLUMN_RADIUS_M)
-            near = np.flatnonzero(distance < COLUMN_RADIUS_M)
+            owner = find_nearest_column(thin[members], peaks, COLUMN_RADIUS_M)
+            near = np.flatnonzero(owner >= 0)
             near = near[np.argsort(owner[near], kind="stable")]
             cuts = np.flatnonzero(np.diff(owner[near])) + 1
             groups += [(members[column], False) for column in np.split(near, cuts) if len(column)]

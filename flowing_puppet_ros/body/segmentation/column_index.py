@@ -10,6 +10,8 @@ from numba import njit
 
 CELL_M, MAX_CELLS = 0.5, 2000  # edge of a cell; cells a side, so that the last ones hold whatever lies beyond
 
+MEDIAN_POINTS = 5000  # of a scan, whose median is its middle
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColumnIndex:
@@ -30,8 +32,7 @@ class ColumnIndex:
     @classmethod
     def of(cls, points: np.ndarray) -> ColumnIndex:
         """Sort points (N, 3) m, N > 0, into cells."""
-        low = np.maximum(points[:, :2].min(axis=0), np.median(points[:, :2], axis=0) - CELL_M * MAX_CELLS / 2)
-        shape = np.minimum(((points[:, :2].max(axis=0) - low) / CELL_M).astype(np.int64) + 1, MAX_CELLS)
+        low, shape, _ = lay_grid(points, CELL_M, MAX_CELLS)
         order, first = sort_into_cells(points, low, shape, CELL_M)
         return cls(order, first, low, shape)
 
@@ -39,6 +40,27 @@ class ColumnIndex:
         """Return the indices (K,) of the points (N, 3) m within `radius` of a place (2,) m, and how far they are."""
         rows, away = _find_near(points, self.order, self.first, self.low, self.shape, place[0], place[1], radius)
         return rows, away
+
+
+def lay_grid(points: np.ndarray, width: float, max_cells: int) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return the corner (2,) m of a grid over points (N, 3) m, N > 0, its size (2,), and whether all lie in it.
+
+    It has at most `max_cells` cells of a `width` m a side; where that is not enough, about the middle of the points.
+    """
+    least, most = _find_extent(points)
+    middle = np.median(points[:: 1 + len(points) // MEDIAN_POINTS, :2], axis=0)
+    low = np.maximum(least, middle - width * max_cells / 2)
+    wanted = ((most - low) / width).astype(np.int64) + 1
+    return low, np.minimum(wanted, max_cells), bool((low <= least).all() and (wanted <= max_cells).all())
+
+
+@njit(cache=True, nogil=True)
+def _find_extent(points):  # type: ignore[no-untyped-def]
+    least, most = np.full(2, np.inf), np.full(2, -np.inf)
+    for row in range(len(points)):
+        for axis in range(2):
+            least[axis], most[axis] = min(least[axis], points[row, axis]), max(most[axis], points[row, axis])
+    return least, most
 
 
 @njit(cache=True, nogil=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 from scipy.ndimage import gaussian_filter
 
-from flowing_puppet_ros.body.segmentation.column_index import sort_into_cells
+from flowing_puppet_ros.body.segmentation.column_index import lay_grid, sort_into_cells
 
 CELL_M, MAX_CELLS = 1.0, 200  # edge of a cell; cells a side, so that the grid ends there
 LOW_SHARE = 0.03
@@ -35,9 +35,8 @@ class FloorGrid:
     @classmethod
     def find(cls, points: np.ndarray) -> FloorGrid:
         """Find the floor of a scene with points (N, 3) m, z up, N > 0; where none is seen, its neighbours' floor."""
-        low = np.maximum(points[:, :2].min(axis=0), np.median(points[:, :2], axis=0) - CELL_M * MAX_CELLS / 2)
-        shape = np.minimum(((points[:, :2].max(axis=0) - low) / CELL_M).astype(np.int64) + 1, MAX_CELLS)
-        lowest = _find_lowest(np.ascontiguousarray(points), low, shape)
+        low, shape, all_inside = lay_grid(points, CELL_M, MAX_CELLS)
+        lowest = _find_lowest(np.ascontiguousarray(points), low, shape, all_inside)
         x, y = (low[k] + CELL_M * (np.arange(shape[k]) + 0.5) for k in (0, 1))
         plane = _fit_plane(lowest, x, y, points)
         base = plane[0] + plane[1] * x[:, None] + plane[2] * y[None, :]
@@ -66,11 +65,11 @@ def looks_upside_down(points: np.ndarray) -> bool:
     return above > MIN_FLOOR_SHARE and below < MAX_CEILING_SHARE
 
 
-def _find_lowest(points: np.ndarray, low: np.ndarray, shape: np.ndarray) -> np.ndarray:
+def _find_lowest(points: np.ndarray, low: np.ndarray, shape: np.ndarray, all_inside: bool) -> np.ndarray:
     """Return a low percentile (W, D) of z in each cell, NaN where too few points are."""
     inside = points
-    beyond = (points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1)
-    if beyond.any():
+    if not all_inside:
+        beyond = (points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1)
         inside = points[~beyond]
     lowest = _select_lowest(inside, *sort_into_cells(inside, low, shape, CELL_M))
     return np.asarray(lowest.reshape(int(shape[0]), int(shape[1])))

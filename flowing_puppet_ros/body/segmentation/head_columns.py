@@ -30,6 +30,19 @@ def find_columns(points: np.ndarray, weight: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
+def find_nearest_column(points, columns, radius):  # type: ignore[no-untyped-def]
+    """Return the nearest (M,) of the columns (K, 2) m to points (M, 3) m; -1 for none within a radius."""
+    owner = np.full(len(points), -1, np.int64)
+    for row in range(len(points)):
+        best = radius * radius
+        for k in range(len(columns)):
+            x, y = points[row, 0] - columns[k, 0], points[row, 1] - columns[k, 1]
+            if x * x + y * y < best:
+                owner[row], best = k, x * x + y * y
+    return owner
+
+
+@njit(cache=True, nogil=True)
 def _find_peaks(points, weight, kernel):  # type: ignore[no-untyped-def]
     left = points[:, 0].min() - _MARGIN_CELLS * PEAK_CELL_M
     low = points[:, 1].min() - _MARGIN_CELLS * PEAK_CELL_M

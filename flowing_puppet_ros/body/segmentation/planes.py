@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import label
 
 MIN_TRIALS, MAX_TRIALS, TRIALS_TIMES_POINTS = 200, 3000, 2_000_000
 """RANSAC trials. Small clouds may have a small floor, and take more trials in the same time."""
@@ -60,8 +59,9 @@ class Plane:
 class PlaneCache:
     """The floor and walls of the last cloud of a stream, searched again only now and then or when they are gone."""
 
-    def __init__(self) -> None:
-        """Start empty."""
+    def __init__(self, max_clouds: int = MAX_CACHED_CLOUDS) -> None:
+        """Start empty; planes are searched again after `max_clouds`."""
+        self._max_clouds = max_clouds
         self._planes: list[tuple[Plane, float]] = []
         self._has_floor = False
         self._clouds_left = 0
@@ -92,7 +92,7 @@ class PlaneCache:
         planes = [*([floor] if floor is not None else []), *walls]
         shares = [float((np.abs(plane.height(points)) < clearance).mean()) for plane in planes]
         self._planes = [(plane.shift(origin), share) for plane, share in zip(planes, shares, strict=True)]
-        self._has_floor, self._clouds_left = floor is not None, MAX_CACHED_CLOUDS
+        self._has_floor, self._clouds_left = floor is not None, self._max_clouds
 
 
 def find_planes(points: np.ndarray, clearance: float) -> tuple[Plane | None, list[Plane]]:
@@ -101,11 +101,11 @@ def find_planes(points: np.ndarray, clearance: float) -> tuple[Plane | None, lis
     `clearance` is the half thickness of a plane, metres.
     """
     rng = np.random.default_rng(0)
-    floor = find_floor(_subsample(points), clearance, rng)
+    floor = find_floor(subsample(points), clearance, rng)
     walls: list[Plane] = []
     while len(walls) < MAX_WALLS:
         free = points[is_clear_of_planes(points, clearance, floor, walls)]
-        wall = find_wall(_subsample(free), clearance, rng) if len(free) >= 3 else None
+        wall = find_wall(subsample(free), clearance, rng) if len(free) >= 3 else None
         if wall is None:
             break
         walls.append(wall)
@@ -120,7 +120,7 @@ def is_clear_of_planes(points: np.ndarray, clearance: float, floor: Plane | None
     return clear
 
 
-def _subsample(points: np.ndarray) -> np.ndarray:
+def subsample(points: np.ndarray) -> np.ndarray:
     """Return evenly chosen points, as many as are enough to find planes."""
     return np.ascontiguousarray(points[:: 1 + len(points) // MAX_PLANE_POINTS])
 
@@ -235,6 +235,8 @@ def _fit_best(
 
 def _largest_piece(along: np.ndarray) -> np.ndarray:
     """Return the points (M, 2) in metres of the piece with most cells, which touch, if only at corners."""
+    from scipy.ndimage import label  # loaded here: a fit of one person needs no planes
+
     cell = np.floor((along - along.min(axis=0)) / CELL_M).astype(np.int64)
     filled = np.zeros(cell.max(axis=0) + 1, dtype=bool)
     filled[tuple(cell.T)] = True

@@ -25,6 +25,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, ch
 from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.track.tracked_body import BodyObservation, align, extrapolate, translate
 from flowing_puppet_ros.body.upright.upright_fit import (
     FEW_POINTS,
     MIN_MANY_POINTS,
@@ -32,7 +33,6 @@ from flowing_puppet_ros.body.upright.upright_fit import (
     floor_term,
     keep_place_only,
 )
-from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.threads import one_blas_thread
@@ -49,7 +49,10 @@ VISIBLE_HALF_LIFE_S = 2.0  # in which the normal visible surface falls to half w
 MAX_TURNED_RATIO = 1.25
 """Two-way distance of a body that walks ahead, relative to that of one that walks backwards, up to which it is taken:
 few points hardly tell front from back, and hardly anybody walks backwards."""
-MAX_STRETCH = 2.0  # frames by which a motion is extrapolated at most
+JOINT_STEPS = 3
+"""Gauss-Newton steps per cloud at most where somebody sees the joints."""
+ALIGN_GAP_NS = 100_000_000
+"""Time between clouds from which on a body is first moved to the joints that somebody sees."""
 
 
 @dataclass(frozen=True)
@@ -83,15 +86,6 @@ class BodyTrackerSettings(Settings):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Observation:
-    """A fit, the time of its cloud in nanoseconds, and the mean (3,) of the cloud's points, metres."""
-
-    fit: BodyFit
-    stamp: int
-    middle: F64
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _TrackState:
     """What is known of the person after a cloud.
 
@@ -99,8 +93,8 @@ class _TrackState:
     is normally seen (points times squared metres of distance), `lost`: the body is not where the person is.
     """
 
-    before: _Observation | None = None
-    last: _Observation | None = None
+    before: BodyObservation | None = None
+    last: BodyObservation | None = None
     best: float = np.inf
     frames: int = 0
     visible: float = 0.0
@@ -111,7 +105,8 @@ class _TrackState:
 class _Prepared(NamedTuple):
     """A cloud that is ready to be tracked to; `oriented`: its normals were turned outwards by the predicted body.
 
-    `floor`: z of the floor in metres where few points leave the body to it, else None. `targets` pull at the joints.
+    `floor`: z of the floor in metres where few points leave the body to it, else None. `targets` pull at the joints,
+    and `places` say where they are, None where nobody sees them.
     """
 
     cloud: Cloud
@@ -120,6 +115,7 @@ class _Prepared(NamedTuple):
     oriented: bool
     floor: float | None
     targets: JointTargets
+    places: JointTargets | None
 
 
 class BodyTracker:
@@ -158,7 +154,7 @@ class BodyTracker:
 
     def start(self, person: PersonCloud, fit: BodyFit) -> None:
         """Start from a body that was found in the person's cloud."""
-        seen = _Observation(fit, person.stamp, person.points.mean(axis=0))
+        seen = BodyObservation(fit, person.stamp, person.points.mean(axis=0))
         self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
 
     def correct(self, fit: BodyFit, parts: Sequence[int]) -> None:
@@ -229,24 +225,29 @@ class BodyTracker:
                 fit, lost = self._refit(fit, prepared, seed, progress), False
         return self._record(fit, lost, prepared)
 
-    def track(self, person: PersonCloud, targets: JointTargets | None = None) -> BodyFit | None:
+    def track(
+        self, person: PersonCloud, targets: JointTargets | None = None, places: JointTargets | None = None
+    ) -> BodyFit | None:
         """Fit the next cloud like `track_or_refit`, but never by a full fit: None when there is no body to start from.
 
-        `targets` are where somebody else sees the joints. `lost` tells whether the body is not where the person is.
+        `targets` are where somebody else sees the joints, and `places` are the same with their depths, to which a body
+        is moved that is lost or comes after a gap. `lost` tells whether the body is not where the person is.
         """
         if self._state.last is None:
             # Normals take long, and nothing would use them.
             self._fitter.prepare_points(*check_cloud(person.points, person.normals), person.viewpoint)
             return None
         with one_blas_thread():
-            prepared = self._prepare(person, targets)
+            prepared = self._prepare(person, targets, places)
             fit, lost = self._track(prepared)
         if fit is None:
             self._state = replace(self._state, lost=lost)
             return None
         return self._record(fit, lost, prepared)
 
-    def _prepare(self, person: PersonCloud, targets: JointTargets | None = None) -> _Prepared:
+    def _prepare(
+        self, person: PersonCloud, targets: JointTargets | None = None, places: JointTargets | None = None
+    ) -> _Prepared:
         stamp, viewpoint = person.stamp, person.viewpoint
         on_floor = person.floor is not None and viewpoint is not None and len(person.points) < MIN_MANY_POINTS
         points, normals = (person.points, person.normals) if on_floor else check_cloud(person.points, person.normals)
@@ -267,7 +268,7 @@ class BodyTracker:
         else:
             cloud = self._fitter.prepare_cloud(points, normals, viewpoint, person.field)
         pull = self._no_joints if targets is None else targets
-        return _Prepared(cloud, stamp, occluded, oriented, person.floor if on_floor else None, pull)
+        return _Prepared(cloud, stamp, occluded, oriented, person.floor if on_floor else None, pull, places)
 
     def _track(self, prepared: _Prepared) -> tuple[BodyFit | None, bool]:
         """Return the last body after a few steps on the new cloud, and whether it is lost.
@@ -277,7 +278,7 @@ class BodyTracker:
         last, cloud = self._state.last, prepared.cloud
         if prepared.occluded and last is not None:
             self.counters["hidden"] += 1
-            return self._fitter.assess(self._translate(last, prepared.stamp), cloud), False
+            return self._fitter.assess(translate(self._state.before, last, prepared.stamp), cloud), False
         if last is None:
             return None, True
         fit = self._step(self._predict(last, cloud.points.mean(axis=0), prepared.stamp), prepared)
@@ -287,7 +288,7 @@ class BodyTracker:
         state = self._state
         if prepared.floor is not None:
             fit = keep_place_only(self._fitter.model, fit, len(prepared.cloud.points))
-        seen = _Observation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
+        seen = BodyObservation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
         best = state.best if lost or prepared.occluded else min(state.best, fit.two_way_distance)
         frames = state.frames + (not prepared.occluded)
         self._state = replace(state, before=state.last, last=seen, best=best, frames=frames, lost=lost)
@@ -295,12 +296,20 @@ class BodyTracker:
 
     def _step(self, start: BodyState, prepared: _Prepared) -> BodyFit:
         """Take a few steps from where the person should be; if they fail, more steps with a wider kernel."""
-        fit = self._refine(start, prepared, NARROW_WIDTHS_M, self._settings.gauss_newton_steps)
+        steps, places, last = self._settings.gauss_newton_steps, prepared.places, self._state.last
+        if prepared.targets.rays is not None:
+            steps = min(steps, JOINT_STEPS)
+        late = places is not None and last is not None and prepared.stamp - last.stamp >= ALIGN_GAP_NS
+        if places is not None and late:
+            start = align(self._fitter.gauss_newton, start, places)
+        fit = self._refine(start, prepared, NARROW_WIDTHS_M, steps)
         if not self._is_lost(fit):
             self.counters["tracked"] += 1
             return fit
         self.counters["widened"] += 1
-        wide = self._refine(start, prepared, WIDE_WIDTHS_M, WIDE_STEPS)
+        if places is not None:
+            start, steps = align(self._fitter.gauss_newton, start, places), 2 * steps
+        wide = self._refine(start, prepared, WIDE_WIDTHS_M, WIDE_STEPS if places is None else steps)
         return min(fit, wide, key=lambda found: found.two_way_distance)
 
     def _refit(
@@ -335,31 +344,14 @@ class BodyTracker:
         self._state = _TrackState(best=fit.two_way_distance, visible=self._state.visible)
         return fit
 
-    def _predict(self, last: _Observation, middle: F64, stamp: int) -> BodyState:
+    def _predict(self, last: BodyObservation, middle: F64, stamp: int) -> BodyState:
         """Return the last body, moved on by its last motion in proportion to the time.
 
         After a long gap, which a full fit leaves in a live stream too, it moves as the middle of the cloud did.
         """
-        state, before = last.fit.state, self._state.before
         if stamp - last.stamp > 1e9 * self._settings.max_time_gap:
-            return replace(state, center=state.center + middle - last.middle)
-        if before is None:
-            return state
-        share = _stretch(before, last, stamp)
-        turn = rotation.log(np.swapaxes(before.fit.state.rotation, -1, -2) @ state.rotation)
-        return replace(
-            state,
-            center=state.center + share * (state.center - before.fit.state.center),
-            rotation=state.rotation @ rotation.exp(share * turn),
-        )
-
-    def _translate(self, last: _Observation, stamp: int) -> BodyState:
-        """Return the last body, moved on as its torso moved, in the pose that it has."""
-        state, before = last.fit.state, self._state.before
-        if before is None:
-            return state
-        moved = state.center[0] - before.fit.state.center[0]
-        return replace(state, center=state.center + _stretch(before, last, stamp) * moved)
+            return replace(last.fit.state, center=last.fit.state.center + middle - last.middle)
+        return extrapolate(self._state.before, last, stamp)
 
     def _update_visible(self, points: F64, stamp: int, viewpoint: F64, min_visible: float) -> bool:
         """Return whether less than a share of the person is seen than normally; what is normal follows what is seen."""
@@ -392,8 +384,3 @@ class BodyTracker:
 
     def _is_lost(self, fit: BodyFit) -> bool:
         return fit.two_way_distance > self._settings.lost_ratio * self._state.best + self._settings.lost_distance
-
-
-def _stretch(before: _Observation, last: _Observation, stamp: int) -> float:
-    """Return by how many frames the last motion is extrapolated."""
-    return min((stamp - last.stamp) / (last.stamp - before.stamp), MAX_STRETCH)

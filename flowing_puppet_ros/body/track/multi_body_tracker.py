@@ -14,14 +14,15 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.assignment import assign_cheapest
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCloud
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
 from flowing_puppet_ros.body.track.person_belief import PersonBelief
+from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.body.upright.person_finder import JudgedFit
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
@@ -78,9 +79,9 @@ class _BodyTrack:
         """Return where the middle should be at a later time in nanoseconds."""
         return np.asarray(self.middle + self.velocity * 1e-9 * (stamp - self.stamp))
 
-    def prove(self, fit: BodyFit) -> bool:
-        """Return whether it is known to be a person, as a reliable body shows from then on."""
-        self.proven = self.proven or fit.reliable
+    def prove(self, person: PersonCloud, fit: BodyFit) -> bool:
+        """Return whether it is known to be a person, as a body of theirs may show from then on."""
+        self.proven = self.proven or shows_person(person, fit)
         return self.proven and (self.belief is None or self.belief.decide())
 
     def start(self, person: PersonCloud, fit: BodyFit) -> None:
@@ -211,7 +212,7 @@ class MultiBodyTracker:
                 continue
             if judge is not None and fit is not None and track.number not in started:
                 fit = track.weigh(person, fit, judge)
-            if fit is not None and track.prove(fit):
+            if fit is not None and track.prove(person, fit):
                 bodies.append(track.show(fit))
             # A full fit to the little that is seen of a hidden person would bend the body.
             unreliable = fit is not None and not fit.reliable and not track.tracker.hidden
@@ -258,7 +259,7 @@ class MultiBodyTracker:
         self._background_fit.start(track.number, track.tracker.fork(quick), cloud, executor)
         self._adopt_finished_fit()
         fit = track.tracker.last
-        return [track.show(fit)] if known is None and fit is not None and track.prove(fit) else []
+        return [track.show(fit)] if known is None and fit is not None and track.prove(cloud.person, fit) else []
 
     def _adopt_finished_fit(self) -> None:
         """Take over the tracker that a full fit has led to, unless the track's own is closer by now."""
@@ -286,7 +287,7 @@ class MultiBodyTracker:
                 if distance < limit:
                     penalty = 0.0 if track.tracker.last else NO_BODY_PENALTY_M
                     cost[row, column] = penalty + distance * (OWNED_FACTOR if person.owner == row else 1.0)
-        rows, columns = linear_sum_assignment(np.minimum(cost, 1e3))
+        rows, columns = assign_cheapest(np.minimum(cost, 1e3))
         pairs = zip(rows, columns, strict=True)
         matched = {int(column): self._tracks[row] for row, column in pairs if cost[row, column] < np.inf}
         for column, middle in enumerate(middles):

@@ -10,7 +10,7 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 
-SURE, CONFIRMED, MOVED_CONFIRMED, HOPELESS = 0.75, 0.45, 0.3, 0.2
+SURE, CONFIRMED, MOVED_CONFIRMED, HOPELESS = 0.75, 0.6, 0.3, 0.2
 """Mean probabilities of a person: from which one scan is enough; from which several are; the same for what has moved;
 and below which several show that it is none."""
 MANY_SURE, MANY_CONFIRMED = 0.9, 0.8

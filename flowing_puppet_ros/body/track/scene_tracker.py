@@ -18,7 +18,9 @@ from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
+from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.track.seen_free import SeenFree
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.person_finder import (
     FoundBody,
@@ -35,9 +37,11 @@ from flowing_puppet_ros.settings import Settings, nested, setting
 MAX_HEIGHT_M = 2.6
 """A cloud that is no wider is a person, when nobody can be told from their surroundings in it."""
 _NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
-MAX_NEW_FITS = 8
-"""Candidates to which bodies are fitted in a cloud of a live stream, the likeliest first; the others come with the
-next. In a recording, which waits, so many in a row have to be nobody."""
+MAX_MISSES = 8
+"""Candidates in a row that have to be nobody until no more are fitted in a scan of a recording, the likeliest first."""
+MAX_LIVE_FITS = 4
+"""Candidates to which bodies are fitted in a scan of a live stream, so that the first body does not wait for others,
+which come with the next."""
 MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
 _UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
 MAX_REJECTED = 50  # candidates that are told of
@@ -79,6 +83,7 @@ class SceneTracker:
         self._single_view: bool | None = None
         self._planes = PlaneCache()
         self._finder = PersonFinder(fitter, settings.people)
+        self._seen_free = SeenFree()
         self._searched = np.empty(0, dtype=np.int64)
         self._was_searched = False
         self._report = report or Report()
@@ -96,6 +101,7 @@ class SceneTracker:
         self._single_view = None
         self._planes = PlaneCache()
         self._finder.reset()
+        self._seen_free.reset()
         self._was_searched = False
 
     @property
@@ -173,10 +179,9 @@ class SceneTracker:
         if not people:
             raise InputError(_NOBODY.format(len(cloud.points)))
         people = self._with_viewpoint(cloud, people, remember=False)
-        return [
-            TrackedBody(f"b{number}", self._fit(person, seed, progress))
-            for number, person in enumerate(people, start=1)
-        ]
+        fits = [(person, self._fit(person, seed, progress)) for person in people]
+        proven = [fit for person, fit in fits if person.proven or shows_person(person, fit)]
+        return [TrackedBody(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
         """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
@@ -194,6 +199,8 @@ class SceneTracker:
 
     def _is_one_sided(self, cloud: SceneCloud, remember: bool) -> bool:
         """Return whether people are seen from one side: known, set, decided before, or as the likeliest one looks."""
+        if cloud.is_merged:
+            return False
         if cloud.single_view or self._settings.view == "single":
             return True
         if self._settings.view == "full" or self._single_view is not None:
@@ -233,9 +240,10 @@ class SceneTracker:
             cloud.viewpoint,
             cloud.stamp,
             known,
-            MAX_NEW_FITS if live else None,
-            MAX_NEW_FITS if remember else None,
+            MAX_LIVE_FITS if live else None,
+            MAX_MISSES if remember else None,
             remember,
+            self._seen_free.add(points, cloud.viewpoint) if remember else None,
         )
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
@@ -288,16 +296,19 @@ class SceneTracker:
     def _sensor(self, cloud: SceneCloud) -> F64 | None:
         """Return where the sensor is for the segmentation, unless people are seen from all sides."""
         full = self._settings.view == "full" or (self._settings.view == "auto" and self._single_view is False)
-        return None if full and not cloud.single_view else cloud.viewpoint
+        return None if cloud.is_merged or (full and not cloud.single_view) else cloud.viewpoint
 
     def _with_viewpoint(self, cloud: SceneCloud, people: list[PersonCloud], remember: bool = True) -> list[PersonCloud]:
         """Return the people with the viewpoint for their fits.
 
+        of several sensors         | that of each
         known to be a single view  | the sensor's place
         setting full or single     | none, or the sensor's place
         auto, decided before       | as before
         auto, not decided          | what the first person's points look like
         """
+        if cloud.is_merged:
+            return cloud.with_fields(people)
         single = (
             True if cloud.single_view else {"single": True, "full": False}.get(self._settings.view, self._single_view)
         )

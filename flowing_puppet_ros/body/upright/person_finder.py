@@ -23,6 +23,7 @@ from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS, Upright
 from flowing_puppet_ros.body.upright.verification import weigh_fit
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.threads import one_blas_thread
 
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
 """Points, probability by shape, and score of what a full search is made for though no upright body explains it."""
@@ -30,6 +31,9 @@ MIN_WORTHWHILE = 0.15
 """Probability by the bank's best body from which on its other bodies are refined too."""
 MIN_TRACKED = 0.5
 """Probability of a tracked body below which a new one is tried where few points show the person."""
+MIN_COME_SHARE, COME_ODDS, COME_FILTER = 0.15, 1.5, 0.3
+"""Share of the points, where the sensor once saw through, from which on something has come there; the log odds by which
+that makes it a person; and the share of the filter's limit that is asked of it. Cars and doors move too."""
 SAME_PERSON_M = 0.35  # between the middles of two bodies that are one person
 
 
@@ -95,6 +99,7 @@ class PersonFinder:
         self._rejected = RejectedPlaces(settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
         self._scan: tuple[SceneHeights, ScanRays] | None = None
+        self._come: np.ndarray | None = None
 
     def warm_up(self) -> None:
         """Do beforehand what the first scan would wait for."""
@@ -106,6 +111,7 @@ class PersonFinder:
         self._rejected.clear()
         self._scan = None
 
+    @one_blas_thread()
     def find(
         self,
         points: np.ndarray,
@@ -116,6 +122,7 @@ class PersonFinder:
         max_fits: int | None = None,
         max_misses: int | None = None,
         remember: bool = True,
+        come: np.ndarray | None = None,
     ) -> list[FoundBody]:
         """Find the people in a scan; the same scans give the same answer.
 
@@ -128,9 +135,10 @@ class PersonFinder:
             max_fits: bodies that are fitted at most, the likeliest first; None: as set.
             max_misses: so many fits in a row of which none is a person end it; None: none does.
             remember: whether what is no person is remembered, and what was none is left out.
+            come: which (N,) points lie where the scans before saw through; None where nothing is known.
         """
         self.last_rejected = []
-        self._scan = None
+        self._scan, self._come = None, come
         if len(points) < self._settings.min_points:
             return []
         scene = SceneHeights.of(points)
@@ -181,6 +189,7 @@ class PersonFinder:
                 people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
         return people
 
+    @one_blas_thread()
     def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
 
@@ -200,7 +209,7 @@ class PersonFinder:
             return JudgedFit(0.0, 0.0, fit)
         judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, scene, rays, window)
         if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
-            other = self.upright.fit(cloud, candidate.floor)
+            other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0])
             again = self._weigh(other, cloud, candidate, probability, scene, rays, window)
             judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
@@ -219,8 +228,13 @@ class PersonFinder:
     ) -> JudgedFit:
         evidence = weigh_fit(found, cloud, candidate.rows, scene, rays, window, self._fitter.model)
         model = PersonModel.load()
-        likely = 0.0 if evidence.between_others else model.combine(probability, evidence)
+        odds = COME_ODDS if self._has_come(candidate) else 0.0
+        likely = 0.0 if evidence.between_others else model.combine(probability, evidence, odds)
         return JudgedFit(likely, model.rate(likely, evidence), found.fit)
+
+    def _has_come(self, candidate: Candidate) -> bool:
+        """Return whether a candidate stands where the sensor once saw through."""
+        return self._come is not None and bool(self._come[candidate.rows].mean() > MIN_COME_SHARE)
 
     def _may_be_bent(self, candidate: Candidate, scene: SceneHeights, probability: float) -> bool:
         """Return whether a candidate may be a person who sits, bends or lifts the arms, for a full search to show."""
@@ -233,11 +247,12 @@ class PersonFinder:
         chosen = []
         for number in np.argsort(-probability, kind="stable"):
             candidate = candidates[number]
-            if probability[number] < self._settings.min_filter:
+            come = self._has_come(candidate)
+            if probability[number] < self._settings.min_filter * (COME_FILTER if come else 1.0):
                 self.last_rejected.append(
                     _describe_rejected(candidate, probability[number], "its shape is no person's")
                 )
-            elif remember and self._rejected.contains(candidate, stamp):
+            elif remember and not come and self._rejected.contains(candidate, stamp):
                 self.last_rejected.append(_describe_rejected(candidate, probability[number], "rejected before"))
             else:
                 chosen.append(int(number))
@@ -260,7 +275,7 @@ class PersonFinder:
         judged = weigh(first)
         if judged.probability >= MIN_WORTHWHILE and len(starts) > 1:
             others = self.upright.refine(starts[1:], cloud, candidate.floor)
-            if others.cost < first.cost:
+            if others.score < first.score:
                 judged = weigh(others)
         return judged
 

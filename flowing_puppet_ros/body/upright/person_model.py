@@ -60,10 +60,10 @@ class PersonModel:
             | {"fusion": self.fusion, "accuracy": self.accuracy}
         )
 
-    def combine(self, shape_probability: float, evidence: FitEvidence) -> float:
-        """Return the probability of a person by the filter and the fit's evidence."""
+    def combine(self, shape_probability: float, evidence: FitEvidence, odds: float = 0.0) -> float:
+        """Return the probability of a person by the filter, the fit's evidence, and other log odds."""
         judged = log_odds(self.judge.predict(evidence.values[None])[0])
-        return float(_logistic(weigh_odds(log_odds(shape_probability), judged, self.fusion)))
+        return float(_logistic(weigh_odds(log_odds(shape_probability), judged, self.fusion) + odds))
 
     def rate(self, probability: float, evidence: FitEvidence) -> float:
         """Return the probability that a body is a person whose joints are within 10 cm in the mean."""

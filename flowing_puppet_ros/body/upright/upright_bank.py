@@ -30,7 +30,7 @@ MEAN_STATURE_M, STATURE_DEVIATION_M, STATURE_COST_M = 1.72, 0.1, 0.002
 ROUGH_POINTS, FINE_POINTS = 90, 300  # surface points of a body
 ROUGH_TARGETS, FINE_TARGETS = 60, 250  # of the cloud
 FINE_BODIES, MAX_SAME_YAW = 96, 2
-TURNED = 2  # of the best bodies, that face the other way than the best
+TURNED = 3  # of the best bodies, that face the other way than the best
 SEEN_MARGIN_M = 0.08  # above and below a cloud within which a body's surface is taken for seen
 
 
@@ -52,16 +52,21 @@ class UprightBank:
     normals: np.ndarray
     stature: np.ndarray
 
-    def find_best(self, cloud: SingleViewCloud, floor: float, count: int) -> list[tuple[float, BodyState]]:
+    def find_best(
+        self, cloud: SingleViewCloud, floor: float, count: int, facing: np.ndarray | None = None
+    ) -> list[tuple[float, BodyState]]:
         """Return the best bodies on a cloud with their costs in metres, at most two of a yaw and `count` of all.
 
         A few of them face the other way than the best: few points hardly tell front from back, and only the refined
-        bodies show which it is. `floor` is z of the floor, metres.
+        bodies show which it is. `floor` is z of the floor, metres. Where it is known to which side, `facing` (2,), all
+        face there.
         """
         rows = np.arange(len(self.points))
+        if facing is not None:
+            rows = rows[np.repeat(self.turns[:, :2, 0] @ facing > 0, POSES)]
         targets = cloud.points[farthest_points(cloud.points, FINE_TARGETS)]
         rough, _ = self._judge(cloud, floor, rows, targets[:ROUGH_TARGETS], ROUGH_POINTS)
-        rows = np.argsort(rough, kind="stable")[:FINE_BODIES]
+        rows = rows[np.argsort(rough, kind="stable")[:FINE_BODIES]]
         cost, shift = self._judge(cloud, floor, rows, targets, FINE_POINTS)
         order = np.argsort(cost, kind="stable")
         yaw = rows // POSES

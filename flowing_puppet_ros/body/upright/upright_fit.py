@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
+from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
@@ -19,19 +22,25 @@ from flowing_puppet_ros.body.upright.upright_bank import (
     make_upright_bank,
     stature_cost,
 )
+from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import parallel_map, usable_threads
 
-STARTS = 7  # bodies of the bank that are refined
+STARTS = 8  # bodies of the bank that are refined
 FEW_POINTS = RefineWeights(pose=1e-5, shape=3e-5, pairwise=5e-7, sigma_start=0.12, sigma_end=0.05, iterations=8)
 MANY_POINTS = RefineWeights(pose=1e-6, shape=5e-6, pairwise=1e-7, sigma_start=0.08, sigma_end=0.04, iterations=8)
 MIN_MANY_POINTS = 400
 """Points from which on they tell more about a body than the priors do."""
+BEST_OF_WAY = 2  # bodies of those that face the same way that many points refine further
 COST_SCALE_M, SAME_POSE_M, FINAL_STEPS = 0.003, 0.2, 2
 """Difference of the costs of two bodies at which the worse counts 1 / e, mean distance of their joints up to which they
 are averaged, and steps from the mean."""
+CLOSE_M, CLOSE_WORTH_M, ALIGNMENT_WORTH_M = 0.03, 0.1, 0.1
+"""Distance up to which a point is close to a body, and what a share of 1 of close points and a cosine of 1 between the
+normals are worth."""
 FLOOR_WEIGHT, SOLE_VERTICES = 0.3, 25
 """Weight of the floor against that of the cloud, and the lowest vertices that are on it."""
 MIN_LIMB_POINTS = 60
@@ -48,10 +57,20 @@ class UprightFit:
         fit: the body.
         cost: metres, how far body and cloud are from each other, with the prior of the stature.
         stature: metres.
+        score: metres, the cost less what speaks for which way it faces: see `_score`.
     """
 
     fit: BodyFit
     cost: float
+    stature: float
+    score: float
+
+
+class _Refined(NamedTuple):
+    """A refined body with its cost and stature, metres."""
+
+    cost: float
+    body: BodyState
     stature: float
 
 
@@ -72,7 +91,7 @@ class UprightFitter:
         points: np.ndarray,
         viewpoint: np.ndarray,
         unknown: np.ndarray | None,
-        field: SensorField | None = None,
+        field: SensorField | SensorRig | None = None,
     ) -> SingleViewCloud:
         """Return the cloud of a candidate; InputError when part of it lies behind the sensor.
 
@@ -82,6 +101,8 @@ class UprightFitter:
             unknown: (K, 3) m, see `ScanRays.find_unknown`; None where there is a field.
             field: what the sensor can know of the candidate.
         """
+        if isinstance(field, SensorRig):
+            return RigCloud.seen_by(points, field)
         points = downsample(points, None, MAX_FIT_POINTS)[0]
         return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, unknown, field)
 
@@ -89,36 +110,49 @@ class UprightFitter:
         """Return the bank's best bodies with their costs in metres."""
         return make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS)
 
-    def fit(self, cloud: SingleViewCloud, floor: float) -> UprightFit:
-        """Fit the best upright body to a cloud; `floor` is z of the floor, metres."""
-        return self.refine(self.find_rough(cloud, floor), cloud, floor)
+    def fit(self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None) -> UprightFit:
+        """Fit the best upright body to a cloud; `floor` is z of the floor, m; `facing` (2,) as in `UprightBank`."""
+        starts = make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS, facing)
+        return self.refine(starts, cloud, floor)
 
     def refine(self, starts: list[tuple[float, BodyState]], cloud: SingleViewCloud, floor: float) -> UprightFit:
         """Refine bodies and return the best; `floor` is z of the floor, metres."""
         coarse = CoarseCloud.of(cloud)
-        many = len(cloud.points) >= MIN_MANY_POINTS
+        terms = [cloud.free_space_term, lambda vertices, _: floor_term(vertices, floor)]
 
-        def improve(
-            start: tuple[float, BodyState], steps: int = FEW_POINTS.iterations
-        ) -> tuple[float, BodyState, float]:
-            terms = [cloud.free_space_term, lambda vertices, _: floor_term(vertices, floor)]
-            center = start[1].shape[0]
-            weights = replace(FEW_POINTS, shape_center=center, iterations=steps)
-            if steps < FEW_POINTS.iterations:
-                weights = replace(weights, sigma_start=FEW_POINTS.sigma_end)
-            body = self._fitter.gauss_newton.run(start[1], cloud, self._none, weights, terms)
-            if many:
-                body = self._fitter.gauss_newton.run(body, cloud, self._none, MANY_POINTS, terms)
+        def run(body: BodyState, weights: RefineWeights) -> _Refined:
+            body = self._fitter.gauss_newton.run(body, cloud, self._none, weights, terms)
             stature = self._fitter.model.measure_height(body.shape)
             cost = self._fitter.hypotheses.pose_bank.cost(body, coarse) + float(stature_cost(np.array(stature)))
-            return cost, body, stature
+            return _Refined(cost, body, stature)
 
-        found = parallel_map(improve, starts, self._threads)
-        if not many and len(found) > 1:
-            found = [improve((0.0, self._average([(cost, body) for cost, body, _ in found])), FINAL_STEPS)]
-        cost, body, stature = min(found, key=lambda each: each[0])
-        fit = keep_place_only(self._fitter.model, self._fitter.assess(body, cloud), len(cloud.points))
-        return UprightFit(fit, cost, stature)
+        def improve(body: BodyState) -> _Refined:
+            return run(body, replace(FEW_POINTS, shape_center=body.shape[0]))
+
+        ways = _group_by_facing(parallel_map(improve, [body for _, body in starts], self._threads))
+        if len(cloud.points) >= MIN_MANY_POINTS:
+            best = [each.body for way in ways for each in way[:BEST_OF_WAY]]
+            ways = _group_by_facing(parallel_map(lambda body: run(body, MANY_POINTS), best, self._threads))
+        elif len(starts) > 1:
+            last = replace(FEW_POINTS, iterations=FINAL_STEPS, sigma_start=FEW_POINTS.sigma_end)
+            means = [self._average(way) for way in ways]
+            ways = [[run(mean, replace(last, shape_center=mean.shape[0]))] for mean in means]
+        return min((self._finish(way[0], cloud) for way in ways), key=lambda each: each.score)
+
+    def _finish(self, found: _Refined, cloud: SingleViewCloud) -> UprightFit:
+        fit = keep_place_only(self._fitter.model, self._fitter.assess(found.body, cloud), len(cloud.points))
+        return UprightFit(fit, found.cost, found.stature, self._score(fit, found.cost, cloud))
+
+    def _score(self, fit: BodyFit, cost: float, cloud: SingleViewCloud) -> float:
+        """Return by which of two bodies that face opposite ways the right one is known, metres; less is better.
+
+        Their costs hardly differ, but a body that faces the right way is close to more of the points, and its normals
+        are more like the cloud's.
+        """
+        distance, nearest = NearestPoints(fit.vertices).query(cloud.points)
+        normals = vertex_normals(fit.vertices, self._fitter.model.faces)[nearest]
+        alignment = float((cloud.normals * normals).sum(axis=1).mean())
+        return cost - CLOSE_WORTH_M * float((distance < CLOSE_M).mean()) - ALIGNMENT_WORTH_M * alignment
 
     def turn_round(self, body: BodyState, cloud: SingleViewCloud, floor: float) -> UprightFit:
         """Fit a body that faces the other way, with its limbs where they are; `floor` is z of the floor, metres."""
@@ -135,22 +169,23 @@ class UprightFitter:
         """Return a body that was fitted otherwise with its cost on a cloud."""
         stature = self._fitter.model.measure_height(fit.state.shape)
         cost = self._fitter.hypotheses.pose_bank.cost(fit.state, CoarseCloud.of(cloud))
-        return UprightFit(fit, cost + float(stature_cost(np.array(stature))), stature)
+        cost += float(stature_cost(np.array(stature)))
+        return UprightFit(fit, cost, stature, self._score(fit, cost, cloud))
 
-    def _average(self, found: list[tuple[float, BodyState]]) -> BodyState:
-        """Return the mean of those bodies, given with their costs in metres, that stand as the likeliest does.
+    def _average(self, found: list[_Refined]) -> BodyState:
+        """Return the mean of those bodies that stand as the likeliest does.
 
         Where few points leave much open, the mean of what they allow is nearer to the truth than the best of it.
         """
         model = self._fitter.model
-        cost = np.array([each[0] for each in found])
+        cost = np.array([each.cost for each in found])
         weight = np.exp((cost.min() - cost) / COST_SCALE_M)
-        joints = np.stack([model.joints(model.vertices(body)) for _, body in found])
+        joints = np.stack([model.joints(model.vertices(each.body)) for each in found])
         apart = np.linalg.norm(joints[:, None] - joints[None], axis=3).mean(axis=2)
         middle = int((apart @ weight).argmin())
         near = np.flatnonzero(apart[middle] < SAME_POSE_M)
         share = weight[near] / weight[near].sum()
-        base, bodies = found[middle][1], [found[k][1] for k in near]
+        base, bodies = found[middle].body, [found[k].body for k in near]
         turns = np.stack([so3.log(np.swapaxes(base.rotation, -1, -2) @ body.rotation) for body in bodies])
         return BodyState(
             np.tensordot(share, np.stack([body.center for body in bodies]), 1),
@@ -158,6 +193,15 @@ class UprightFitter:
             np.tensordot(share, np.stack([body.pose for body in bodies]), 1),
             np.tensordot(share, np.stack([body.shape for body in bodies]), 1),
         )
+
+
+def _group_by_facing(found: list[_Refined]) -> list[list[_Refined]]:
+    """Return the bodies that face as the best one does, and those that do not, if any; the best of each first."""
+    found = sorted(found, key=lambda each: each.cost)
+    ahead = found[0].body.rotation[0, :2, 0]
+    same = [bool(each.body.rotation[0, :2, 0] @ ahead > 0) for each in found]
+    ways = [[each for each, own in zip(found, same, strict=True) if own is side] for side in (True, False)]
+    return [way for way in ways if way]
 
 
 def keep_place_only(model: StitchedPuppet, fit: BodyFit, points: int) -> BodyFit:

@@ -18,11 +18,9 @@ from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings, Progr
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame, measure_stature
 from flowing_puppet_ros.body.measurements.measure import DEFINITIONS, measure_fit
 from flowing_puppet_ros.body.refine.body_beneath import measure_gaps, measure_part_gaps
-from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
+from flowing_puppet_ros.body.scans.scan import SUFFIXES, Scan, read_scan, to_smallest_float, write_ply
 from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit, has_size_of_person
-from flowing_puppet_ros.cli.scans.fit_depth import fit_view, read_view
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson, find_people, list_scene_ups
-from flowing_puppet_ros.cli.scans.fit_scene import fit_one_sided_scene
 from flowing_puppet_ros.cli.scans.given_joints import fit_from_joints
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.errors import InputError, PuppetError
@@ -40,10 +38,9 @@ def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str
     started = time.perf_counter()
     fitter = make_fitter(options.model, options.settings)
     refuse_overwriting(source, options)
-    view = read_view(source, options)
-    if view is not None:
-        bodies, notes = fit_view(view, source, fitter, options)
-        return {"input": str(source), "people": _finish_all(source, bodies, notes, fitter, options, started)}
+    viewed = _fit_view(source, fitter, options)
+    if viewed is not None:
+        return {"input": str(source), "people": _finish_all(source, *viewed, fitter, options, started)}
     scan = read_scan(source)
     seen = _find_one_sided(scan, fitter, options) if options.scene else []
     if seen:
@@ -110,11 +107,24 @@ def _fit_person(
     return write_result(stem, fitter.model, found, view, person.notes, time.perf_counter() - started, options)
 
 
+def _fit_view(source: Path, fitter: BodyFitter, options: FitOptions) -> tuple[list[FrameFit], tuple[str, ...]] | None:
+    """Return the bodies in a depth image or an organised cloud and notes; None where it is to be read as a scan."""
+    plain = options.camera_info is None and options.color is None and not options.scene
+    if plain and source.suffix.lower() in SUFFIXES:
+        return None
+    from flowing_puppet_ros.cli.scans.fit_depth import fit_view, read_view  # loaded here: takes 0.15 s
+
+    view = read_view(source, options)
+    return None if view is None else fit_view(view, source, fitter, options)
+
+
 def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list[FrameFit]:
     """Return the people of a scene that was seen from the origin; none where it was not, or nobody is found so."""
     moved = options.viewpoint is not None or (scan.viewpoint is not None and np.any(scan.viewpoint))
     if options.upright == "any" or scan.faces is not None or moved:
         return []
+    from flowing_puppet_ros.cli.scans.fit_scene import fit_one_sided_scene  # loaded here: takes 0.1 s
+
     unit = ScanUnit.named("m" if options.unit == "auto" else options.unit)
     ups = list_scene_ups(options)
     found = fit_one_sided_scene(fitter, scan.points, unit.metres, ups, options.view, options.segmentation)

@@ -87,6 +87,11 @@ class OneSidedView:
         tolerance = TOLERANCE_SPACINGS * spacing
         return cls(viewpoint, axes, directions, depth, tolerance, low, cell, np.ascontiguousarray(nearest), field)
 
+    @property
+    def viewpoints(self) -> np.ndarray:
+        """Where the sensor is, (1, 3) m, as of several."""
+        return self.viewpoint[None]
+
     def compare(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return where `points` (N, 3) m lie relative to the seen surface.
 

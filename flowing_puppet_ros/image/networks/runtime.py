@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from typing import Any, Protocol
 
 import cv2
@@ -13,9 +12,6 @@ import numpy as np
 from flowing_puppet_ros.arrays import Array
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.extras import import_extra
-
-MAX_SHAPES = 3
-"""Sizes of input for which a network stays prepared; each takes some ten megabytes."""
 
 
 class Network(Protocol):
@@ -36,12 +32,11 @@ class LiteRtNetwork:
             InputError: when LiteRT is not installed, or `data` is no network.
         """
         interpreter = import_extra("ai_edge_litert.interpreter", "neural", "a keypoint network").Interpreter
-        self._make: Callable[[], Any] = lambda: interpreter(model_content=data, num_threads=1)
-        self._prepared: dict[tuple[int, ...], Any] = {}
+        self._shape: tuple[int, ...] = ()
         self._lock = threading.Lock()
         try:
-            self._first = self._make()
-            self._input = self._first.get_input_details()[0]
+            self._interpreter = interpreter(model_content=data, num_threads=1)
+            self._input = self._interpreter.get_input_details()[0]
         except ValueError as error:
             raise InputError(f"the file is not a TFLite network ({error})") from error
 
@@ -63,27 +58,27 @@ class LiteRtNetwork:
         """
         with self._lock:
             try:
-                interpreter = self._prepare(values.shape)
-                interpreter.set_tensor(self._input["index"], values.astype(self.input_type, copy=False))
-                interpreter.invoke()
+                self._prepare(values.shape)
+                self._interpreter.set_tensor(self._input["index"], values.astype(self.input_type, copy=False))
+                self._interpreter.invoke()
             except (RuntimeError, ValueError) as error:
                 raise InputError(
                     f"the network takes inputs of shape {self.input_shape}, -1 where it is free, not {values.shape}:"
                     " check `input` in its description"
                 ) from error
-            return [interpreter.get_tensor(output["index"]) for output in interpreter.get_output_details()]
+            outputs = self._interpreter.get_output_details()
+            return [self._interpreter.get_tensor(output["index"]) for output in outputs]
 
-    def _prepare(self, shape: tuple[int, ...]) -> Any:
-        """Return an interpreter for inputs of a shape; the ones used last are kept."""
-        interpreter = self._prepared.pop(shape, None)
-        if interpreter is None:
-            interpreter = self._make()
-            interpreter.resize_tensor_input(self._input["index"], shape, strict=True)
-            interpreter.allocate_tensors()
-            if len(self._prepared) >= MAX_SHAPES:
-                del self._prepared[next(iter(self._prepared))]
-        self._prepared[shape] = interpreter
-        return interpreter
+    def _prepare(self, shape: tuple[int, ...]) -> None:
+        """Make room for inputs of a shape.
+
+        That takes 2 ms, while an interpreter for every shape would keep weights of its own, 35 MB for MoveNet's.
+        """
+        if shape != self._shape:
+            self._shape = ()
+            self._interpreter.resize_tensor_input(self._input["index"], shape, strict=True)
+            self._interpreter.allocate_tensors()
+            self._shape = shape
 
 
 class OnnxNetwork:

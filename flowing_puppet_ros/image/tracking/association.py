@@ -6,9 +6,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.assignment import assign_cheapest
 from flowing_puppet_ros.image.tracking.appearance import TorsoAppearance, hellinger_distance
 from flowing_puppet_ros.image.tracking.track import Track
 
@@ -53,7 +53,7 @@ def associate(
     cost = np.minimum(distance, 1e3 * limit)
     dissimilarity = _appearance_distance(tracks, appearances, distance.shape)
     bonus = SAME_ID_BONUS_M * (_has_same_id(tracks, ids, distance.shape) & (distance <= limit))
-    rows, columns = linear_sum_assignment(cost + APPEARANCE_WEIGHT_M * dissimilarity - bonus)
+    rows, columns = assign_cheapest(cost + APPEARANCE_WEIGHT_M * dissimilarity - bonus)
     pairs = zip(rows, columns, strict=True)
     matched = {int(row): int(column) for row, column in pairs if distance[row, column] <= limit}
     matched |= _reidentify(tracks, distance, dissimilarity, matched, REIDENTIFY_FACTOR * limit)

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from scipy.linalg import solveh_banded
 
 from flowing_puppet_ros.arrays import F32, F64
 from flowing_puppet_ros.flow.estimate import FlowPair
@@ -85,6 +84,8 @@ def smooth_joints(
 
 def _solve_chain(target: F64, hold: F64, motion: F64, tie: F64) -> F64:
     """Return the positions (T, 2) of one joint that minimise hold |x - target|^2 + tie |x' - x - motion|^2."""
+    from scipy.linalg import solveh_banded  # loaded here: only recordings are smoothed
+
     bands = np.zeros((2, len(hold)))
     bands[1] = hold
     bands[1, :-1] += tie

@@ -83,10 +83,8 @@ class MultiViewStructures:
                 _translation_free_log_density(metres - prior.mean[:, None], prior.covariance + np.diag(noise))
                 - (len(index) - 2) * LOG_SCALES
             )
-        from scipy.special import logsumexp  # loaded here: most who draw or track a puppet know its view
-
-        total = logsumexp(evidence, axis=1) + np.log(self.prior)
-        return np.asarray(np.exp(total - logsumexp(total)))
+        total = np.logaddexp.reduce(evidence, axis=1) + np.log(self.prior)
+        return np.asarray(np.exp(total - np.logaddexp.reduce(total)))
 
     def frontal_probability(self, probability: Array) -> float:
         """Return the sum of the probabilities (9,) of the views in which the frontal puppet is right."""

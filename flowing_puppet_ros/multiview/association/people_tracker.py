@@ -12,9 +12,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.assignment import assign_cheapest
 from flowing_puppet_ros.multiview.association.clusters import (
     Key,
     ViewCluster,
@@ -141,7 +141,7 @@ class PeopleTracker3D:
                 ]
             )
             limit = self.settings.max_mismatch
-            for row, column in zip(*linear_sum_assignment(np.minimum(cost, limit)), strict=True):
+            for row, column in zip(*assign_cheapest(np.minimum(cost, limit)), strict=True):
                 if cost[row, column] < limit:
                     claims[row][name] = int(column)
         return list(zip(tracks, claims, strict=True))

@@ -23,10 +23,12 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.settings import nested, setting
 from flowing_puppet_ros.stream.component import COMPRESSED_DEPTH, Component, Output, Port
+from flowing_puppet_ros.stream.components import warm_up
 from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyOutputSettings, id_sort_key
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriSettings
 from flowing_puppet_ros.stream.components.silhouette_bodies import SilhouetteBodies
 from flowing_puppet_ros.stream.depth_pairs import DepthPairs
+from flowing_puppet_ros.stream.depth_rig import DepthRig, DepthRigSettings
 from flowing_puppet_ros.stream.messages.clouds import decode_pixels
 from flowing_puppet_ros.stream.messages.depth import make_depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
@@ -40,7 +42,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
     TRANSFORMS,
     MessageFactory,
 )
-from flowing_puppet_ros.stream.messages.puppets import JointPosition, decode_body_joints, make_bodies, make_body
+from flowing_puppet_ros.stream.messages.puppets import decode_body_joints, make_bodies, make_body
 from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
 from flowing_puppet_ros.stream.stamp_buffer import CloudLine, StampBuffer
@@ -80,6 +82,7 @@ class BodyFitterSettings(SceneSettings):
     wait: int = setting(
         1, "clouds to wait for late initial joints before fitting a cloud without them", low=0, high=50, advanced=True
     )
+    rig: DepthRigSettings = nested(DepthRigSettings)
     region: RegionSettings = nested(RegionSettings)
     fusion: FusionSettings = nested(FusionSettings)
     fitter: FitterSettings = nested(FitterSettings)
@@ -98,8 +101,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
     """
 
     settings_type = BodyFitterSettings
+    fixed = frozenset({"rig.cameras"})
     min_queue = MAX_WAITING
-    inputs = (
+    inputs: tuple[Port, ...] = (
         Port("points", POINT_CLOUD, "sensor"),
         Port("depth", IMAGE, "sensor", transport=COMPRESSED_DEPTH),
         Port("camera_info", CAMERA_INFO, "sensor"),
@@ -119,19 +123,18 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._fitter = BodyFitter(self._model, settings.fitter)
         self._scene = SceneTracker(self._fitter, settings, self.report)
         self._looked_at: tuple[int, SensorPlace] | None = None
-        self._fused = FusedTracker(
-            PeopleFitter(self._fitter, settings.fusion),
-            settings.tracker,
-            settings.tracker.hold,
-            self.report,
-            self.publish_id,
-        )
+        people, hold = PeopleFitter(self._fitter, settings.fusion), settings.tracker.hold
+        self._fused = FusedTracker(people, settings.tracker, hold, self.report, self.publish_id)
         self._frames = FrameTree()
         self._puppets = PuppetPairs(self._model, settings.fusion, self._frames)
         self._places = SensorPlaces(
             self._frames, settings.up, settings.fixed_frame, settings.sensor_frame, self.report, settings.view
         )
         self._is_fixed = False
+        self._rig = DepthRig(settings.rig, self._places, self.report, factory) if settings.rig.cameras else None
+        if self._rig is not None:  # people are found by depth alone, or by their silhouettes
+            shared = ("/tf_static", "/tf", "silhouettes")
+            self.inputs = (*self._rig.ports, *(port for port in type(self).inputs if port.name in shared))
         self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
         self._depth = DepthPairs(self.report)
         self._clock = CloudClock(self.report)
@@ -141,8 +144,12 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self.outputs = self._outputs.ports
 
     def warm_up(self) -> None:
-        """Do beforehand what the first clouds of a live stream would wait for."""
+        """Do beforehand what the first clouds of a live stream would wait for: fit somebody made up, too."""
         self._scene.warm_up()
+        self._outputs.warm_up()
+        alone = replace(self.settings, up="auto", fixed_frame="", sensor_frame="", rig=DepthRigSettings())
+        other = type(self)(alone, self.factory)
+        warm_up.run(other, warm_up.make_fitter_input(self.factory, self._model))
 
     def reset(self) -> None:
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""
@@ -151,6 +158,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._fused.reset()
         self._puppets.reset()
         self._depth.reset()
+        if self._rig is not None:
+            self._rig.reset()
         self._line.clear()
         self._initial.clear()
         self._places.reset()
@@ -161,6 +170,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         """Fit the clouds that still wait."""
         for pair in self._depth.flush():
             self._append("depth", *pair)
+        for moment in self._rig.flush() if self._rig is not None else ():
+            self._append("points", moment)
         return self._release(final=True) + self._publish_silhouettes()
 
     def fit(
@@ -218,7 +229,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             fit = self._fitter.fit(
                 scene.points,
                 scene.normals,
-                initial=_put_joints(decode_body_joints(body), place),
+                initial=place.put_joints(decode_body_joints(body)),
                 viewpoint=viewpoint,
                 field=field,
                 seed=seed,
@@ -241,6 +252,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             self._puppets.add(port, message)
         elif port == "points":
             self._append(port, message)
+        elif self._rig is not None:
+            for moment in self._rig.add(port, message):
+                self._append("points", moment)
         elif self._line.is_late(stamp_ns(message)):
             self.counters["late initial"] += 1
         else:
@@ -281,7 +295,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         frame, waiting = message.header.frame_id, len(self._line.waiting) - 1 - index
         if "initial" in self._expected and self._initial.get(stamp) is None and waiting < self.settings.wait:
             return False
-        if waiting < self.settings.transform_wait and self._places.is_awaited(frame, stamp):
+        frames = [frame] if self._rig is None else message.frames
+        if waiting < self.settings.transform_wait and any(self._places.is_awaited(each, stamp) for each in frames):
             return False
         # Without a calibration no puppet can be used, however long a cloud waits for it.
         calibrated = self._puppets.is_calibrated or "puppets/camera_info" in self._expected
@@ -302,7 +317,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         occluded: list[str] = []
         self._coarse: list[CoarsePerson] = []
         try:
-            scene, place, is_known = self._decode(cloud, of_depth)
+            rig, decode = self._rig, self._decode
+            scene, place, is_known = decode(cloud, of_depth) if rig is None else rig.merge(cloud, decode)
             scene = replace(scene, stamp=self._clock.advance(stamp))
             if is_known and place.is_fixed != self._is_fixed:
                 self._is_fixed = place.is_fixed
@@ -382,8 +398,3 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self.counters["bodies"] += len(bodies)
         self.counters["doubtful bodies"] += sum(not body.fit.reliable for body in bodies)
         return self._outputs.make(header, bodies, subscribed=self._subscribed) if header is not None else []
-
-
-def _put_joints(joints: dict[str, JointPosition], place: SensorPlace) -> dict[str, JointPosition]:
-    places = {name: place.put(np.array(joint[:3])) for name, joint in joints.items()}
-    return {name: (float(p[0]), float(p[1]), float(p[2]), joints[name][3]) for name, p in places.items()}

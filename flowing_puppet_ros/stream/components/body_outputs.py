@@ -84,7 +84,7 @@ class BodyOutputs:
     always = (
         Port("bodies", BODIES),
         Port("body_meshes", "visualization_msgs/msg/MarkerArray", lazy=True),
-        Port("part_poses", "geometry_msgs/msg/PoseArray"),
+        Port("part_poses", "geometry_msgs/msg/PoseArray", lazy=True),
         Port("body_vertices", POINT_CLOUD, lazy=True),
         Port("body_topology", MESH, "latched"),
         Port("/tf", TRANSFORMS),
@@ -136,8 +136,9 @@ class BodyOutputs:
         outputs: Output = [("bodies", make_bodies(factory, header, ordered))]
         if fits and not self._topology_sent:
             self._topology_sent = True
-            outputs.append(("body_topology", make_topology(factory, self._model)))
-        outputs.append(("part_poses", make_part_poses(factory, header, [fit.state for _, fit in fits])))
+            outputs.append(("body_topology", self._topology))
+        if "part_poses" in subscribed:
+            outputs.append(("part_poses", make_part_poses(factory, header, [fit.state for _, fit in fits])))
         markers = self._make_mesh_markers(header, fits, alive) if "body_meshes" in subscribed else []
         if markers:
             outputs.append(("body_meshes", factory.make("visualization_msgs/msg/MarkerArray", markers=markers)))
@@ -178,6 +179,14 @@ class BodyOutputs:
             inferred = fit.visibility.vertices == Visibility.INFERRED
             markers.append(make_mesh_marker(self._factory, header, number, self._preview_faces, fit.vertices, inferred))
         return markers
+
+    def warm_up(self) -> None:
+        """Make beforehand what the first body would wait for."""
+        _ = self._topology
+
+    @cached_property
+    def _topology(self) -> Any:
+        return make_topology(self._factory, self._model)
 
     @cached_property
     def _preview_faces(self) -> I64:

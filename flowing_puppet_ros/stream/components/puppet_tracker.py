@@ -109,13 +109,11 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
     def warm_up(self) -> None:
         """Track somebody made up with a component of its own, and load the detector."""
         other = type(self)(self.settings, self.factory)
-        other.set_expected("detections", True)
         for port in other.outputs:
             if port.lazy and not port.optional:
                 other.set_subscribed(port.name, True)
         messages = warm_up.make_tracker_input(self.factory, self._model)
-        for port_name, message in messages:
-            other.handle(port_name, message)
+        warm_up.run(other, messages)
         self._live.warm_up(decode_image(messages[-1][1]), warm_up.make_puppet(self._model))
 
     def reset(self) -> None:

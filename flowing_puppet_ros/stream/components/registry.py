@@ -6,22 +6,38 @@ Nothing here needs ROS, so that the files can be written and checked without it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 from flowing_puppet_ros.settings import SettingInfo, Settings, setting
 from flowing_puppet_ros.stream.component import Component
-from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
-from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
-from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
-from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
 
-COMPONENTS: dict[str, type[Component[Any]]] = {
-    "optical_flow": OpticalFlowComponent,
-    "puppet_tracker": PuppetTrackerComponent,
-    "visual_hull": VisualHullComponent,
-    "body_fitter": BodyFitterComponent,
+_CLASSES = {
+    "optical_flow": "OpticalFlowComponent",
+    "puppet_tracker": "PuppetTrackerComponent",
+    "visual_hull": "VisualHullComponent",
+    "body_fitter": "BodyFitterComponent",
 }
+"""Node -> its component, in the module of the node's name."""
+
+
+class _Components(Mapping[str, type[Component[Any]]]):
+    """The components by node; each is imported when it is asked for, since a node needs no other's modules."""
+
+    def __getitem__(self, name: str) -> type[Component[Any]]:
+        kind: type[Component[Any]] = getattr(import_module(f"{__package__}.{name}"), _CLASSES[name])
+        return kind
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(_CLASSES)
+
+    def __len__(self) -> int:
+        return len(_CLASSES)
+
+
+COMPONENTS = _Components()
 """The component that each node runs."""
 
 

@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.arrays import F64, Array
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.stream.component import Component
 from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform
 from flowing_puppet_ros.stream.messages.images import make_image
-from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, TRANSFORMS, MessageFactory
+from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, PUPPETS, TRANSFORMS, MessageFactory
 from flowing_puppet_ros.stream.messages.puppets import make_puppets
 
 type Messages = list[tuple[str, Any]]
@@ -26,6 +28,15 @@ SCALE_PX_PER_M, FOCAL_PX, DISTANCE_M = 80.0, 200.0, 2.5  # scale = focal length 
 PERIOD_NS = 100_000_000  # between two images
 FRAMES = 3  # images per camera
 WORLD_FRAME = "warm_up"
+
+
+def run(component: Component[Any], messages: Messages) -> None:
+    """Let a component, which is used for nothing else, process messages; optional inputs among them are expected."""
+    optional = {port.name for port in component.inputs if port.optional}
+    for name in optional & {name for name, _ in messages}:
+        component.set_expected(name, True)
+    for name, message in messages:
+        component.handle(name, message)
 
 
 def make_images(factory: MessageFactory, camera: str = WORLD_FRAME) -> list[Any]:
@@ -66,6 +77,49 @@ def make_hull_input(factory: MessageFactory, names: tuple[str, ...]) -> Messages
                 (f"{name}/puppets", make_puppets(factory, header, model, [person])),
             ]
     return found
+
+
+def make_fitter_input(factory: MessageFactory, model: StitchedPuppet) -> Messages:
+    """Return the input of a body fitter: depth images of somebody on a floor before a wall, and the puppets."""
+    vertices = model.vertices(model.rest_state())
+    joints = model.joints(vertices)
+    to_camera = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    vertices, joints = ((points - middle) @ to_camera.T + [0.0, 0.0, DISTANCE_M] for points in (vertices, joints))
+    depth = _draw_depth(vertices)
+    puppets = [
+        factory.make("flowing_puppet_msgs/msg/PuppetJoint", name=name, x=x, y=y, confidence=0.9)
+        for name, (x, y) in zip(model.joint_names, _project(joints), strict=True)
+    ]
+    found: Messages = []
+    info = _make_camera_info(factory, WORLD_FRAME)
+    for number in range(1, FRAMES + 1):
+        header = make_header(factory, number * PERIOD_NS, WORLD_FRAME)
+        puppet = factory.make("flowing_puppet_msgs/msg/Puppet", id="w1", confidence=0.9, joints=puppets)
+        found += [("puppets/camera_info", info), ("camera_info", info)]
+        found += [("puppets", factory.make(PUPPETS, header=header, puppets=[puppet]))]
+        found += [("depth", make_image(factory, header, depth, "16UC1"))]
+    return found
+
+
+def _draw_depth(vertices: F64) -> Array:
+    """Return the depth image (H, W) in millimetres of places (V, 3) m in the camera's frame, on a floor, before a wall.
+
+    Each place covers the pixels around its own.
+    """
+    rows = np.arange(IMAGE_SIZE[0]) - (IMAGE_SIZE[0] - 1) / 2
+    floor = FOCAL_PX * vertices[:, 1].max() / np.maximum(rows, 1e-3)
+    depth = np.tile(np.minimum(floor, 2 * DISTANCE_M)[:, None], (1, IMAGE_SIZE[1]))
+    columns, lines = np.floor(_project(vertices) + 0.5).astype(np.int64).T
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            np.minimum.at(depth, (lines + down, columns + right), vertices[:, 2])
+    return (1000 * depth).astype(np.uint16)
+
+
+def _project(points: F64) -> F64:
+    middle = np.array([(IMAGE_SIZE[1] - 1) / 2, (IMAGE_SIZE[0] - 1) / 2])
+    return FOCAL_PX * points[:, :2] / points[:, 2:] + middle
 
 
 def make_puppet(model: DeformableStructures) -> TrackedPuppet:

@@ -41,7 +41,9 @@ def decode_pixels(message: Any) -> tuple[F64, F64 | None, I64]:
     good = _are_all(np.isfinite(points))
     if good.any():
         known = points if good.all() else points[good]
-        good[good] = _are_all(np.abs(known - np.median(known, axis=0)) < _MAX_DISTANCE_M)
+        # The median takes long, and is needed only where some points may be too far from it.
+        if np.abs(known).max() >= _MAX_DISTANCE_M / 2:
+            good[good] = _are_all(np.abs(known - np.median(known, axis=0)) < _MAX_DISTANCE_M)
     places = np.flatnonzero(good)
     if not all(name in types for name in _NORMALS):
         return points[good], None, places

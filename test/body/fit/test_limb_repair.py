@@ -155,4 +155,4 @@ def test_a_body_that_may_face_the_other_way_is_compared_with_that_one_repaired(
     monkeypatch.setattr(own, "_search_both_headings", lambda *_: found)
     monkeypatch.setattr(own, "repair_limbs", lambda body, *_: candidate(body.state, repaired[id(body.state)]))
     monkeypatch.setattr(own, "refine", lambda state, *_: state)
-    assert own.search(cloud, np.random.default_rng(0), lambda _: None) is states[chosen]
+    assert own.search(cloud, np.random.default_rng(0), lambda _: None)[0] is states[chosen]

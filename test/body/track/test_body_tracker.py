@@ -13,6 +13,7 @@ from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, sample_surface, scan_whole
 from flowing_puppet_ros.evidence.cloud.sensor_field import PINHOLE, SensorField, SensorProjection
+from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
@@ -32,7 +33,7 @@ class _KnowingFitter(BodyFitter):
         *,
         initial: Mapping[str, tuple[float, float, float, float]] | None = None,
         viewpoint: np.ndarray | None = None,
-        field: SensorField | None = None,
+        field: SensorField | SensorRig | None = None,
         seed: int | None = None,
         progress: Progress | None = None,
         nonrigid: bool = True,

@@ -115,6 +115,11 @@ def test_tables_line_up(tmp_path: Path) -> None:
         assert [row["cm"] for row in csv.DictReader(file)] == ["1.23456", "12.0"]
 
 
+def test_a_table_has_the_columns_of_all_rows() -> None:
+    rows = [{"node": "a", "results": 12, "hz": 1.5}, {"node": "b", "hz": 30.0, "first": "1 s"}]
+    assert format_table(rows) == "node  results   hz  first\na          12  1.5\nb               30  1 s"
+
+
 @LEARN
 def test_the_command_writes_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     quick = ["--particles", "4", "--iterations", "1", "--restarts", "0", "--gauss-newton-steps", "1"]

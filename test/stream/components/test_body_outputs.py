@@ -21,7 +21,7 @@ from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header, rotation_matrix
 
 FACTORY = BagMessageFactory()
-ALL = {"body_meshes", "body_vertices"}
+ALL = {"body_meshes", "body_vertices", "part_poses"}
 TENTH = 100_000_000
 
 

@@ -8,6 +8,11 @@ from pathlib import Path
 
 import pytest
 
+from flowing_puppet_ros.bag.typestore import BagMessageFactory
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.stream.components import warm_up
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
+
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -19,6 +24,7 @@ from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
 from flowing_puppet_ros.model import weights
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
 from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
 from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
@@ -34,7 +40,7 @@ components = {}
 for name, kind, settings in (
     ("flow", OpticalFlowComponent, {}), ("told", PuppetTrackerComponent, {"detection": OWN}),
     ("cam1", PuppetTrackerComponent, {}), ("cam2", PuppetTrackerComponent, {}),
-    ("hull", VisualHullComponent, {"cameras": "cam1,cam2", "hull_every": 1}),
+    ("hull", VisualHullComponent, {"cameras": "cam1,cam2", "hull_every": 1}), ("fitter", BodyFitterComponent, {}),
 ):
     component = components[name] = kind(kind.settings_type(**settings), factory)
     component.warm_up()
@@ -85,3 +91,12 @@ def test_the_first_messages_wait_for_nothing() -> None:
     assert not any(told["traces"].values())
     assert told["done"]["hull"]["hulls"] > 0 and told["done"]["hull"]["silhouettes"] > 0
     assert told["done"]["flow"]["flows"] == 7 and told["done"]["told"]["images"] == 8
+
+
+def test_a_body_fitter_warms_up_by_tracking_somebody() -> None:
+    factory = BagMessageFactory()
+    component = BodyFitterComponent(BodyFitterSettings(), factory)
+    warm_up.run(component, warm_up.make_fitter_input(factory, StitchedPuppet.load()))
+    assert component.counters["clouds"] == warm_up.FRAMES
+    assert component.counters["tracked people"] >= 2
+    assert component.counters["unusable"] == 0

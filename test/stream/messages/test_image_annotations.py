@@ -139,6 +139,8 @@ def test_simple_outlines_stay_near_the_full_ones() -> None:
 def test_people_have_different_colours() -> None:
     assert len({person_colour(f"b{number}") for number in range(1, 8)}) == 7
     assert person_colour("a1") == person_colour("a8") == person_colour("") != person_colour("a2")
+    letters = [person_colour(name) for name in ("bkqzf", "xwhar", "dnotu", "plmie", "gsvcy")]
+    assert len(set(letters)) >= 3 and letters[0] == person_colour("bkqzf")
 
 
 @pytest.mark.parametrize("make", [make_detections_2d, make_annotations])

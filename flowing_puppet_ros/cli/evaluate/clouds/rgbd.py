@@ -15,6 +15,7 @@ from tqdm import tqdm
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
+from flowing_puppet_ros.evaluate.moving.camera_ring import CameraRing, RingScore, compare_cameras, summarise_ring
 from flowing_puppet_ros.evaluate.moving.fitter_run import run_fitter
 from flowing_puppet_ros.evaluate.moving.robot_view import SENSINGS, RobotView
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
@@ -67,6 +68,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--robot", type=float, metavar="SECONDS", help="feed body_fitter with what a robot sees instead, which stands,"
         " drives and nods, hangs upside down, or whose colour and depth stand apart or are not of one time; no --mocap",
     )  # fmt: skip
+    parser.add_argument(
+        "--cameras", type=int, metavar="N", help="compare N depth cameras around the people with each of them alone"
+    )
     parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture that the poses are from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for rgbd.csv and rgbd.json")
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
@@ -93,6 +97,10 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.motions is not None:
         motions = _track_motions(arguments, fitter, studio)
         print(format_json({"motions": motions}) if arguments.json else format_table(motions))
+        return 0
+    if arguments.cameras is not None:
+        rings = _look_from_around(arguments, fitter, studio)
+        print(format_json({"cameras": rings}) if arguments.json else format_table(rings))
         return 0
     scores: list[RgbdScore] = []
     rows = [(cut, number) for cut in arguments.cuts for number in range(arguments.count)]
@@ -126,6 +134,20 @@ def _track_motions(arguments: argparse.Namespace, fitter: BodyFitter, studio: Rg
         for each, score in zip(scores, found, strict=True):
             each.append(score)
     return [summarise_motions(each) for each in reversed(scores)]
+
+
+def _look_from_around(
+    arguments: argparse.Namespace, fitter: BodyFitter, studio: RgbdStudio
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Return the figures of one camera and of all around the people."""
+    if not 2 <= arguments.cameras <= 8:
+        raise InputError(f"--cameras is {arguments.cameras}; 2 to 8 can be compared with one")
+    ring, scores = CameraRing(studio, arguments.cameras), dict[int, list[RingScore]]()
+    for number in tqdm(range(arguments.count), file=sys.stderr, disable=arguments.json):
+        rng = np.random.default_rng([arguments.people_seed, 500, number])
+        for count, found in compare_cameras(fitter, ring, rng, arguments.people).items():
+            scores.setdefault(count, []).extend(found)
+    return [summarise_ring(count, found) for count, found in scores.items()]
 
 
 def _see_from_robot(arguments: argparse.Namespace) -> list[dict[str, Any]]:

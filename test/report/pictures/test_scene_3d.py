@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.report.bag_pictures import BodyMesh
-from flowing_puppet_ros.report.scene_3d import (
+from flowing_puppet_ros.report.pictures.bag_pictures import BodyMesh
+from flowing_puppet_ros.report.pictures.scene_3d import (
     MAX_BYTES,
     MAX_POINTS,
     SceneFrame,

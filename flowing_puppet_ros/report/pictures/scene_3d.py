@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.report.bag_pictures import BodyMesh
+from flowing_puppet_ros.report.pictures.bag_pictures import BodyMesh
 
 MAX_FRAMES, MAX_POINTS = 240, 2000  # stamps, and points of each
 MAX_BYTES = 6_000_000

@@ -18,7 +18,7 @@ from flowing_puppet_ros.draw.overlay import write_text
 from flowing_puppet_ros.draw.pictures import scale_to_height
 from flowing_puppet_ros.evaluate.bag.recording import puppet_joints
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.report.bag_pictures import BodyMesh, ImageBox, crop_camera
+from flowing_puppet_ros.report.pictures.bag_pictures import BodyMesh, ImageBox, crop_camera
 
 MAX_LAG_NS = 350_000_000
 """From an image to the cloud of the bodies that are drawn over it, as `fusion.max_lag` has it."""

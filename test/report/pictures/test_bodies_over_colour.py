@@ -10,15 +10,15 @@ import pytest
 
 from flowing_puppet_ros.draw.palette import NEUTRAL
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.report.bag_pictures import BodyMesh, ImageBox
-from flowing_puppet_ros.report.bodies_over_colour import (
+from flowing_puppet_ros.report.data import gather_data
+from flowing_puppet_ros.report.pictures.bag_pictures import BodyMesh, ImageBox
+from flowing_puppet_ros.report.pictures.bodies_over_colour import (
     PAIR_HEIGHT,
     BodiesAtStamp,
     draw_bodies,
     find_everybody_box,
     find_nearest_stamp,
 )
-from flowing_puppet_ros.report.data import gather_data
 
 type Replay = Callable[..., tuple[Path, Path]]
 
