@@ -27,7 +27,8 @@ class _Components(Mapping[str, type[Component[Any]]]):
     """The components by node; each is imported when it is asked for, since a node needs no other's modules."""
 
     def __getitem__(self, name: str) -> type[Component[Any]]:
-        kind: type[Component[Any]] = getattr(import_module(f"{__package__}.{name}"), _CLASSES[name])
+        own = _CLASSES[name]  # a KeyError where there is no such node
+        kind: type[Component[Any]] = getattr(import_module(f"{__package__}.{name}"), own)
         return kind
 
     def __iter__(self) -> Iterator[str]:
