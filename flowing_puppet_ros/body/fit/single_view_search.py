@@ -29,7 +29,8 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.threads import parallel_map
 
 STARTS, KEPT_STARTS = 16, 12  # bodies of the bank that are refined, and those of them that are refined further
-KEPT, FINISHED = (8, 6, 4), 3  # bodies whose limbs are sampled again in each round, and those that are finished
+KEPT, SPARSE_KEPT = (6, 4, 3), (8, 6, 4)  # bodies whose limbs are sampled again in each round, and of sparse clouds
+FINISHED = 3  # bodies that are finished
 LIMB_SAMPLES = 300  # poses sampled for each stage of a limb
 # Parts of an arm and of a leg from the trunk outwards, without the side; those of a stage are sampled at once.
 LIMB_CHAINS = (
@@ -97,15 +98,16 @@ class SingleViewSearch:
             The best body, and then others that explain the cloud nearly as well.
         """
         coarse = CoarseCloud.of(cloud)
-        bodies = self._find_starts(cloud, coarse)
+        rounds = KEPT if _is_dense(cloud) else SPARSE_KEPT
+        bodies = self._find_starts(cloud, coarse, rounds[0])
         progress(0.3)
         for number, (kept, improve) in enumerate(
-            zip(KEPT, (self._replace_limbs, self._improve_pairs, self._improve_limbs), strict=True)
+            zip(rounds, (self._replace_limbs, self._improve_pairs, self._improve_limbs), strict=True)
         ):
             starts = list(zip(bodies[:kept], rng.spawn(kept), strict=False))
             improved = parallel_map(partial(_apply, improve, cloud, coarse), starts, self._threads)
             bodies = self._rank(improved, coarse)
-            progress(0.3 + 0.5 * (number + 1) / len(KEPT))
+            progress(0.3 + 0.5 * (number + 1) / len(rounds))
         weights = _final_weights(cloud, steps)
         bodies = parallel_map(lambda body: self._refine(body, cloud, weights), bodies[:FINISHED], self._threads)
         progress(1.0)
@@ -113,10 +115,10 @@ class SingleViewSearch:
         limit = self._bank.cost(bodies[0], coarse) + MAX_EQUAL_COST_M
         return [bodies[0], *(body for body in bodies[1:] if self._bank.cost(body, coarse) < limit)]
 
-    def _find_starts(self, cloud: SingleViewCloud, coarse: CoarseCloud) -> list[BodyState]:
-        """Return the bank's best bodies after a few steps of Gauss-Newton, the best first."""
+    def _find_starts(self, cloud: SingleViewCloud, coarse: CoarseCloud, count: int) -> list[BodyState]:
+        """Return the `count` best bodies of the bank after a few steps of Gauss-Newton, the best first."""
         bodies = self._bank.find_best(coarse, STARTS)
-        for weights, kept in ((FIRST, KEPT_STARTS), (SECOND, KEPT[0])):
+        for weights, kept in ((FIRST, KEPT_STARTS), (SECOND, count)):
             refine = partial(self._refine, cloud=cloud, weights=weights)
             bodies = self._rank(parallel_map(refine, bodies, self._threads), coarse)[:kept]
         return bodies
@@ -260,8 +262,13 @@ def _apply(
     return improve(start[0], cloud, coarse, start[1])
 
 
+def _is_dense(cloud: SingleViewCloud) -> bool:
+    """Return whether a cloud is dense and exact enough for a few bodies to settle the pose."""
+    return len(cloud.points) >= MIN_DENSE_POINTS
+
+
 def _final_weights(cloud: SingleViewCloud, steps: int) -> RefineWeights:
     """Return the weights of the last refinement; wider and with stronger priors against the noise of sparse clouds."""
-    if len(cloud.points) >= MIN_DENSE_POINTS:
+    if _is_dense(cloud):
         return RefineWeights(sigma_start=0.08, iterations=steps)
     return RefineWeights(pose=1e-6, shape=5e-6, pairwise=1e-7, sigma_start=0.08, sigma_end=0.05, iterations=steps)
