@@ -313,9 +313,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def _fit_one(self, stamp: int, cloud: Any, of_depth: bool, initial: Any | None) -> Output:
         self.counters["clouds"] += 1
-        bodies: list[TrackedBody] = []
-        occluded: list[str] = []
-        self._coarse: list[CoarsePerson] = []
+        bodies, occluded, coarse = list[TrackedBody](), list[str](), list[CoarsePerson]()
         try:
             rig, decode = self._rig, self._decode
             scene, place, is_known = decode(cloud, of_depth) if rig is None else rig.merge(cloud, decode)
@@ -327,20 +325,20 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             if initial is not None and initial.bodies:
                 bodies = self._fit_initial(scene, place, initial, self.seed_of(stamp))
             else:
-                bodies, occluded = self._fit_scene(scene, cloud.header, stamp, place, is_known)
+                bodies, occluded, coarse = self._fit_scene(scene, cloud.header, stamp, place, is_known)
             bodies = [body.move(*place.back) for body in bodies]
+            coarse = [person.move(*place.back) for person in coarse]
             self._looked_at = stamp, place
         except InputError as error:
             self.report.count_unusable(error)
         self.counters["bodies"] += len(bodies)
-        self.counters["people in colour only"] += len(self._coarse)
-        coarse = [person.move(*place.back) for person in self._coarse]
+        self.counters["people in colour only"] += len(coarse)
         return self._outputs.make(cloud.header, bodies, occluded, self._subscribed, coarse)
 
     def _fit_scene(
         self, scene: SceneCloud, header: Any, stamp: int, place: SensorPlace, is_known: bool
-    ) -> tuple[list[TrackedBody], list[str]]:
-        """Return the bodies of everybody, and the ids of those out of sight: with a camera's puppets, or without.
+    ) -> tuple[list[TrackedBody], list[str], list[CoarsePerson]]:
+        """Return the bodies of everybody, the ids of those out of sight, and who is seen in colour only.
 
         Where the camera looks, only who has a puppet has a body. Elsewhere people are found in the cloud alone. A cloud
         whose place is not known is fitted by itself.
@@ -348,26 +346,28 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         seed = self.seed_of(stamp)
         step = self._step_scene if is_known else self._step_alone
         if "puppets" not in self._expected or not self.settings.scene:
-            return step(scene, seed)
+            return *step(scene, seed), []
         try:
             paired = self._puppets.find(header, stamp, *place.back)
         except InputError as error:
             self.report.warn(str(error))
             self.counters["clouds without puppets"] += 1
-            return step(scene, seed)
+            return *step(scene, seed), []
         self._puppets.drop_until(stamp)
         seen = SeenCloud.of(scene.points, paired.camera, scene.viewpoint)
-        coarse = paired.puppets if self.settings.fusion.colour_only else []
-        if not len(scene.points):
-            self._coarse = place_others(self._model, coarse, seen)
-        self._scene.check(scene)
+        puppets = paired.puppets if self.settings.fusion.colour_only else []
+        try:
+            self._scene.check(scene)
+        except InputError as error:
+            self.report.count_unusable(error)
+            return [], [], place_others(self._model, puppets, seen)
         if is_known:
             bodies, own = self._fused.step(seen, scene.draw_image(), paired.puppets, scene.stamp)
         else:
             bodies, own = self._fused.step_alone(seen, scene.draw_image(), paired.puppets)
         occluded = self._fused.occluded_ids
         with_body = {body.id for body in bodies}
-        self._coarse = place_others(self._model, [each for each in coarse if each.id not in with_body], seen)
+        coarse = place_others(self._model, [each for each in puppets if each.id not in with_body], seen)
         if paired.puppets and not own.any():
             self.report.warn(
                 f"none of the {len(paired.puppets)} puppets lies on the cloud: nobody is near enough to the sensor, or "
@@ -377,7 +377,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         if outside.mean() > MIN_OUTSIDE_SHARE:
             others, hidden = step(scene.take(outside), seed)
             bodies, occluded = [*bodies, *others], [*occluded, *hidden]
-        return bodies, occluded
+        return bodies, occluded, coarse
 
     def _step_alone(self, scene: SceneCloud, seed: int) -> tuple[list[TrackedBody], list[str]]:
         """Return the bodies of everybody in a cloud that nothing joins to the others, and nobody's ids."""
