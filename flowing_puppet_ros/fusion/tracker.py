@@ -35,7 +35,8 @@ from flowing_puppet_ros.threads import one_blas_thread, parallel_map
 REFIT_INTERVAL_NS, LIMB_INTERVAL_NS = 1_000_000_000, 250_000_000
 """From one fit of an unreliable body from its joints to the next, and from one search for a lost limb to the next."""
 MAX_PATIENCE = 16
-"""Times that interval: it doubles with every attempt that finds nothing better, which takes as long as ten clouds."""
+"""Times the former: it doubles with every fit that finds nothing better, which takes as long as ten clouds. A limb that
+is not found in one cloud often is in the next."""
 BETTER_SHARE = 0.95
 """Two-way distance of a new fit, relative to the tracked body's, below which it is better."""
 MAX_PLANE_CLOUDS = 40
@@ -46,9 +47,13 @@ MAX_SAME_PERSON_M = 0.6
 
 @dataclass(slots=True)
 class _Retry:
-    """When something that takes long is worth another attempt: `stamp` ns of the last one, and the interval to it."""
+    """When something that takes long is worth another attempt: `stamp` ns of the last one, and the interval to it.
+
+    The interval doubles with every attempt in vain, up to `max_patience` times.
+    """
 
     interval: int
+    max_patience: int = 1
     stamp: int | None = None
     patience: int = 1
 
@@ -58,7 +63,7 @@ class _Retry:
 
     def record(self, stamp: int, success: bool) -> None:
         """Take note of an attempt."""
-        self.stamp, self.patience = stamp, 1 if success else min(2 * self.patience, MAX_PATIENCE)
+        self.stamp, self.patience = stamp, 1 if success else min(2 * self.patience, self.max_patience)
 
 
 @dataclass(slots=True, eq=False)
@@ -71,7 +76,7 @@ class _PuppetTrack:
     id: str
     tracker: BodyTracker
     stamp: int
-    refit: _Retry = field(default_factory=lambda: _Retry(REFIT_INTERVAL_NS))
+    refit: _Retry = field(default_factory=lambda: _Retry(REFIT_INTERVAL_NS, MAX_PATIENCE))
     searches: dict[int, _Retry] = field(default_factory=dict)
     proven: bool = False
     motion: TorsoMotion = field(default_factory=TorsoMotion)
