@@ -71,7 +71,7 @@ SEARCH: dict[str, list[tuple[Any, str]]] = {
 """Functions of each stage of a whole fit, besides the search for nearest points and Gauss-Newton."""
 ONE_SIDED_SEARCH: dict[str, list[tuple[Any, str]]] = REFINEMENT | {
     "bank of poses": [(PoseBank, "find_best")],
-    "limbs sampled again": [(SingleViewSearch, "_resample_limb")],
+    "limbs sampled again": [(SingleViewSearch, "_resample_limbs")],
 }
 """Functions of each stage of a fit to one side."""
 

@@ -110,8 +110,8 @@ def test_clouds_of_optical_frames_are_fitted_upright(inputs: dict[str, list[Any]
 @pytest.mark.slow
 def test_each_body_of_the_start_is_fitted_and_a_lost_one_is_deleted(inputs: dict[str, list[Any]]) -> None:
     component = fitter()
-    component.set_subscribed("body_meshes", True)
-    component.set_subscribed("body_vertices", True)
+    for name in ("body_meshes", "body_vertices", "part_poses"):
+        component.set_subscribed(name, True)
     hull, joints = inputs["/hull"][1], inputs["/hull/joints"][1]
     points, _ = decode_cloud(hull)
     header = make_header(FACTORY, stamp_ns(hull), "world")

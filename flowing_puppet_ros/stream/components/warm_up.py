@@ -92,10 +92,10 @@ def make_fitter_input(factory: MessageFactory, model: StitchedPuppet) -> Message
         for name, (x, y) in zip(model.joint_names, _project(joints), strict=True)
     ]
     found: Messages = []
-    info = _make_camera_info(factory, WORLD_FRAME)
     for number in range(1, FRAMES + 1):
         header = make_header(factory, number * PERIOD_NS, WORLD_FRAME)
         puppet = factory.make("flowing_puppet_msgs/msg/Puppet", id="w1", confidence=0.9, joints=puppets)
+        info = _make_camera_info(factory, WORLD_FRAME, number * PERIOD_NS)
         found += [("puppets/camera_info", info), ("camera_info", info)]
         found += [("puppets", factory.make(PUPPETS, header=header, puppets=[puppet]))]
         found += [("depth", make_image(factory, header, depth, "16UC1"))]
@@ -130,9 +130,9 @@ def make_puppet(model: DeformableStructures) -> TrackedPuppet:
     return FlowingPuppetTracker(model).step(np.zeros((*IMAGE_SIZE, 3), np.uint8), 0, [person]).puppets[0]
 
 
-def _make_camera_info(factory: MessageFactory, name: str) -> Any:
+def _make_camera_info(factory: MessageFactory, name: str, stamp: int = PERIOD_NS) -> Any:
     k = np.array([FOCAL_PX, 0, (IMAGE_SIZE[1] - 1) / 2, 0, FOCAL_PX, (IMAGE_SIZE[0] - 1) / 2, 0, 0, 1.0])
-    header = make_header(factory, PERIOD_NS, name)
+    header = make_header(factory, stamp, name)
     return factory.make(CAMERA_INFO, header=header, width=IMAGE_SIZE[1], height=IMAGE_SIZE[0], k=k, p=np.zeros(12))
 
 

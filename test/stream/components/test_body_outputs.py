@@ -11,7 +11,7 @@ import pytest
 
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.body.fit.fitter import BodyFit
-from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
+from flowing_puppet_ros.body.fit.visibility import JOINT_CONFIDENCE, BodyVisibility, Visibility
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody, TrackStatus
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyOutputSettings
@@ -176,7 +176,7 @@ def test_what_was_not_seen_is_said_and_pale(model: StitchedPuppet) -> None:
     assert set(parts.values()) == {one.parts[0].SEEN}
     joints = {joint.name: joint for joint in one.joints}
     assert joints["right_elbow"].visibility == joints["right_elbow"].SEEN
-    assert joints["right_elbow"].confidence == pytest.approx(0.97)
+    assert joints["right_elbow"].confidence == pytest.approx(JOINT_CONFIDENCE[Visibility.SEEN])
     (marker,) = made["body_meshes"].markers
     corners = np.array([(p.x, p.y, p.z) for p in marker.points])
     pale = np.array([colour.r > marker.color.r for colour in marker.colors])
