@@ -43,6 +43,7 @@ from flowing_puppet_ros.report.pictures.bag_pictures import (
     STRIP_HEIGHT,
     BodyShot,
     FlowShot,
+    ImageBox,
     body_axes,
     decode_picture,
     draw_body_shot,
@@ -256,13 +257,16 @@ def _add_strip(
 ) -> None:
     """Add the images at the stamps `strip` with puppets, and beside them with the `bodies` of their clouds."""
     people = [camera.puppets[stamp] for stamp in strip]
+    boxes: dict[tuple[int, ...], ImageBox] = {}
     for (_, stamp), message in read_messages(given, {camera.image_topic: strip}):
         with suppress(InputError):
             image = decode_image(message)
             if camera.camera is None or not bodies:
                 picture = draw_track(image, camera.puppets[stamp], find_people_box(people, image.shape))
             else:
-                box = find_everybody_box(camera.camera, bodies.values(), people, image.shape)
+                if image.shape not in boxes:
+                    boxes[image.shape] = find_everybody_box(camera.camera, bodies.values(), people, image.shape)
+                box = boxes[image.shape]
                 picture = draw_track(image, camera.puppets[stamp], box, PAIR_HEIGHT)
                 there = bodies.get(stamp)
                 drawn = draw_bodies(image, camera.camera, there, box)
