@@ -49,8 +49,6 @@ VISIBLE_HALF_LIFE_S = 2.0  # in which the normal visible surface falls to half w
 MAX_TURNED_RATIO = 1.25
 """Two-way distance of a body that walks ahead, relative to that of one that walks backwards, up to which it is taken:
 few points hardly tell front from back, and hardly anybody walks backwards."""
-JOINT_STEPS = 3
-"""Gauss-Newton steps per cloud at most where somebody sees the joints."""
 ALIGN_GAP_NS = 100_000_000
 """Time between clouds from which on a body is first moved to the joints that somebody sees."""
 
@@ -297,8 +295,6 @@ class BodyTracker:
     def _step(self, start: BodyState, prepared: _Prepared) -> BodyFit:
         """Take a few steps from where the person should be; if they fail, more steps with a wider kernel."""
         steps, places, last = self._settings.gauss_newton_steps, prepared.places, self._state.last
-        if prepared.targets.rays is not None:
-            steps = min(steps, JOINT_STEPS)
         late = places is not None and last is not None and prepared.stamp - last.stamp >= ALIGN_GAP_NS
         if places is not None and late:
             start = align(self._fitter.gauss_newton, start, places)
