@@ -111,9 +111,9 @@ class SingleViewSearch:
         weights = _final_weights(cloud, steps)
         bodies = parallel_map(lambda body: self._refine(body, cloud, weights), bodies[:FINISHED], self._threads)
         progress(1.0)
-        bodies.sort(key=lambda body: self._bank.cost(body, coarse))
-        limit = self._bank.cost(bodies[0], coarse) + MAX_EQUAL_COST_M
-        return [bodies[0], *(body for body in bodies[1:] if self._bank.cost(body, coarse) < limit)]
+        costs = np.array([self._bank.cost(body, coarse) for body in bodies])
+        best, *others = np.argsort(costs, kind="stable")
+        return [bodies[best], *(bodies[k] for k in others if costs[k] < costs[best] + MAX_EQUAL_COST_M)]
 
     def _find_starts(self, cloud: SingleViewCloud, coarse: CoarseCloud, count: int) -> list[BodyState]:
         """Return the `count` best bodies of the bank after a few steps of Gauss-Newton, the best first."""

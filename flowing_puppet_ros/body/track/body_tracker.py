@@ -295,17 +295,17 @@ class BodyTracker:
     def _step(self, start: BodyState, prepared: _Prepared) -> BodyFit:
         """Take a few steps from where the person should be; if they fail, more steps with a wider kernel."""
         steps, places, last = self._settings.gauss_newton_steps, prepared.places, self._state.last
-        late = places is not None and last is not None and prepared.stamp - last.stamp >= ALIGN_GAP_NS
-        if places is not None and late:
+        if places is not None and last is not None and prepared.stamp - last.stamp >= ALIGN_GAP_NS:
             start = align(self._fitter.gauss_newton, start, places)
         fit = self._refine(start, prepared, NARROW_WIDTHS_M, steps)
         if not self._is_lost(fit):
             self.counters["tracked"] += 1
             return fit
         self.counters["widened"] += 1
+        wide_steps = WIDE_STEPS
         if places is not None:
-            start, steps = align(self._fitter.gauss_newton, start, places), 2 * steps
-        wide = self._refine(start, prepared, WIDE_WIDTHS_M, WIDE_STEPS if places is None else steps)
+            start, wide_steps = align(self._fitter.gauss_newton, start, places), 2 * steps
+        wide = self._refine(start, prepared, WIDE_WIDTHS_M, wide_steps)
         return min(fit, wide, key=lambda found: found.two_way_distance)
 
     def _refit(

@@ -14,7 +14,6 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model import rotation
-from flowing_puppet_ros.model.rotation import log
 from flowing_puppet_ros.model.sp import BodyState
 
 MAX_STRETCH = 2.0  # frames by which a motion is extrapolated at most
@@ -120,7 +119,7 @@ def _is_jump(before: BodyFit, after: BodyFit, nanoseconds: int) -> bool:
     """Return whether a torso cannot have moved or turned so far in that time."""
     seconds = 1e-9 * nanoseconds
     moved = np.linalg.norm(after.state.center[0] - before.state.center[0])
-    turned = np.linalg.norm(log(before.state.rotation[0].T @ after.state.rotation[0]))
+    turned = np.linalg.norm(rotation.log(before.state.rotation[0].T @ after.state.rotation[0]))
     return bool(
         moved > MAX_PLACE_ERROR_M + MAX_SPEED_M_PER_S * seconds
         or turned > MAX_TURN_ERROR_RAD + MAX_TURN_RAD_PER_S * seconds

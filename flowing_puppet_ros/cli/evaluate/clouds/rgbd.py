@@ -136,9 +136,7 @@ def _track_motions(arguments: argparse.Namespace, fitter: BodyFitter, studio: Rg
     return [summarise_motions(each) for each in reversed(scores)]
 
 
-def _look_from_around(
-    arguments: argparse.Namespace, fitter: BodyFitter, studio: RgbdStudio
-) -> list[dict[str, Any]]:  # fmt: skip
+def _look_from_around(arguments: argparse.Namespace, fitter: BodyFitter, studio: RgbdStudio) -> list[dict[str, Any]]:
     """Return the figures of one camera and of all around the people."""
     if not 2 <= arguments.cameras <= 8:
         raise InputError(f"--cameras is {arguments.cameras}; 2 to 8 can be compared with one")
