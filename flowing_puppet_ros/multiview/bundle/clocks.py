@@ -83,7 +83,7 @@ def _measure_distance(
     The samples that the other camera does not show count as _UNSEEN_DISTANCE_M.
     """
     both = np.minimum(weight, their_weight)
-    shown, seen_by_both = np.count_nonzero((weight > 0).any(axis=1)), np.count_nonzero((both > 0).any(axis=1))
+    shown, seen_by_both = (int(np.count_nonzero((each > 0).any(axis=1))) for each in (weight, both))
     share = seen_by_both / max(shown, 1)
     if share < _MIN_SHARE:
         return np.inf
