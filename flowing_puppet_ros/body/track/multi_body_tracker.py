@@ -25,7 +25,7 @@ from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerS
 from flowing_puppet_ros.body.track.person_belief import PersonBelief
 from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
-from flowing_puppet_ros.body.upright.person_finder import JudgedFit
+from flowing_puppet_ros.body.upright.found_body import JudgedFit
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
