@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.limb_crop import list_capsules
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
@@ -210,10 +211,13 @@ class PeopleFitter:
             dict(zip(self.model.joint_names, self.model.joints(self.model.vertices(body)), strict=True))
         )
 
-    def fit_claim(self, claim: Claim, person: PersonCloud) -> BodyFit | None:
-        """Return the body of a puppet's own points, from its joints; None where there is none."""
+    def fit_claim(self, claim: Claim, person: PersonCloud, known: Cloud | None = None) -> BodyFit | None:
+        """Return the body of a puppet's own points, from its joints; None where there is none.
+
+        `known` is the person's cloud as a tracker has prepared it.
+        """
         try:
-            cloud = self.joint_fitter.make_cloud(person.points, person.field, person.viewpoint)
+            cloud = self.joint_fitter.take_cloud(person, known)
             return self.joint_fitter.fit(cloud, self.joint_fitter.start(claim.joints), claim.joints)
         except InputError:
             return None

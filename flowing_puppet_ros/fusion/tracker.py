@@ -211,7 +211,7 @@ class FusedTracker:
                 return None if tracker.lost else fit
             doubtful = fit is not None and not fit.reliable and not tracker.hidden and job.track.refit.is_due(stamp)
             if fit is None or tracker.lost or doubtful:
-                fresh = self._people.fit_claim(claim, job.person)
+                fresh = self._people.fit_claim(claim, job.person, tracker.cloud)
                 limit = np.inf if fit is None else BETTER_SHARE * fit.two_way_distance
                 better = fresh is not None and fresh.two_way_distance < limit
                 job.track.refit.record(stamp, better)
@@ -244,7 +244,7 @@ class FusedTracker:
         lost = [limb for limb in lost if tries[limb].is_due(stamp)]
         if not lost or track.tracker.hidden:
             return fit
-        cloud = fitter.make_cloud(job.person.points, job.person.field)
+        cloud = fitter.take_cloud(job.person, track.tracker.cloud)
         found = fitter.hang_anew(cloud, fit.state, claim.joints, lost)
         for limb in lost:
             tries[limb].record(stamp, found is not None)

@@ -117,7 +117,12 @@ class _Prepared(NamedTuple):
 
 
 class BodyTracker:
-    """Tracks one person; `counters` counts clouds by how they were fitted: tracked, widened, searched, hidden."""
+    """Tracks one person.
+
+    Attributes:
+        counters: clouds by how they were fitted: tracked, widened, searched, hidden.
+        cloud: the last cloud of `track`, prepared; None where nothing was to be tracked.
+    """
 
     def __init__(self, fitter: BodyFitter, settings: BodyTrackerSettings) -> None:
         """Track with the model of `fitter`, which also makes the full fits."""
@@ -127,6 +132,7 @@ class BodyTracker:
         self._upright = UprightFitter(fitter)
         self.counters: Counter[str] = Counter()
         self._quick = False
+        self.cloud: Cloud | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -236,12 +242,14 @@ class BodyTracker:
         is moved that is lost or comes after a gap. `start` is where the body should be, None where it is `predict`'s.
         `lost` tells whether the body is not where the person is.
         """
+        self.cloud = None
         if self._state.last is None:
             # Normals take long, and nothing would use them.
             self._fitter.prepare_points(*check_cloud(person.points, person.normals), person.viewpoint)
             return None
         with one_blas_thread():
             prepared = self._prepare(person, targets, places)
+self.cloud = prepared.cloud
             fit, lost = self._track(prepared, start)
         if fit is None:
             self._state = replace(self._state, lost=lost)
