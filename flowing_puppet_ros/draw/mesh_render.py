@@ -13,8 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+from itertools import product
 from typing import Protocol
 
+import cv2
 import numpy as np
 from numba import njit
 
@@ -137,12 +140,13 @@ class Canvas:
 
     def compose(self, background: Sequence[int] | np.ndarray = (255, 255, 255), opacity: float = 1.0) -> Rendering:
         """Return the drawing with `opacity` over a colour (3,) or an image (H, W, 3); sub-pixels are averaged."""
-        (width, height), samples = self.size, self.samples
-        blocks = (height, samples, width, samples)
-        covered = np.isfinite(self._depth).reshape(blocks).mean(axis=(1, 3), dtype=np.float32)
-        total = self._colour.reshape(*blocks, 3).mean(axis=(1, 3))
+        drawn = np.isfinite(self._depth).astype(np.float32)
+        covered, total = (
+            np.asarray(cv2.resize(values, self.size, interpolation=cv2.INTER_AREA)) for values in (drawn, self._colour)
+        )
         rgb = opacity * total + (1 - opacity * covered[..., None]) * np.asarray(background, np.float32)
-        depth = self._depth.reshape(blocks).min(axis=(1, 3))
+        shifts = product(range(self.samples), repeat=2)
+        depth = reduce(np.minimum, [self._depth[row :: self.samples, column :: self.samples] for row, column in shifts])
         return Rendering(np.clip(np.rint(rgb), 0, 255).astype(np.uint8), depth, covered)
 
     def _project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -258,18 +258,21 @@ def _add_strip(
     """Add the images at the stamps `strip` with puppets, and beside them with the `bodies` of their clouds."""
     people = [camera.puppets[stamp] for stamp in strip]
     boxes: dict[tuple[int, ...], ImageBox] = {}
+    seen_by = camera.camera if bodies else None
     for (_, stamp), message in read_messages(given, {camera.image_topic: strip}):
         with suppress(InputError):
             image = decode_image(message)
-            if camera.camera is None or not bodies:
-                picture = draw_track(image, camera.puppets[stamp], find_people_box(people, image.shape))
+            shape = image.shape
+            if shape not in boxes:
+                everybody = seen_by and find_everybody_box(seen_by, bodies.values(), people, shape)
+                boxes[shape] = everybody or find_people_box(people, shape)
+            box = boxes[shape]
+            if seen_by is None:
+                picture = draw_track(image, camera.puppets[stamp], box)
             else:
-                if image.shape not in boxes:
-                    boxes[image.shape] = find_everybody_box(camera.camera, bodies.values(), people, image.shape)
-                box = boxes[image.shape]
                 picture = draw_track(image, camera.puppets[stamp], box, PAIR_HEIGHT)
                 there = bodies.get(stamp)
-                drawn = draw_bodies(image, camera.camera, there, box)
+                drawn = draw_bodies(image, seen_by, there, box)
                 data.overlaid[stamp] = (drawn, there.stamp if there else None)
             data.strip.append((stamp, picture))
 

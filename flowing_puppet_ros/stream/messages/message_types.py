@@ -34,6 +34,10 @@ class MessageFactory(Protocol):
         """Make a message of type `package/msg/Name`; arrays of numbers are given as ndarray, other arrays as lists."""
         ...
 
+    def __hash__(self) -> int:
+        """Return a hash of this factory: what is made once for all may be kept by it."""
+        ...
+
 
 def message_bytes(data: Any) -> U8:
     """View a uint8[] field of any kind of message as an array, without a copy."""

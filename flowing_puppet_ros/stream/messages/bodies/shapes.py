@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -67,6 +68,7 @@ def make_part_poses(factory: MessageFactory, header: Any, states: Sequence[BodyS
     return factory.make("geometry_msgs/msg/PoseArray", header=header, poses=poses)
 
 
+@lru_cache(maxsize=4)
 def make_topology(factory: MessageFactory, model: StitchedPuppet) -> Any:
     """Return the shape_msgs/Mesh of the model at rest; its triangles are valid for the vertices of every fit."""
     triangles = [
