@@ -236,7 +236,7 @@ def test_a_hand_lies_beside_the_wrist_of_both_networks() -> None:
     """Landmarks that have a whole lower arm elsewhere take the hand along as far as they take the wrist."""
     shifts = {"left_wrist": 12.0, "left_index": 12.0}
     (found,) = find(Seeing([pose(300)], [], shifts=shifts))
-    expected = place_joints(("left_wrist", "left_index"), 300) + (12 / 1.8, 0)
+    expected = place_joints(("left_wrist", "left_index"), 300) + np.array([12 / 1.8, 0])
     np.testing.assert_allclose([at(found, "left_wrist")[0], at(found, "left_hand")[0]], expected, atol=1e-6)
 
 
