@@ -103,6 +103,7 @@ class PersonFinder:
         max_misses: int | None = None,
         remember: bool = True,
         come: np.ndarray | None = None,
+        only_known: bool = False,
     ) -> list[FoundBody]:
         """Find the people in a scan; the same scans give the same answer.
 
@@ -116,13 +117,16 @@ class PersonFinder:
             max_misses: so many fits in a row of which none is a person end it; None: none does.
             remember: whether what is no person is remembered, and what was none is left out.
             come: which (N,) points lie where the scans before saw through; None where nothing is known.
+            only_known: nobody else is looked for, unless one of those who are expected is not there.
         """
         self.last_rejected = []
         self._view = None
         if len(points) < self._settings.min_points:
             return []
         scene = SceneHeights.of(points)
-        candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
+        candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known)
+        if only_known and len(owned) < sum(len(body) > 0 for body in known):
+            candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
         make = partial(_make_person, points, normals, scene, viewpoint, stamp)
         people = [
             FoundBody(make(rows, owner=owner), None)
@@ -234,6 +238,14 @@ class PersonFinder:
         if judged.probability < self._settings.min_probability / 2:
             self._rejected.add(candidate, person.stamp)
         return judged
+
+    @one_blas_thread()
+    def choose_facing(self, person: PersonCloud, first: BodyFit, full: BodyFit) -> BodyFit:
+        """Return the body of a full fit to a person, or one that faces as the `first` one where that is likelier."""
+        if person.viewpoint is None or person.floor is None:
+            return full
+        cloud = self.upright.make_cloud(person.points, person.viewpoint, None, person.field)
+        return self.upright.choose_facing(first, full, cloud, person.floor)
 
     def _weigh(
         self,
