@@ -80,6 +80,7 @@ class PersonFinder:
         self._rejected = RejectedPlaces(settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
         self._view: ScanView | None = None
+        self._owned = np.empty(0, dtype=bool)
 
     def warm_up(self) -> None:
         """Do beforehand what the first scan would wait for."""
@@ -153,6 +154,9 @@ class PersonFinder:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
                 taken.append(candidate.middle)
                 people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
+        self._owned = np.zeros(len(points), dtype=bool)
+        for body in people:
+            self._owned[body.person.rows] = True
         return people
 
     def _fit_offered(
@@ -216,24 +220,25 @@ class PersonFinder:
     def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
 
-        Where it explains few points badly, a new upright body may be better, and is returned instead. What is rejected
+        Points of other people count neither for nor against it. Where it explains few points badly, a new upright body
+        may be better, and is returned instead. What is rejected
         is remembered as by `find`.
         """
         if self._view is None or not len(rows):
             return JudgedFit(0.0, 0.0, fit)
-        scene, rays = self._view.scene, self._view.rays
-        candidate = Candidate.of(scene, rows)
+        view, rows = self._view.leave_to(rows, self._owned)
+        rays, candidate = view.rays, Candidate.of(view.scene, rows)
         window = rays.find_window(person.points)
-        shape = describe_candidates([candidate], scene, rays.viewpoint)
+        shape = describe_candidates([candidate], view.scene, rays.viewpoint)
         probability = float(PersonModel.load().trees.predict(shape)[0])
         try:
             cloud = self.upright.make_cloud(person.points, rays.viewpoint, rays.find_unknown(person.points, window))
         except InputError:  # the sensor stands in it
             return JudgedFit(0.0, 0.0, fit)
-        judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, self._view, window)
+        judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, view, window)
         if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
             other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0])
-            again = self._weigh(other, cloud, candidate, probability, self._view, window)
+            again = self._weigh(other, cloud, candidate, probability, view, window)
             judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
             self._rejected.add(candidate, person.stamp)
