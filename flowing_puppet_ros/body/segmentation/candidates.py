@@ -89,7 +89,11 @@ class SceneHeights:
 
 
 def find_candidates(
-    scene: SceneHeights, viewpoint: np.ndarray, min_points: int, known: Sequence[np.ndarray] = ()
+    scene: SceneHeights,
+    viewpoint: np.ndarray,
+    min_points: int,
+    known: Sequence[np.ndarray] = (),
+    only_known: bool = False,
 ) -> tuple[list[Candidate], dict[int, np.ndarray]]:
     """Find where people may be, and the points of those who are known.
 
@@ -98,11 +102,15 @@ def find_candidates(
         viewpoint: (3,) position of the sensor, metres.
         min_points: points that a candidate needs.
         known: points (K, 3) in metres on each body that is expected in the cloud, at its predicted position.
+        only_known: look near the known bodies only, and find no candidates.
 
     Returns:
         The candidates, and by the index of a known body the rows (N,) of its points, ascending.
     """
-    rows = np.flatnonzero((scene.height > HEIGHT_LIMITS_M[0]) & (scene.height < HEIGHT_LIMITS_M[1]) & ~scene.wall)
+    inside = (scene.height > HEIGHT_LIMITS_M[0]) & (scene.height < HEIGHT_LIMITS_M[1]) & ~scene.wall
+    if only_known:
+        inside &= _lies_near(scene, known)
+    rows = np.flatnonzero(inside)
     if not len(rows):
         return [], {}
     thin, voxel = thin_points(np.column_stack([scene.points[rows, :2], scene.height[rows]]))
@@ -119,9 +127,20 @@ def find_candidates(
         for owner in np.unique(label[label >= new_labels]):
             owned[int(owner - new_labels)] = members.gather(np.flatnonzero(label == owner))
         label[label >= new_labels] = -1
+    if only_known:
+        return [], owned
     groups = [group for cluster in _list_clusters(thin, label, weight, min_points) for group in cluster]
     found = [_make_candidate(scene, members.gather(chosen), whole, min_points) for chosen, whole in groups]
     return _filter_by_surroundings([candidate for candidate in found if candidate is not None], scene), owned
+
+
+def _lies_near(scene: SceneHeights, known: Sequence[np.ndarray]) -> np.ndarray:
+    """Return which (N,) of the scene's points are so near to the middle of a known body that they may be its own."""
+    near = np.zeros(len(scene.points), dtype=bool)
+    for body in known:
+        if len(body):
+            near[scene.index.find_near(scene.points, body[:, :2].mean(axis=0), MAX_PERSON_WIDTH_M)[0]] = True
+    return near
 
 
 class _VoxelRows(NamedTuple):

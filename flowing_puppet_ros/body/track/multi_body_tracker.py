@@ -41,6 +41,8 @@ VELOCITY_GAIN = 0.5  # fraction of a new velocity that is taken
 MAX_VELOCITY_GAP_NS = 1_000_000_000  # between clouds that give a velocity
 REFIT_INTERVAL_NS = 5_000_000_000  # from one full fit of an unreliable body to the next
 TURN_INTERVAL_NS = 1_000_000_000  # between attempts to turn a body round that walks backwards
+MAX_OTHER_WAY_RATIO = 0.8
+"""Two-way distance of a full fit that faces the other way, relative to the tracked body's, up to which it is taken."""
 BODY_STRIDE = 8  # every so many vertices stand for a body
 MAX_FITS_AT_ONCE = 4  # new people in one cloud of a live stream who have a body in it
 
@@ -300,8 +302,7 @@ class MultiBodyTracker:
         number, tracker = finished
         for track in self._tracks:
             if track.number == number and tracker.last is not None:
-                own = track.tracker.last
-                if own is None or tracker.last.two_way_distance < own.two_way_distance:
+                if _is_better(tracker.last, track.tracker.last):
                     track.tracker = tracker
                 else:
                     track.tracker.accept()
@@ -358,6 +359,14 @@ def _track(pair: tuple[_BodyTrack, PersonCloud]) -> BodyFit | InputError | None:
         return track.tracker.track(person)
     except InputError as error:
         return error
+
+
+def _is_better(full: BodyFit, own: BodyFit | None) -> bool:
+    """Return whether a full fit is closer than the tracked body, and much closer where it faces the other way."""
+    if own is None:
+        return True
+    same = own.state.rotation[0, :2, 0] @ full.state.rotation[0, :2, 0] > 0
+    return full.two_way_distance < (1.0 if same else MAX_OTHER_WAY_RATIO) * own.two_way_distance
 
 
 def _person_seed(seed: int, number: int) -> int:

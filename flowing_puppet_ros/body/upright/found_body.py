@@ -16,6 +16,7 @@ from flowing_puppet_ros.body.upright.scan_rays import ScanRays
 MIN_COME_SHARE = 0.15
 """Share of the points, where the sensor once saw through, from which on something has come there."""
 SAME_PERSON_M = 0.35  # between the middles of two bodies that are one person
+SURROUNDINGS_M = 2.0  # about the middle of a person, of what may speak for or against one
 SAME_MIDDLE_M, SAME_SIZE = 0.08, 1.2
 """Distance and ratio of the numbers of points up to which a candidate is one that was fitted before."""
 
@@ -58,6 +59,16 @@ class ScanView:
     def has_come(self, candidate: Candidate) -> bool:
         """Return whether a candidate stands where the sensor once saw through."""
         return self.come is not None and bool(self.come[candidate.rows].mean() > MIN_COME_SHARE)
+
+    def leave_to(self, rows: np.ndarray, owned: np.ndarray) -> tuple[ScanView, np.ndarray]:
+        """Return what is about the points `rows` (N,), ascending, without others that somebody has, and `rows` in it.
+
+        `owned` tells of each point of the scan whether somebody has it.
+        """
+        middle = np.median(self.scene.points[rows, :2], axis=0)
+        near = self.scene.index.find_near(self.scene.points, middle, SURROUNDINGS_M)[0]
+        kept = np.union1d(rows, near[~owned[near]])
+        return self.take(kept), np.searchsorted(kept, rows)
 
     def take(self, rows: np.ndarray) -> ScanView:
         """Return the part of the scan whose points are `rows` (K,), K > 0, of which nothing is remembered."""

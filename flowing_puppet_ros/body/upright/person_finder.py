@@ -80,6 +80,7 @@ class PersonFinder:
         self._rejected = RejectedPlaces(settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
         self._view: ScanView | None = None
+        self._owned = np.empty(0, dtype=bool)
 
     def warm_up(self) -> None:
         """Do beforehand what the first scan would wait for."""
@@ -103,6 +104,7 @@ class PersonFinder:
         max_misses: int | None = None,
         remember: bool = True,
         come: np.ndarray | None = None,
+        only_known: bool = False,
     ) -> list[FoundBody]:
         """Find the people in a scan; the same scans give the same answer.
 
@@ -116,13 +118,16 @@ class PersonFinder:
             max_misses: so many fits in a row of which none is a person end it; None: none does.
             remember: whether what is no person is remembered, and what was none is left out.
             come: which (N,) points lie where the scans before saw through; None where nothing is known.
+            only_known: nobody else is looked for, unless one of those who are expected is not there.
         """
         self.last_rejected = []
         self._view = None
         if len(points) < self._settings.min_points:
             return []
         scene = SceneHeights.of(points)
-        candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
+        candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known)
+        if only_known and len(owned) < sum(len(body) > 0 for body in known):
+            candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
         make = partial(_make_person, points, normals, scene, viewpoint, stamp)
         people = [
             FoundBody(make(rows, owner=owner), None)
@@ -149,6 +154,9 @@ class PersonFinder:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
                 taken.append(candidate.middle)
                 people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
+        self._owned = np.zeros(len(points), dtype=bool)
+        for body in people:
+            self._owned[body.person.rows] = True
         return people
 
     def _fit_offered(
@@ -212,28 +220,37 @@ class PersonFinder:
     def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
 
-        Where it explains few points badly, a new upright body may be better, and is returned instead. What is rejected
+        Points of other people count neither for nor against it. Where it explains few points badly, a new upright body
+        may be better, and is returned instead. What is rejected
         is remembered as by `find`.
         """
         if self._view is None or not len(rows):
             return JudgedFit(0.0, 0.0, fit)
-        scene, rays = self._view.scene, self._view.rays
-        candidate = Candidate.of(scene, rows)
+        view, rows = self._view.leave_to(rows, self._owned)
+        rays, candidate = view.rays, Candidate.of(view.scene, rows)
         window = rays.find_window(person.points)
-        shape = describe_candidates([candidate], scene, rays.viewpoint)
+        shape = describe_candidates([candidate], view.scene, rays.viewpoint)
         probability = float(PersonModel.load().trees.predict(shape)[0])
         try:
             cloud = self.upright.make_cloud(person.points, rays.viewpoint, rays.find_unknown(person.points, window))
         except InputError:  # the sensor stands in it
             return JudgedFit(0.0, 0.0, fit)
-        judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, self._view, window)
+        judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, view, window)
         if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
             other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0])
-            again = self._weigh(other, cloud, candidate, probability, self._view, window)
+            again = self._weigh(other, cloud, candidate, probability, view, window)
             judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
             self._rejected.add(candidate, person.stamp)
         return judged
+
+    @one_blas_thread()
+    def choose_facing(self, person: PersonCloud, first: BodyFit, full: BodyFit) -> BodyFit:
+        """Return the body of a full fit to a person, or one that faces as the `first` one where that is likelier."""
+        if person.viewpoint is None or person.floor is None:
+            return full
+        cloud = self.upright.make_cloud(person.points, person.viewpoint, None, person.field)
+        return self.upright.choose_facing(first, full, cloud, person.floor)
 
     def _weigh(
         self,
