@@ -44,6 +44,9 @@ SURFACE_GAP_M, MIN_SURFACE_SHARE, MAX_SURFACES = 0.08, 0.15, 3
 """Between the depths of two surfaces, share of a surface in the points around a joint, and how many there may be."""
 CHOSEN = {name for chain in CHAINS for name in chain}
 """Joints whose depth is chosen among several."""
+MAX_EXPECTED_GAP_M, MIN_EXPECTED = 0.12, 3
+"""Between a ray and where its joint is expected, beyond which the depth there tells nothing, and joints of the trunk
+that tell its depth."""
 SAME_PLACE_M, MIN_TRUNK_GAP_M, MIN_OTHER_CONFIDENCE = 0.12, 0.1, 0.3
 """Between the joints of two people of which one was lifted onto the other, by how much it is nearer to the other's
 trunk than to its own along the axis, and what a joint that may be the other's counts at least."""
@@ -96,8 +99,8 @@ def lift_joints(
     samples, beyond = _collect_samples(puppet, cloud, usable, np.flatnonzero(puppet.known))
     outside = _find_outside(puppet, cloud)
     trunk = trunk_rows(model)
-    should = None if expected is None else (expected - cloud.camera.centre) @ axis
-    depth = _find_trunk_depth(puppet, samples, trunk, None if should is None else float(should[trunk].mean()))
+    should = _expect_depths(expected, rays, cloud)
+    depth = _find_trunk_depth(puppet, samples, trunk, should[trunk])
     missed = [
         joint
         for joint, values in samples.items()
@@ -123,7 +126,7 @@ def lift_joints(
             TRUNK_REACH_M if near_trunk else LIMB_REACH_M,
             measure_seen_share(puppet.confidence[joint], bool(puppet.hidden[joint])),
         )  # fmt: skip
-        if should is not None:
+        if np.isfinite(should[joint]):
             choices[joint] = expect_depth(choices[joint], float(should[joint]))
     for joint, choice in choose_depths(model, choices).items():
         points[joint] = choices[joint].points[choice]
@@ -152,6 +155,15 @@ def find_lifted_onto_others(people: Sequence[LiftedJoints], axis: F64) -> list[B
             onto |= (gap < SAME_PLACE_M) & nearer
         found.append(onto)
     return found
+
+
+def _expect_depths(expected: F64 | None, rays: F64, cloud: SeenCloud) -> F64:
+    """Return the depths (J,) m of `expected` joints, NaN where the puppet sees a joint elsewhere."""
+    if expected is None:
+        return np.full(len(rays), np.nan)
+    place = expected - cloud.camera.centre
+    across = np.linalg.norm(np.cross(place, rays), axis=1)
+    return np.where(across < MAX_EXPECTED_GAP_M, place @ cloud.camera.rotation[2], np.nan)
 
 
 def _find_outside(puppet: PuppetJoints, cloud: SeenCloud) -> Bools:
@@ -238,17 +250,17 @@ def _find_around(joints, pixels, depth, focal):  # type: ignore[no-untyped-def]
     return found_joint[:count], found_row[:count]
 
 
-def _find_trunk_depth(puppet: PuppetJoints, samples: dict[int, F64], trunk: list[int], expected: float | None) -> float:
+def _find_trunk_depth(puppet: PuppetJoints, samples: dict[int, F64], trunk: list[int], expected: F64) -> float:
     """Return the median depth of the trunk, of all joints where the trunk has none, or NaN.
 
-    Joints count by their squared confidence: at hidden hips, the cloud shows the table before them. Where it is
-    `expected` within reach, metres, the wall beside the shoulders does not count.
+    Joints count by their squared confidence: at hidden hips, the cloud shows the table before them. Where most of its
+    joints have an `expected` depth, metres, NaN elsewhere, the wall beside the shoulders does not count.
     """
+    middle = float(np.nanmean(expected)) if np.count_nonzero(np.isfinite(expected)) >= MIN_EXPECTED else np.nan
     for joints in (trunk, list(samples)):
         known = {joint: samples[joint] for joint in joints if len(samples.get(joint, ())) >= MIN_POINTS}
-        if expected is not None:
-            near = {joint: values[np.abs(values - expected) < MAX_TRUNK_DEPTH_M] for joint, values in known.items()}
-            known = {joint: values for joint, values in near.items() if len(values) >= MIN_POINTS} or known
+        near = {joint: values[np.abs(values - middle) < MAX_TRUNK_DEPTH_M] for joint, values in known.items()}
+        known = {joint: values for joint, values in near.items() if len(values) >= MIN_POINTS} or known
         if known:
             depth = np.array([np.median(values) for values in known.values()])
             return _find_weighted_median(depth, puppet.confidence[list(known)] ** 2)

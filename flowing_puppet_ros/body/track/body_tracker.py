@@ -253,7 +253,7 @@ class BodyTracker:
             return None
         with one_blas_thread():
             prepared = self._prepare(person, targets, places)
-self.cloud = prepared.cloud
+            self.cloud = prepared.cloud
             fit, lost = self._track(prepared, start)
         if fit is None:
             self._state = replace(self._state, lost=lost)
