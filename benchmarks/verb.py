@@ -10,25 +10,13 @@ import argparse
 import json
 import sys
 
-from benchmarks import live
-from benchmarks.speed import Bench
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evaluate.tables import format_table
 
 SUBVERBS = {"peers": "benchmarks.peers_verb"}
-PARTS = {
-    "look-ups": Bench.measure_look_ups,
-    "steps": Bench.measure_steps,
-    "search": Bench.measure_search,
-    "growth": Bench.measure_growth,
-    "tracking": Bench.measure_tracking,
-    "stages": Bench.measure_stages,
-    "scene": Bench.measure_scene,
-    "fits": Bench.measure_fits,
-    "images": Bench.measure_images,
-    "replay": Bench.measure_replay,
-    "memory": Bench.measure_memory,
-}
+PARTS = (
+    "look-ups", "steps", "search", "growth", "tracking", "stages", "scene", "fits", "images", "replay", "memory",
+)  # fmt: skip
+"""Each is a method of `speed.Bench`."""
 LIVE = "live"
 MIN_SECONDS = 5.0  # of feeding a node
 
@@ -50,14 +38,17 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--seed is {arguments.seed}; it must be 0 or more")
     if not MIN_SECONDS <= arguments.seconds < float("inf"):
         raise InputError(f"--seconds is {arguments.seconds:g}; it must be {MIN_SECONDS:g} or more")
+    from benchmarks import live  # loaded for who does more than ask for help
+    from benchmarks.speed import Bench
+    from flowing_puppet_ros.evaluate.tables import format_table
+
     bench, figures = Bench(arguments.seed), {}
     for part in arguments.parts or PARTS:
         print(f"measuring {part}", file=sys.stderr)
-        is_live = part == LIVE
-        figures[part] = live.run(arguments.seconds, arguments.seed) if is_live else PARTS[part](bench)
+        measure = None if part == LIVE else getattr(bench, f"measure_{part.replace('-', '_')}")
+        figures[part] = measure() if measure else live.run(arguments.seconds, arguments.seed)
         if not arguments.json:
-            what = live.__doc__ if is_live else PARTS[part].__doc__
-            print(f"{part}: {what}\n{format_table(figures[part])}\n", flush=True)
+            print(f"{part}: {(measure or live).__doc__}\n{format_table(figures[part])}\n", flush=True)
     if arguments.json:
         print(json.dumps(figures))
     return 0

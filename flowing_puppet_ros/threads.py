@@ -15,13 +15,14 @@ from functools import cache, partial
 from threading import Lock
 
 import threadpoolctl
-from numba import config
 
 MAX_THREADS = 1024  # more than any machine has cores
 
 
 def usable_threads(threads: int) -> int:
     """Return at most `threads`, the cores that this process may use, and NUMBA_NUM_THREADS, which limits workers."""
+    from numba import config  # loaded here: who only parses arguments has no use for a compiler
+
     return max(1, min(threads, int(config.NUMBA_NUM_THREADS)))
 
 

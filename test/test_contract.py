@@ -51,6 +51,8 @@ OPTIONAL = {
     "evaluate.output": "report",
 }
 """Where what a requirements file other than runtime.txt lists may be imported."""
+HEAVY_PACKAGES = {"cv2", "matplotlib", "mcap", "numba", "open3d", "rclpy", "rosbags", "scipy", "sklearn"}
+"""What takes a tenth of a second or more to import."""
 MAX_FILES = 10
 """The other rooms (folders of modules) that each room imports; the layers in docs/architecture.md are made from it."""
 
@@ -170,6 +172,23 @@ class Absent:
 sys.meta_path.insert(0, Absent())
 for name in {names}:
     importlib.import_module(name)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_help_of_a_verb_loads_nothing_heavy() -> None:
+    """The parser of every verb is made where what takes long to import is absent."""
+    code = f"""
+import sys
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {sorted(HEAVY_PACKAGES)}:
+            raise ModuleNotFoundError(f"the help of {{verb}} loads {{name}}", name=name)
+sys.meta_path.insert(0, Absent())
+from flowing_puppet_ros.cli import VERBS, make_verb_parser
+for verb in VERBS:
+    make_verb_parser(verb, ["--help"])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -26,21 +26,12 @@ def pages() -> Iterator[tuple[str, str]]:
 
 
 def parsers(verb: str) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    """Yield the parser of a verb, of its sub-verbs and of its sub-commands, with the words that lead there."""
-    subverbs = getattr(import_verb(verb), "SUBVERBS", {})
-    for given in ([], *([name] for name in subverbs)):
+    """Yield the parser of a verb and of its sub-verbs, with the words that lead there."""
+    module = import_verb(verb)
+    own = [[]] if hasattr(module, "add_arguments") else []
+    for given in (*own, *([name] for name in getattr(module, "SUBVERBS", {}))):
         _, parser, _ = make_verb_parser(verb, list(given))
-        yield from below(" ".join([verb, *given]), parser)
-
-
-def below(words: str, parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.ArgumentParser]]:
-    """Yield a parser, or where it only chooses between sub-commands theirs."""
-    choices = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
-    if not choices:
-        yield words, parser
-    for action in choices:
-        for name, inner in action.choices.items():
-            yield from below(f"{words} {name}", inner)
+        yield " ".join([verb, *given]), parser
 
 
 def verb_section(words: str, parser: argparse.ArgumentParser) -> str:

@@ -15,7 +15,7 @@ from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.image.detector.part_detector import DEFAULT_SETTINGS, PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
-from flowing_puppet_ros.image.tracking.track import TrackerSettings
+from flowing_puppet_ros.image.tracking.settings import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order

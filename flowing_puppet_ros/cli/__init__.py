@@ -7,14 +7,19 @@ Arguments come in; files, tables and an exit status go out. Read `fit` first: it
 from __future__ import annotations
 
 import argparse
+import ast
 import sys
+from collections.abc import Mapping
+from contextlib import nullcontext
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.errors import InputError, PuppetError
+from flowing_puppet_ros.extras import needing_extra
 
 VERBS = {
     "fit": "fit the 3D Stitched Puppet to meshes and clouds",
@@ -65,7 +70,7 @@ EXAMPLES = {
 
 _INPUT_ARGUMENTS = ("inputs", "input", "images")
 """Names of the arguments of verbs that are inputs."""
-VERB_PACKAGES = ("doctor", "evaluate", "export", "sample")
+VERB_PACKAGES = ("doctor", "evaluate", "sample")
 """Verbs in folders of their own."""
 _MODULES = {"import": "cameras.import_folder", "calibrate": "cameras.calibrate_bag"}
 """Verbs whose module is elsewhere."""
@@ -102,12 +107,15 @@ def make_verb_parser(verb: str, arguments: list[str]) -> tuple[ModuleType, argpa
     """Return the module of a verb, its parser, and the arguments left to parse.
 
     A module may name modules of sub-verbs in `SUBVERBS`; if the first argument is one of these, its module is returned.
+    `EXTRA` names what must be installed for these. A module without `add_arguments` only chooses between them.
     """
     module, name = import_verb(verb), verb
     subverbs = getattr(module, "SUBVERBS", {})
     if arguments and arguments[0] in subverbs:
         name, arguments = f"{verb} {arguments[0]}", arguments[1:]
-        module = import_module(subverbs[name.split()[1]])
+        extra = getattr(module, "EXTRA", "")
+        with needing_extra(extra, verb) if extra else nullcontext():
+            module = import_module(subverbs[name.split()[1]])
     lines = ["examples:", *(f"  flowing-puppet {example}" for example in EXAMPLES[verb])] if name == verb else []
     parser = argparse.ArgumentParser(
         prog=f"flowing-puppet {name}",
@@ -115,8 +123,21 @@ def make_verb_parser(verb: str, arguments: list[str]) -> tuple[ModuleType, argpa
         epilog="\n".join(lines),
         formatter_class=_HelpFormatter,
     )
-    module.add_arguments(parser)
+    if hasattr(module, "add_arguments"):
+        module.add_arguments(parser)
+    else:
+        _add_subverbs(parser, subverbs)
     return module, parser, arguments
+
+
+def _add_subverbs(parser: argparse.ArgumentParser, subverbs: Mapping[str, str]) -> None:
+    """Add the names of sub-verbs (name -> module) with their modules' summaries, without loading these modules."""
+    kinds = parser.add_subparsers(required=True, metavar="|".join(subverbs))
+    for name, module in subverbs.items():
+        spec = find_spec(module)
+        assert spec is not None and spec.origin is not None
+        said = ast.get_docstring(ast.parse(Path(spec.origin).read_text("utf8"))) or ""
+        kinds.add_parser(name, help=said.partition("\n")[0].rstrip(".").replace("%", "%%"))
 
 
 def _suggest(verb: str, parsed: argparse.Namespace, error: str) -> str:

@@ -11,12 +11,9 @@ import socket
 import sys
 from pathlib import Path
 
-from flowing_puppet_ros.annotate.folder import ImageFolder
-from flowing_puppet_ros.annotate.store import AnnotationStore
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.extras import needing_extra
-from flowing_puppet_ros.image.networks.choice import IMAGE_SIDE_PX, SOURCE_HELP, SOURCES, load_networks
-from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
+from flowing_puppet_ros.image.networks.sources import IMAGE_SIDE_PX, SOURCE_HELP, SOURCES
 
 WILDCARDS = ("", "0.0.0.0", "::")
 
@@ -37,7 +34,11 @@ def run(arguments: argparse.Namespace) -> int:
     with needing_extra("annotate", "annotate"):
         import waitress
 
+        from flowing_puppet_ros.annotate.folder import ImageFolder
         from flowing_puppet_ros.annotate.server import MAX_REQUEST_BYTES, make_app
+        from flowing_puppet_ros.annotate.store import AnnotationStore
+        from flowing_puppet_ros.image.networks.choice import load_networks
+        from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
     if arguments.host in WILDCARDS:
         raise InputError(f"--host {arguments.host} does not name a machine; give the address that the browser will use")
     folder = ImageFolder(arguments.folder)

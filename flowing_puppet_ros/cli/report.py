@@ -6,8 +6,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from flowing_puppet_ros.report.report import write_report
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `flowing-puppet report`."""
@@ -21,6 +19,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write the report and print its path."""
+    from flowing_puppet_ros.report.report import write_report  # loaded for who does more than ask for help
+
     write_report(arguments.input or arguments.output, arguments.output, arguments.out, picture=arguments.picture)
     print(arguments.out)
     return 0

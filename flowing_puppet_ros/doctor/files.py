@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 
 from flowing_puppet_ros.bag.storage.paths import is_bag
-from flowing_puppet_ros.body.scans.scan import SCAN_SUFFIXES, SUFFIXES, Scan, read_scan
+from flowing_puppet_ros.body.scans.names import SCAN_SUFFIXES, SUFFIXES, UNITS
+from flowing_puppet_ros.body.scans.scan import Scan, read_scan
 from flowing_puppet_ros.body.scans.unit import (
     GUESS,
     MAX_ADULT_EXTENT_M,
     MAX_SCENE_EXTENT_M,
     METRIC_UNITS,
-    UNITS,
     is_closed,
     propose_units,
 )

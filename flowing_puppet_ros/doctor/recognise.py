@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from flowing_puppet_ros.bag.storage.paths import is_bag
-from flowing_puppet_ros.body.scans.scan import SCAN_SUFFIXES, SUFFIXES
+from flowing_puppet_ros.body.scans.names import SCAN_SUFFIXES, SUFFIXES
 from flowing_puppet_ros.image.formats.video_reader import IMAGE_SUFFIXES
 
 

@@ -14,8 +14,8 @@ from flowing_puppet_ros.bag.unused import explain_unused
 from flowing_puppet_ros.doctor.finding import Inspection
 from flowing_puppet_ros.doctor.topic_samples import TopicSample, compare_clocks, describe_faults, sample_topics
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED
 from flowing_puppet_ros.image.networks.files import FILES, find_file
+from flowing_puppet_ros.image.networks.sources import NOT_INSTALLED
 from flowing_puppet_ros.stream.component import base_topic
 from flowing_puppet_ros.stream.messages.message_types import (
     CAMERA_INFO,

@@ -7,14 +7,14 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from flowing_puppet_ros.exchange.body_json import write_json
 from flowing_puppet_ros.exchange.bvh import write_bvh
 from flowing_puppet_ros.exchange.glb import write_glb
 from flowing_puppet_ros.exchange.motion import BodyMotion
-from flowing_puppet_ros.exchange.obj import write_obj
 from flowing_puppet_ros.exchange.trc import write_trc
 
-FORMATS = ("glb", "bvh", "obj", "trc", "json")
 _WRITERS = {"glb": write_glb, "bvh": write_bvh, "trc": write_trc}
 
 
@@ -45,3 +45,14 @@ def _write_meshes(folder: Path, name: str, person: BodyMotion) -> list[Path]:
     for frame, stem in enumerate(stems):
         write_obj(folder / f"{stem}.obj", person, frame)
     return [folder / f"{stem}.obj" for stem in stems]
+
+
+def write_obj(path: Path, motion: BodyMotion, frame: int) -> None:
+    """Write the mesh of one frame, metres, y up, with a group for each part."""
+    model = motion.model
+    lines = [f"# {motion.name}: metres, y up", *(f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in motion.vertices[frame])]
+    part_of_face = np.sort(model.part_of_vertex[model.faces], axis=1)[:, 1]  # of two corners at least
+    for part, name in enumerate(model.tree.names):
+        lines.append(f"g {name}")
+        lines += [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in model.faces[part_of_face == part]]
+    path.write_text("\n".join(lines) + "\n", "utf8")

@@ -8,15 +8,14 @@ The estimator is OpenCV's DIS (Kroeger et al., "Fast Optical Flow using Dense In
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from flowing_puppet_ros.arrays import U8, Flow
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.images import as_image
-from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.threads import one_opencv_thread
 
 type FlowPair = tuple[Flow, Flow]
@@ -27,14 +26,6 @@ PRESETS = {
     "medium": cv2.DISOPTICAL_FLOW_PRESET_MEDIUM,
 }
 MIN_SIDE_PX = 16  # of an image, as given and as reduced
-
-
-@dataclass(frozen=True)
-class FlowSettings(Settings):
-    """How the dense flow is computed."""
-
-    preset: str = setting("medium", "DIS preset: medium is more accurate, fast is for live use", choices=(*PRESETS,))
-    max_side: int = setting(640, "longest image side the flow is computed at", unit="px", low=32, high=8192)
 
 
 def working_size(shape: tuple[int, ...], max_side: int) -> tuple[int, int]:

@@ -12,9 +12,8 @@ import trimesh
 
 from flowing_puppet_ros.exchange.bones import BONES, NAMES
 from flowing_puppet_ros.exchange.bvh import write_bvh
-from flowing_puppet_ros.exchange.files import write_people
+from flowing_puppet_ros.exchange.files import write_obj, write_people
 from flowing_puppet_ros.exchange.motion import BodyMotion
-from flowing_puppet_ros.exchange.obj import write_obj
 from flowing_puppet_ros.exchange.trc import write_trc
 
 

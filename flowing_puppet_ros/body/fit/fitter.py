@@ -15,7 +15,7 @@ from flowing_puppet_ros.body.cloud.limb_crop import crop_to_limbs
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
 from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleViewCloud
-from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings, Progress, sub_progress
+from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, Progress, sub_progress
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.quality import assess_fit
 from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility, judge_visibility, rate_joints
@@ -24,6 +24,7 @@ from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNe
 from flowing_puppet_ros.body.refine.hand_pose import refine_hand_pose
 from flowing_puppet_ros.body.refine.nonrigid import NonRigidRefinement, NonRigidWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, ExactCloud
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField

@@ -29,9 +29,9 @@ from flowing_puppet_ros.body.search.part_points import build_part_points
 from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer, WalkNoise
 from flowing_puppet_ros.body.search.schedule import four_stages, local_stages
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.threads import parallel_map, usable_threads
 
 Progress = Callable[[float], None]
@@ -58,49 +58,6 @@ WARM_UP_SHARE = 0.1
 SURE_COST_M = 0.01
 # Cost of a body turned to the other heading, in costs of the body itself, from which on no search around it helps.
 MAX_TURNED_RATIO = 1.3
-
-
-@dataclass(frozen=True, slots=True)
-class FitterSettings(Settings):
-    """Settings of `BodyFitter`; the defaults are fast, the thesis has 80 particles and 120 iterations."""
-
-    particles: int = setting(20, "particles per part", low=4, high=1000)
-    iterations: int = setting(25, "iterations of the search when the pose is unknown", low=1, high=10000)
-    local_particles: int = setting(
-        20, "particles per part when the pose is roughly known", low=4, high=1000, advanced=True
-    )
-    local_iterations: int = setting(
-        16, "iterations of the search when the pose is roughly known", low=0, high=10000, advanced=True
-    )
-    levenberg_steps: int = setting(4, "Levenberg-Marquardt steps per new particle", low=0, high=50, advanced=True)
-    gauss_newton_steps: int = setting(15, "Gauss-Newton steps of the final refinement", low=0, high=200, advanced=True)
-    max_points: int = setting(10000, "points that a cloud is downsampled to", low=200, high=200000, advanced=True)
-    joint_weight: float = setting(
-        0.02, "weight of an initial joint relative to the whole cloud", low=0.0, high=100.0, advanced=True
-    )
-    clip_factor: float = setting(
-        2.0,
-        "limb radii around the initial joints' bones to which a cloud is cropped; 0: not cropped",
-        low=0.0,
-        high=20.0,
-        advanced=True,
-    )
-    restarts: int = setting(
-        1,
-        "larger searches from new starts while no body is close to the cloud and reliable",
-        low=0,
-        high=20,
-        advanced=True,
-    )
-    restart_distance: float = setting(
-        0.02, "two-way distance below which a body is close to the cloud", unit="m", low=0.0, high=1.0, advanced=True
-    )
-    max_limb_repairs: int = setting(
-        3, "maximum rounds in which limbs that seem misplaced are searched again", low=0, high=20, advanced=True
-    )
-    nonrigid: bool = setting(True, "refine the surface beyond the model where a whole cloud is dense", advanced=True)
-    threads: int = setting(2, "threads, at most one per core; the result does not depend on it", low=1, high=64)
-    seed: int = setting(0, "seed of all random draws", low=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

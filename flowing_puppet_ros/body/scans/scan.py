@@ -15,11 +15,9 @@ from flowing_puppet_ros.body.scans.formats.pcd import read_pcd
 from flowing_puppet_ros.body.scans.formats.ply import read_ply
 from flowing_puppet_ros.body.scans.formats.stl import read_stl
 from flowing_puppet_ros.body.scans.formats.tables import read_lidar_scan, read_numpy, read_text_table
+from flowing_puppet_ros.body.scans.names import SUFFIXES
 from flowing_puppet_ros.errors import InputError
 
-SCAN_SUFFIXES = (".ply", ".obj", ".off", ".stl", ".glb", ".gltf", ".pcd", ".xyz", ".npy", ".npz", ".asc", ".pts")
-SUFFIXES = (*SCAN_SUFFIXES, ".txt", ".csv", ".bin")
-"""Suffixes that are read; in a folder only `SCAN_SUFFIXES`, since the others may be anything."""
 MESH_READERS = {".obj": read_obj, ".off": read_off, ".stl": read_stl, ".glb": read_gltf, ".gltf": read_gltf}
 """Readers of vertices and triangles by suffix."""
 PACKED = {

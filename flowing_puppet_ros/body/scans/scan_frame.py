@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowing_puppet_ros.body.scans.names import UP_AXES
 from flowing_puppet_ros.model import rotation as so3
 
-UP_AXES = ("z", "y", "-y", "-z", "x", "-x")
-"""Axes that may point up, the likelier first; -y in optical frames (REP-103)."""
 SAME_AXIS_COSINE = np.cos(np.radians(15.0))
 """Cosine of the angle to an axis from which on a direction counts as that axis."""
 

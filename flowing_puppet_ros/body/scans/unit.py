@@ -7,10 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowing_puppet_ros.body.scans.names import UNITS
 from flowing_puppet_ros.body.scans.scan import Scan
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""Metres per unit."""
 METRIC_UNITS = ("m", "cm", "mm")
 GUESS = "guess"
 """The unit of scans whose size was changed: metres per unit follow from an adult's size."""

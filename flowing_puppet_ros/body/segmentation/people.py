@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence, Set
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -12,8 +11,8 @@ from scipy.spatial import cKDTree
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.segmentation.linkage import link_within
 from flowing_puppet_ros.body.segmentation.planes import Plane, PlaneCache, find_planes, is_clear_of_planes
+from flowing_puppet_ros.body.settings import SegmentationSettings
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.settings import Settings, setting
 
 VOXELS_PER_GAP = 2.5  # voxel edges in `max_gap`
 MAX_GAP_RANGE_M = 4.0
@@ -29,34 +28,6 @@ MAX_OWN_DISTANCE_M, MIN_CLAIM_SHARE, MIN_WHOLE_SHARE = 0.25, 0.1, 0.5
 points, and from which on the whole cluster."""
 FLOOR_GAP_LIMITS_M = (0.5, 1.2)
 """Height of the lowest point above the floor up to which a cluster scores 1, and from which on it is not a person."""
-
-
-@dataclass(frozen=True)
-class SegmentationSettings(Settings):
-    """Settings of `segment_people`."""
-
-    max_people: int = setting(20, "maximum number of people taken from a cloud, by score", low=1, high=100)
-    max_range: float = setting(
-        30.0, "distance from the sensor beyond which points are dropped", unit="m", low=0.5, high=1000.0
-    )
-    plane_clearance: float = setting(
-        0.05,
-        "distance from the floor or a wall up to which points belong to it",
-        unit="m",
-        low=0.005,
-        high=0.5,
-        advanced=True,
-    )
-    max_gap: float = setting(
-        0.12,
-        "maximum gap between points of one person up to 4 m from the sensor; grows with distance beyond",
-        unit="m",
-        low=0.02,
-        high=1.0,
-        advanced=True,
-    )
-    min_points: int = setting(60, "minimum number of points of a person", low=50, high=100000, advanced=True)
-    min_score: float = setting(0.5, "minimum score of a cluster to count as a person", low=0.0, high=1.0, advanced=True)
 
 
 def segment_people(

@@ -10,8 +10,9 @@ import numpy as np
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, rotation_to_z_up
-from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
+from flowing_puppet_ros.body.segmentation.people import segment_people
 from flowing_puppet_ros.body.segmentation.planes import find_wall
+from flowing_puppet_ros.body.settings import SegmentationSettings
 
 MAX_COMPARED = 3  # likeliest people of each direction by which directions are compared
 MAX_SAME_SHARE = 0.5  # of the points of a person, found before with another direction up

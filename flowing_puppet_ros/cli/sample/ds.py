@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from flowing_puppet_ros.cli.sample.samples import add_common_arguments, draw_samples
 from flowing_puppet_ros.draw.overlay import DrawnPuppet, draw_puppets
 from flowing_puppet_ros.draw.pictures import make_contact_sheet, save
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
@@ -26,9 +27,15 @@ ALL = "all"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the flags of `sample ds`."""
+    add_common_arguments(parser, FILES)
     parser.add_argument("--parts", type=int, choices=tuple(JOINT_NAMES), default=10, help="parts [%(default)s]")
     views = "side the torso faces, on a map with the camera in the south; all: the likely puppet of every side"
     parser.add_argument("--view", choices=(*VIEW_NAMES, ALL), help=f"{views} [near S]")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw the samples, print the paths of the files and return the exit status."""
+    return draw_samples(arguments, draw)
 
 
 def draw(arguments: argparse.Namespace, rng: np.random.Generator) -> Iterator[Path]:

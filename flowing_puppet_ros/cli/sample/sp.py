@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from flowing_puppet_ros.body.scans.scan import write_ply
+from flowing_puppet_ros.cli.sample.samples import add_common_arguments, draw_samples
 from flowing_puppet_ros.draw.mesh_render import fit_orthographic_camera, render
 from flowing_puppet_ros.draw.palette import part_colours
 from flowing_puppet_ros.draw.pictures import make_contact_sheet, save
@@ -23,7 +24,13 @@ FILES = "sp_GENDER_000.ply ... and sp_GENDER.png"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add no flags: `sample sp` has none of its own."""
+    """Add the flags of `sample sp`."""
+    add_common_arguments(parser, FILES)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw the samples, print the paths of the files and return the exit status."""
+    return draw_samples(arguments, draw)
 
 
 def draw(arguments: argparse.Namespace, rng: np.random.Generator) -> Iterator[Path]:

@@ -22,7 +22,7 @@ from ruamel.yaml.error import YAMLError
 
 from flowing_puppet_ros.arrays import F64, U8
 from flowing_puppet_ros.body.scans.formats.pcd import read_pcd
-from flowing_puppet_ros.body.scans.unit import UNITS
+from flowing_puppet_ros.body.scans.names import UNITS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorProjection

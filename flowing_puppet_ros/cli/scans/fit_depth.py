@@ -13,8 +13,9 @@ import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, measure_stature
+from flowing_puppet_ros.body.scans.names import UNITS
 from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, parse_axis, rotation_to_z_up
-from flowing_puppet_ros.body.scans.unit import UNITS, ScanUnit
+from flowing_puppet_ros.body.scans.unit import ScanUnit
 from flowing_puppet_ros.cli.scans.depth_view import (
     DepthView,
     is_depth_image,
@@ -29,7 +30,8 @@ from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, place_joints
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.networks.choice import IMAGE_SIDE_PX, are_installed, load_networks
+from flowing_puppet_ros.image.networks.choice import are_installed, load_networks
+from flowing_puppet_ros.image.networks.sources import IMAGE_SIDE_PX
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 MAX_POINTS = 80_000  # of an image, evenly thinned

@@ -14,12 +14,14 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings, Progress
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, Progress
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, fit_in_best_frame, measure_stature
 from flowing_puppet_ros.body.measurements.measure import DEFINITIONS, measure_fit
 from flowing_puppet_ros.body.refine.body_beneath import measure_gaps, measure_part_gaps
-from flowing_puppet_ros.body.scans.scan import SUFFIXES, Scan, read_scan, to_smallest_float, write_ply
+from flowing_puppet_ros.body.scans.names import SUFFIXES
+from flowing_puppet_ros.body.scans.scan import Scan, read_scan, to_smallest_float, write_ply
 from flowing_puppet_ros.body.scans.unit import GUESS, ScanUnit, has_size_of_person
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson, find_people, list_scene_ups
 from flowing_puppet_ros.cli.scans.given_joints import fit_from_joints
 from flowing_puppet_ros.draw.palette import part_colours

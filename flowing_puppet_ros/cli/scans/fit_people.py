@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.up_axis_search import choose_up_axis, explain_roughly
+from flowing_puppet_ros.body.scans.names import UNITS
 from flowing_puppet_ros.body.scans.scan import Scan
 from flowing_puppet_ros.body.scans.scan_frame import parse_axis, propose_up_axes
 from flowing_puppet_ros.body.scans.unit import (
@@ -19,7 +20,6 @@ from flowing_puppet_ros.body.scans.unit import (
     MAX_SCENE_EXTENT_M,
     METRIC_UNITS,
     MIN_SCENE_EXTENT_M,
-    UNITS,
     ScanUnit,
     is_closed,
     propose_named_unit,
@@ -27,9 +27,9 @@ from flowing_puppet_ros.body.scans.unit import (
     propose_units,
 )
 from flowing_puppet_ros.body.scans.viewpoint import choose_viewpoint, find_viewpoint, is_seen_from
-from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
 from flowing_puppet_ros.body.segmentation.pieces import Pieces, split_pieces
 from flowing_puppet_ros.body.segmentation.up_axis import has_floor, segment_people_unknown_up
+from flowing_puppet_ros.body.settings import FitterSettings, SegmentationSettings
 from flowing_puppet_ros.errors import InputError, PuppetError
 
 MAX_SCENE_POINTS = 300_000  # sampled from a scene

@@ -9,7 +9,7 @@ import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, rotation_to_z_up
-from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
+from flowing_puppet_ros.body.settings import SegmentationSettings
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 

@@ -13,7 +13,8 @@ import numpy as np
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
 from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, measure_stature
-from flowing_puppet_ros.body.scans.scan_frame import UP_AXES, ScanFrame, parse_axis, rotation_to_z_up
+from flowing_puppet_ros.body.scans.names import UP_AXES
+from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.scans.unit import GUESS
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions, ScanPerson
 from flowing_puppet_ros.errors import InputError

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.body.scans.scan import SCAN_SUFFIXES, Scan, read_scan
+from flowing_puppet_ros.body.scans.names import SCAN_SUFFIXES
+from flowing_puppet_ros.body.scans.scan import Scan, read_scan
 from flowing_puppet_ros.body.scans.scan_correspondence import correspond
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet

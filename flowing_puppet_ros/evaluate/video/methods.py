@@ -21,17 +21,18 @@ from flowing_puppet_ros.flow.estimate import FlowPair, working_size
 from flowing_puppet_ros.image.arms.evidence import ArmEvidenceModel
 from flowing_puppet_ros.image.detector.detection import PersonCandidate, PersonDetection
 from flowing_puppet_ros.image.detector.interface import DetectorLike
-from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
+from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame
 from flowing_puppet_ros.image.networks.choice import are_installed, load_networks
 from flowing_puppet_ros.image.networks.files import REMEDY
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
+from flowing_puppet_ros.image.settings import DetectorSettings
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
-from flowing_puppet_ros.image.video.clip import Clip, ClipSettings, Method, TrackedFrame, track_clip, track_live
+from flowing_puppet_ros.image.video.clip import Clip, Method, TrackedFrame, track_clip, track_live
 from flowing_puppet_ros.image.video.detection_worker import DetectionWorker
 from flowing_puppet_ros.image.video.pending_detection import FRAME_NS
-from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
+from flowing_puppet_ros.image.video.settings import ClipSettings, LiveDetectionSettings
 from flowing_puppet_ros.image.video.tracklets import FIRST
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures

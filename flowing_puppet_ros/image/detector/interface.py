@@ -8,7 +8,7 @@ from typing import Protocol
 
 from flowing_puppet_ros.arrays import Image
 from flowing_puppet_ros.image.detector.detection import PersonCandidate, PersonDetection
-from flowing_puppet_ros.image.detector.part_detector import DetectorSettings
+from flowing_puppet_ros.image.settings import DetectorSettings
 
 
 class DetectorLike(Protocol):

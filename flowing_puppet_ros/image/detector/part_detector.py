@@ -35,27 +35,13 @@ from flowing_puppet_ros.image.detector.scoring import (
     suppress_duplicates,
 )
 from flowing_puppet_ros.image.detector.skin_features import skin_features
+from flowing_puppet_ros.image.settings import DetectorSettings
 from flowing_puppet_ros.images import as_image
 from flowing_puppet_ros.model import weights
-from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.threads import one_blas_thread
 
 WEIGHTS = "upper"
 MIN_SIDE_PX = 24  # nothing is found in a smaller image
-
-
-@dataclass(frozen=True, slots=True)
-class DetectorSettings(Settings):
-    """Which people to detect, and with how much effort."""
-
-    min_shoulder_width: float = setting(
-        0.0, "minimum shoulder width; 0: a twentieth of the longer image side", unit="px", low=0.0, high=1e5
-    )
-    max_side: int = setting(720, "longest image side at which people are detected", unit="px", low=64, high=4096)
-    max_candidates: int = setting(12, "maximum number of candidates for which a pose is searched", low=1, high=80)
-    max_people: int = setting(8, "maximum number of people", low=1, high=80)
-    mirrored: bool = setting(True, "also detect in the mirror image: more accurate, twice as slow")
-    min_confidence: float = setting(0.03, "minimum probability of a person", low=0.0, high=1.0)
 
 
 DEFAULT_SETTINGS = DetectorSettings()

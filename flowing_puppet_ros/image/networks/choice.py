@@ -7,21 +7,9 @@ import importlib.util
 from functools import cache
 from pathlib import Path
 
-from flowing_puppet_ros.image.networks.files import FILES, REMEDY, find_file
+from flowing_puppet_ros.image.networks.files import FILES, find_file
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointNetworks, KeypointSource
 from flowing_puppet_ros.image.networks.user_network import UserNetwork
-
-IMAGE_SIDE_PX = 320
-"""Longer side of a single image as the networks see it: more than in video, where the next image is another chance."""
-SOURCES = ("auto", "neural", "own")
-SOURCE_HELP = (
-    "who finds people: neural, keypoint networks; own, the package's detector; auto, the networks if installed [auto]"
-)
-NETWORK_HELP = "description file (YAML) of a keypoint network of your own, ONNX or TFLite, in place of the package's"
-NOT_INSTALLED = (
-    "keypoint networks are not installed, people are found by the package's own detector, which knows upper bodies"
-    f" from the front only: {REMEDY}"
-)
 
 
 def are_installed() -> bool:

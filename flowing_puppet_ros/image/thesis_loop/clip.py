@@ -18,10 +18,11 @@ from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arms.evidence import person_window
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.pose.evidence import KeypointPerson, LikelihoodLike, PersonHypotheses, PersonWindow
-from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FrameEvidence
+from flowing_puppet_ros.image.thesis_loop.energy import FrameEvidence
 from flowing_puppet_ros.image.thesis_loop.flow_moments import FlowMoments
 from flowing_puppet_ros.image.thesis_loop.hand_maps import make_hand_maps
-from flowing_puppet_ros.image.thesis_loop.loop import InitialPose, LoopSettings, ThesisLoop
+from flowing_puppet_ros.image.thesis_loop.loop import InitialPose, ThesisLoop
+from flowing_puppet_ros.image.thesis_loop.settings import EnergySettings, LoopSettings
 from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures

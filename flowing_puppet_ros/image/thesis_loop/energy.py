@@ -17,34 +17,12 @@ from flowing_puppet_ros.evidence.image.hands import HandMaps, hand_score
 from flowing_puppet_ros.evidence.image.likelihood import ImageEvidence
 from flowing_puppet_ros.image.pose.evidence import PersonHypotheses, PersonWindow
 from flowing_puppet_ros.image.thesis_loop.flow_moments import FlowMoments
+from flowing_puppet_ros.image.thesis_loop.settings import EnergySettings
 from flowing_puppet_ros.image.thesis_loop.upper_body import UpperBodyParameters
 from flowing_puppet_ros.image.tracking.propagation import part_membership
-from flowing_puppet_ros.settings import Settings, setting
 
 TERMS = ("contour", "colour", "hands", "detector")
 SCORED_JOINTS = tuple(f"{side}_{name}" for name in ("shoulder", "elbow", "wrist") for side in ("right", "left"))
-
-
-@dataclass(frozen=True, slots=True)
-class EnergySettings(Settings):
-    """Weights of the terms of Eq. 35, and how far a puppet is propagated for its evidence in neighbouring images.
-
-    The weights come from `flowing-puppet learn flowing`, see weights/flowing_weights.md; the detector's is set by hand.
-    """
-
-    prior_weight: float = setting(0.15, "weight of the body model's prior", low=0.0, high=100.0)
-    contour_weight: float = setting(1.0, "weight of the contours", low=0.0, high=100.0)
-    colour_weight: float = setting(0.6, "weight of skin and torso colour", low=0.0, high=100.0)
-    hand_weight: float = setting(1.0, "weight of the hand detectors", low=0.0, high=100.0)
-    score_weight: float = setting(3.0, "weight of the detector's score of each arm joint", low=0.0, high=100.0)
-    forward_flow: bool = setting(True, "use the evidence at the puppet propagated forward by the flow")
-    backward_flow: bool = setting(True, "use the evidence at the puppet propagated backward by the flow")
-    flow_steps: int = setting(1, "images by which the flow propagates a puppet for its evidence", low=1, high=10)
-
-    @property
-    def weights(self) -> F64:
-        """Weights (4,) of TERMS."""
-        return np.array([self.contour_weight, self.colour_weight, self.hand_weight, self.score_weight])
 
 
 @dataclass(slots=True, eq=False)

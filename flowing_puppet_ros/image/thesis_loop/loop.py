@@ -15,13 +15,13 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
-from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings, FlowingEnergy, FrameEvidence, propagate_joints
+from flowing_puppet_ros.image.thesis_loop.energy import FlowingEnergy, FrameEvidence, propagate_joints
+from flowing_puppet_ros.image.thesis_loop.settings import EnergySettings, LoopSettings
 from flowing_puppet_ros.image.thesis_loop.upper_body import PARTS, UpperBodyParameters
 from flowing_puppet_ros.image.thesis_loop.wrist_proposals import WristProposals
 from flowing_puppet_ros.inference.swarm import Swarm, resample, search
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
-from flowing_puppet_ros.settings import Settings, setting
 
 STAGES: tuple[tuple[str, ...], ...] = (PARTS[:4], PARTS)
 """Parts that move in each stage of the hierarchical search: torso, head and right arm, then all."""
@@ -32,24 +32,6 @@ deviations, px, log of the scale."""
 
 MAX_MODES = 10  # poses of the detector to start from
 AGREEMENT_DISTANCE_M = 0.1  # within which particles agree on a joint
-
-
-@dataclass(frozen=True, slots=True)
-class LoopSettings(Settings):
-    """How long the particles are searched for; the thesis has P = 40, M = 5, R = 8 and three seeds."""
-
-    particles: int = setting(40, "particles per image, P", low=2, high=1000)
-    max_propagated: int = setting(5, "best particles propagated to the neighbouring images, M", low=0, high=100)
-    rounds: int = setting(8, "rounds of search and propagation, R", low=1, high=100)
-    restarts: int = setting(3, "independent runs, of which the one of minimum energy is taken", low=1, high=100)
-    iterations: int = setting(3, "steps of the swarm in each stage of a round", low=1, high=1000)
-    jump_probability: float = setting(
-        0.5, "probability that a particle draws a wrist instead of moving", low=0.0, high=1.0
-    )
-    temperature: float = setting(
-        2.0, "energy difference at which a particle is drawn 1/e times as often", low=0.01, high=1e3
-    )
-    seed: int = setting(0, "seed of all random draws", low=0, high=1_000_000)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,8 @@ from flowing_puppet_ros.arrays import F64, U16, Flow
 from flowing_puppet_ros.flow.affine import RegionMotions, apply_affine
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.flow.puppet_flow import PuppetFlow, explained_fraction, fit_part_motions, motion_field
-from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
+from flowing_puppet_ros.image.tracking.settings import TrackerSettings
+from flowing_puppet_ros.image.tracking.track import Track
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order, render_labels
 from flowing_puppet_ros.model.ds.shape import PuppetShape

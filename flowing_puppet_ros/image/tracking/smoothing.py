@@ -12,30 +12,17 @@ trades jitter for error.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
 from flowing_puppet_ros.arrays import F32, F64
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.tracking.propagation import ImageScale
-from flowing_puppet_ros.settings import Settings, setting
+from flowing_puppet_ros.image.tracking.settings import SmoothingSettings
 
 REWEIGHTINGS = 6  # iterations of the robust fit
 DISAGREEMENT_PX = 2.0  # on the flow's grid; a flow with this forward-backward error counts half
 _START_WEIGHT = 1e-6  # keeps joints with neither detection nor flow at their start
-
-
-@dataclass(frozen=True)
-class SmoothingSettings(Settings):
-    """How joints are smoothed over time."""
-
-    flow_weight: float = setting(10.0, "weight of the flow relative to the detections", low=0.0, high=1000.0)
-    detection_width: float = setting(0.016, "distance beyond which a detection counts less", unit="m",
-                                     low=0.001, high=1.0)  # fmt: skip
-    flow_width: float = setting(0.005, "distance beyond which the flow counts less", unit="m",
-                                low=0.0005, high=1.0)  # fmt: skip
 
 
 def flow_at_joints(flow: FlowPair, grid: ImageScale, before: F64, after: F64) -> tuple[F64, F64]:

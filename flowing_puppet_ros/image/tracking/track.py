@@ -9,9 +9,9 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.image.tracking.heading import HeadingFilter
+from flowing_puppet_ros.image.tracking.settings import TrackerSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import PuppetShape, View
-from flowing_puppet_ros.settings import Settings, setting
 
 UNKNOWN_DEVIATION_M = 0.25  # a joint this uncertain is placed by the body model instead
 CONFIDENT_DEVIATION_M = 0.1  # confidence halves at this standard deviation
@@ -21,46 +21,6 @@ SCALE_GAIN = 0.1  # share of the new scale estimate taken at each detection
 MIN_OVERRIDE_M = 0.06  # `Track.override_joint` ignores smaller moves
 APPEARANCE_GAIN = 0.2  # share of the newly seen colours taken at each detection
 OPEN_GATE_AGE = 1_000  # images without a detection after which any detected position passes the gate
-
-
-@dataclass(frozen=True)
-class TrackerSettings(Settings):
-    """How people are propagated, corrected by detections, started and dropped."""
-
-    detection_deviation: float = setting(
-        0.015,
-        "standard deviation of a detected joint of confidence 1",
-        unit="m",
-        low=0.001,
-        high=0.5,
-        advanced=True,
-    )
-    flow_deviation: float = setting(
-        0.007,
-        "standard deviation that the flow adds to a joint in each image",
-        unit="m",
-        low=0.0005,
-        high=0.5,
-        advanced=True,
-    )
-    gate: float = setting(3.5, "standard deviations beyond which a detected joint is an outlier", low=1.0, high=100.0)
-    outliers_to_accept: int = setting(
-        3, "outliers in a row at one place after which the joint moves there", low=1, high=100, advanced=True
-    )
-    match_distance: float = setting(
-        0.5, "maximum median distance of joints between a detection and its track", unit="m", low=0.01, high=10.0
-    )
-    min_joints: int = setting(
-        5, "minimum number of known joints of a detection that starts a track", low=3, high=15, advanced=True
-    )
-    max_people: int = setting(8, "maximum number of people tracked at once", low=1, high=100)
-    max_unmatched_images: int = setting(
-        300, "images without a matched detection after which a track is dropped", low=1, high=100000
-    )
-    max_missed_detections: int = setting(
-        15, "detector runs without a match after which a track is dropped", low=1, high=100000
-    )
-    seed: int = setting(0, "picks the letters that ids begin with", low=0, high=1_000_000)
 
 
 @dataclass(slots=True, eq=False)

@@ -14,15 +14,9 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, U8, Bools
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.flow.estimate import (
-    MIN_SIDE_PX,
-    FlowPair,
-    FlowSettings,
-    OpticalFlow,
-    resize_flow,
-    working_size,
-)
+from flowing_puppet_ros.flow.estimate import MIN_SIDE_PX, FlowPair, OpticalFlow, resize_flow, working_size
 from flowing_puppet_ros.flow.puppet_flow import PuppetFlow
+from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
 from flowing_puppet_ros.image.tracking.appearance import TorsoAppearance, find_overlapping, torso_appearances
@@ -35,8 +29,9 @@ from flowing_puppet_ros.image.tracking.propagation import (
     render_label_map,
     render_tracks,
 )
+from flowing_puppet_ros.image.tracking.settings import TrackerSettings
 from flowing_puppet_ros.image.tracking.shot_boundary import colour_histogram, is_cut
-from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
+from flowing_puppet_ros.image.tracking.track import Track
 from flowing_puppet_ros.images import as_image
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures

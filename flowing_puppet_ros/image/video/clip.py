@@ -18,28 +18,27 @@ from typing import Any, Literal
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.hands import HandDetectors
 from flowing_puppet_ros.evidence.image.likelihood import PartLikelihood
-from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings
+from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.image.arms.evidence import ArmEvidenceModel
-from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.thesis_loop.clip import ThesisClip, evidence_from_keypoints
-from flowing_puppet_ros.image.thesis_loop.energy import EnergySettings
-from flowing_puppet_ros.image.thesis_loop.loop import LoopSettings
-from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings
-from flowing_puppet_ros.image.tracking.track import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackedPuppet, TrackResult
 from flowing_puppet_ros.image.video.detection_worker import DetectionWorker
 from flowing_puppet_ros.image.video.live_tracker import LiveTracker
 from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
 from flowing_puppet_ros.image.video.offline_smoother import OfflineSmoother
-from flowing_puppet_ros.image.video.settings import EVERY_IMAGE, ClipDetectionSettings, LiveDetectionSettings
+from flowing_puppet_ros.image.video.settings import (
+    EVERY_IMAGE,
+    ClipDetectionSettings,
+    ClipSettings,
+    LiveDetectionSettings,
+)
 from flowing_puppet_ros.image.video.tracklets import Tracklet, TrackletLinker
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-from flowing_puppet_ros.settings import Settings, nested
 from flowing_puppet_ros.threads import one_opencv_thread
 
 type Method = Literal["smoothed", "thesis"]
@@ -47,26 +46,6 @@ type DetectedFrame = tuple[VideoFrame, Sequence[Keypoints] | None]
 """A frame and the people that somebody found in it; None where nobody looked."""
 type Progress = Callable[[Iterable[DetectedFrame], str], Iterable[DetectedFrame]]
 """Passes frames through and shows how far they are, under a title."""
-
-
-@dataclass(frozen=True)
-class ThesisSettings(Settings):
-    """Settings of the loop of the thesis."""
-
-    loop: LoopSettings = nested(LoopSettings)
-    energy: EnergySettings = nested(EnergySettings)
-
-
-@dataclass(frozen=True)
-class ClipSettings(Settings):
-    """Settings of all that a clip goes through."""
-
-    tracker: TrackerSettings = nested(TrackerSettings)
-    flow: FlowSettings = nested(FlowSettings)
-    detection: ClipDetectionSettings = nested(ClipDetectionSettings)
-    arms: ArmPathSettings = nested(ArmPathSettings)
-    smoothing: SmoothingSettings = nested(SmoothingSettings)
-    thesis: ThesisSettings = nested(ThesisSettings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

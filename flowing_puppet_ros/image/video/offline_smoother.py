@@ -17,7 +17,8 @@ from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.image.arms.evidence import ARM_JOINTS, ArmEvidence
 from flowing_puppet_ros.image.arms.hypotheses import ArmSmoother
 from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
-from flowing_puppet_ros.image.tracking.smoothing import SmoothingSettings, flow_at_joints, smooth_joints
+from flowing_puppet_ros.image.tracking.settings import SmoothingSettings
+from flowing_puppet_ros.image.tracking.smoothing import flow_at_joints, smooth_joints
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 

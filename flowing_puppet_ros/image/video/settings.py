@@ -5,6 +5,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from flowing_puppet_ros.flow.settings import FlowSettings
+from flowing_puppet_ros.image.arms.viterbi import ArmPathSettings
+from flowing_puppet_ros.image.thesis_loop.settings import EnergySettings, LoopSettings
+from flowing_puppet_ros.image.tracking.settings import SmoothingSettings, TrackerSettings
 from flowing_puppet_ros.settings import Settings, nested, setting
 
 
@@ -112,3 +116,23 @@ class ClipDetectionSettings(Settings):
         high=1.0,
     )
     stride: int = setting(2, "images from one full-frame detection to the next", low=1, high=10000)
+
+
+@dataclass(frozen=True)
+class ThesisSettings(Settings):
+    """Settings of the loop of the thesis."""
+
+    loop: LoopSettings = nested(LoopSettings)
+    energy: EnergySettings = nested(EnergySettings)
+
+
+@dataclass(frozen=True)
+class ClipSettings(Settings):
+    """Settings of all that a clip goes through."""
+
+    tracker: TrackerSettings = nested(TrackerSettings)
+    flow: FlowSettings = nested(FlowSettings)
+    detection: ClipDetectionSettings = nested(ClipDetectionSettings)
+    arms: ArmPathSettings = nested(ArmPathSettings)
+    smoothing: SmoothingSettings = nested(SmoothingSettings)
+    thesis: ThesisSettings = nested(ThesisSettings)

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from flowing_puppet_ros.arrays import F64
@@ -23,7 +22,7 @@ _SCALES_PX = (60.0, 30.0, 20.0, 10.0, 6.0, *[5.0] * 8)  # of the robust loss, ro
 _TRIANGULATION_STEPS = 4
 _MEDIAN_STEPS = 12
 _MIN_DEPTH_M = 0.1  # of a joint in front of a camera
-_MAX_EVALUATIONS = 3  # of derivatives in a round: new weights help more than many steps
+_STEPS = 3  # of Gauss-Newton in a round: new weights help more than many steps
 # How far a camera is expected to be from where the former calibration has it: this keeps what the joints leave free,
 # and is robust, so that a camera that was pushed is not held back.
 _TURN, _MOVE_M, _CLOCK_PERIODS, _FOCAL, _CENTRE = np.radians(0.3), 0.02, 100.0, 0.003, 0.003
@@ -231,27 +230,52 @@ def _adjust_round(
     free[1:, 6] = freedom.clocks
     free[:, 7:] = freedom.intrinsics
     sigma = np.array([_TURN] * 3 + [_MOVE_M] * 3 + [_CLOCK_PERIODS, _FOCAL, _CENTRE, _CENTRE])
-    root = np.sqrt(weight)[..., None] * (focal / focal.mean())[:, None, None] / width
-    deviation = state.subtract(expected, period) / sigma
-    trust = _find_trust(deviation)
+    weight = weight * (focal / focal.mean() / width)[:, None] ** 2
+    trust = _find_trust(state.subtract(expected, period) / sigma) / sigma
+    start, known = state.offset, free.ravel()
+    for _ in range(_STEPS):
+        seen = state.to_plane(plane - ((state.offset - start) / period)[:, None, None] * velocity)
+        normal, gradient = _eliminate_joints(state, seen, velocity, weight)
+        off = (trust**2 * state.subtract(expected, period)).ravel()
+        normal = normal + np.diag((trust**2).ravel())
+        step = np.zeros(known.shape)
+        step[known] = -np.linalg.solve(normal[np.ix_(known, known)], (gradient + off)[known])
+        state = state.move(step.reshape(free.shape), period)
+    return state
 
-    def unpack(values: F64) -> F64:
-        step = np.zeros((cameras, freedom.per_camera))
-        step[free] = values
-        return step
 
-    def residuals(values: F64) -> F64:
-        step = unpack(values)
-        moved = state.move(step, period)
-        seen = moved.to_plane(plane - step[:, 6, None, None] * velocity)
-        points = triangulate_linear(moved.rotation, moved.translation, seen, weight)
-        error = measure_residuals(moved.rotation, moved.translation, seen, points)
-        off = trust * (deviation + step / sigma)
-        return np.concatenate([(root * error).ravel(), off[free]])
+def _eliminate_joints(state: _State, seen: F64, velocity: F64, weight: F64) -> tuple[F64, F64]:
+    """Return the normal equations (10C, 10C), (10C,) of the cameras, with the joints eliminated (Schur complement).
 
-    start, units = np.zeros(int(free.sum())), np.broadcast_to(np.minimum(sigma, 1.0), free.shape)[free]
-    found = least_squares(residuals, start, x_scale=units, diff_step=1e-4, max_nfev=_MAX_EVALUATIONS)
-    return state.move(unpack(found.x), period)
+    `seen` (C, N, 2) are the joints on the image planes, which move by `velocity` (C, N, 2) a period, and `weight`
+    (C, N) those of their squared errors.
+    """
+    points = triangulate_linear(state.rotation, state.translation, seen, weight)
+    error = measure_residuals(state.rotation, state.translation, seen, points)
+    local = np.einsum("cij,cnj->cni", state.rotation, points[None] - state.centre[:, None])
+    x, y, z = np.moveaxis(local, 2, 0)
+    depth = np.maximum(z, _MIN_DEPTH_M)
+    one, none, u, v = np.ones_like(x), np.zeros_like(x), x / depth, y / depth
+    by_turn = np.stack([np.stack([-u * v, 1 + u * u, -v], axis=2), np.stack([-1 - v * v, u * v, u], axis=2)], axis=2)
+    image = np.stack([np.stack([one, none, -u], axis=2), np.stack([none, one, -v], axis=2)], axis=2)
+    by_point = (image / depth[..., None, None]) @ state.rotation[:, None]
+    factor = state.lens[:, 0, None, None]
+    by_clock, by_focal = velocity / factor, seen / factor
+    by_centre = np.broadcast_to(np.eye(2) / factor[..., None], (*x.shape, 2, 2))
+    by_camera = np.concatenate([by_turn, -by_point, by_clock[..., None], by_focal[..., None], by_centre], axis=3)
+    cameras, unknowns = len(state.centre), by_camera.shape[3]
+    heavy = by_camera * weight[..., None, None]
+    own = np.einsum("cnip,cniq->cpq", heavy, by_camera)
+    mixed = np.einsum("cnip,cnik->ncpk", heavy, by_point).reshape(len(points), cameras * unknowns, 3)
+    of_points = np.einsum("cn,cnik,cnil->nkl", weight, by_point, by_point) + 1e-12 * np.eye(3)
+    pull = np.einsum("cn,cnik,cni->nk", weight, by_point, error)
+    solved = np.linalg.solve(of_points, np.concatenate([np.swapaxes(mixed, 1, 2), pull[..., None]], axis=2))
+    normal = -np.einsum("npk,nkq->pq", mixed, solved[..., :-1])
+    for k in range(cameras):
+        block = slice(k * unknowns, (k + 1) * unknowns)
+        normal[block, block] += own[k]
+    gradient = np.einsum("cnip,cni->cp", heavy, error).ravel() - np.einsum("npk,nk->p", mixed, solved[..., -1])
+    return normal, gradient
 
 
 def _find_trust(deviation: F64) -> F64:

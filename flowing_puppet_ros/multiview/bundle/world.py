@@ -21,7 +21,8 @@ from flowing_puppet_ros.multiview.bundle.diagnosis import (
     find_size,
 )
 from flowing_puppet_ros.multiview.camera import Camera
-from flowing_puppet_ros.multiview.rig.rig import UNITS, CameraRig
+from flowing_puppet_ros.multiview.rig.names import UNITS
+from flowing_puppet_ros.multiview.rig.rig import CameraRig
 
 AXES = {f"{sign}{name}": np.eye(3)[axis] * (-1 if sign else 1) for axis, name in enumerate("xyz") for sign in ("", "-")}
 """Directions by name."""

@@ -7,16 +7,9 @@ from pathlib import Path
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.rig import colmap, opencv_yaml, qualisys, ros_files, toml_file
+from flowing_puppet_ros.multiview.rig.names import FORMS
 from flowing_puppet_ros.multiview.rig.rig import CameraRig, check_rig
 
-FORMS = {
-    "pose2sim": "TOML of Pose2Sim, Anipose and Caliscope",
-    "easymocap": "folder with intri.yml and extri.yml",
-    "qualisys": ".qca.txt",
-    "ros": "folder of camera_info YAML with transforms.yaml",
-    "colmap": "folder with cameras.txt and images.txt",
-}
-"""Forms that are read and written."""
 _YAML = (".yml", ".yaml")
 
 

@@ -14,8 +14,6 @@ from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 
-UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Metres in a unit of length."""
 _MAX_ROTATION_ERROR = 1e-3  # of R @ R.T from the identity; files are rounded
 _ROUNDING = 1e-12  # of R @ R.T from the identity that is left as it is
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F32, U8
 from flowing_puppet_ros.draw.flow_colour import flow_scale, flow_to_rgb
-from flowing_puppet_ros.flow.estimate import FlowSettings, OpticalFlow
+from flowing_puppet_ros.flow.estimate import OpticalFlow
+from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
 from flowing_puppet_ros.stream.components import warm_up
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns

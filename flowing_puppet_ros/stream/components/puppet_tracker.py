@@ -12,10 +12,11 @@ import numpy as np
 from flowing_puppet_ros.arrays import U8
 from flowing_puppet_ros.draw.overlay import DrawnPuppet, draw_puppets
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.flow.estimate import FlowPair, FlowSettings, OpticalFlow
+from flowing_puppet_ros.flow.estimate import FlowPair, OpticalFlow
+from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED
-from flowing_puppet_ros.image.tracking.track import TrackerSettings
+from flowing_puppet_ros.image.networks.sources import NOT_INSTALLED
+from flowing_puppet_ros.image.tracking.settings import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.image.video.live_tracker import LiveTracker, make_live_tracker
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings

@@ -15,8 +15,9 @@ from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.networks import choice
-from flowing_puppet_ros.image.networks.choice import NOT_INSTALLED, are_installed
+from flowing_puppet_ros.image.networks.choice import are_installed
 from flowing_puppet_ros.image.networks.keypoint_networks import FoundPerson
+from flowing_puppet_ros.image.networks.sources import NOT_INSTALLED
 from flowing_puppet_ros.image.video import live_tracker
 from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings

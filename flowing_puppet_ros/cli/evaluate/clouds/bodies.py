@@ -10,7 +10,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.bodies import KINDS, BodyScore, draw_scans, score_fit, summarise
 from flowing_puppet_ros.evaluate.body.measurements import measure_errors, summarise_errors

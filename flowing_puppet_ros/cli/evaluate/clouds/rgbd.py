@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.moving.camera_ring import CameraRing, RingScore, compare_cameras, summarise_ring
@@ -24,7 +25,8 @@ from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summa
 from flowing_puppet_ros.evaluate.rgbd.tracking import MotionScore, summarise_motions, track_motion
 from flowing_puppet_ros.evaluate.rgbd.views import CUTS, RgbdStudio, make_pair, make_registered
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
-from flowing_puppet_ros.image.networks.choice import IMAGE_SIDE_PX, load_networks
+from flowing_puppet_ros.image.networks.choice import load_networks
+from flowing_puppet_ros.image.networks.sources import IMAGE_SIDE_PX
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import make_out_folder
 

@@ -19,10 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
-from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
-from flowing_puppet_ros.body.scans.scan_frame import UP_AXES, parse_axis, rotation_to_z_up
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.scans.names import SUFFIXES, UP_AXES
+from flowing_puppet_ros.body.scans.scan import read_scan
+from flowing_puppet_ros.body.scans.scan_frame import parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.scans.scene_labels import LabelledScene, label_scene, read_labels
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
