@@ -34,9 +34,7 @@ class JoinedFitter:
         self.fitter = fitter
         self._silhouettes = SilhouetteFitter(fitter.model, settings)
 
-    def fit(
-        self, cloud: PersonCloud | None, person: SilhouettePerson, previous: BodyState | None = None
-    ) -> BodyFit:
+    def fit(self, cloud: PersonCloud | None, person: SilhouettePerson, previous: BodyState | None = None) -> BodyFit:
         """Return the body of a person.
 
         Args:

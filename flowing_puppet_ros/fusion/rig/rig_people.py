@@ -143,9 +143,7 @@ class RigPeople:
         clouds = self._cut_out(scene, owner, len(bodies), stamp)
         jobs = [
             _RigJob(track, cloud, None if person is None else self._drop_contradicted(person, cloud))
-            for track, cloud, person in zip(
-                [*tracks, *missing], clouds, [*people, *[None] * len(missing)], strict=True
-            )
+            for track, cloud, person in zip([*tracks, *missing], clouds, [*people, *[None] * len(missing)], strict=True)
         ]
         return jobs, owner >= 0
 
@@ -184,8 +182,8 @@ class RigPeople:
             self._contradictions[name] = self._contradictions.get(name, 0) + 1 if name in wrong else 0
             if self._contradictions[name] == MAX_CONTRADICTIONS:
                 self._report.warn(
-                    f"what the depth sensors saw of a person lies beside their silhouette of {name}, which is left out: "
-                    "check its transform on /tf, its camera_info and its clock, and that of the depth sensors"
+                    f"what the depth sensors saw of a person lies beside the silhouette of {name}, which is left out: "
+                    "check the transforms on /tf, the camera_info and the clocks of both"
                 )
         self._report.counters["silhouettes that depth contradicts"] += len(wrong)
         return replace(person, views={name: view for name, view in person.views.items() if name not in wrong})
@@ -207,5 +205,3 @@ class RigPeople:
             return error
         track.tracker.start(cloud or PersonCloud(fit.vertices, None, stamp), fit)
         return fit
-
-

@@ -13,8 +13,8 @@ from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.rim_term import Outline, measure_outside
 
 OUTSIDE_M, MAX_OUTSIDE_SHARE = 0.06, 0.25
-"""Distance from a silhouette at which a point of the person lies outside, and the share of such points from which on the
-camera shows another person, another moment or another place: it is 0.01 to 0.1 where it does not."""
+"""Distance from a silhouette at which a point of the person lies outside, and the share of such points from which on
+the camera shows another person, another moment or another place."""
 MIN_JUDGING_POINTS = 100
 """Points in an image that tell whether its silhouette belongs to them."""
 MAX_JUDGING_POINTS = 3000

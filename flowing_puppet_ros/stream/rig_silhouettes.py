@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The silhouettes that belong to what depth sensors saw: paired by stamp, brought into the frame of the tracks."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from flowing_puppet_ros.arrays import Bools
+from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTrackerSettings
+from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
+from flowing_puppet_ros.fusion.rig.rig_people import RigPeople
+from flowing_puppet_ros.fusion.rig.silhouette_person import SilhouettePerson
+from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
+from flowing_puppet_ros.reporting import Report
+from flowing_puppet_ros.stream.depth_rig import DepthRigSettings
+from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_views
+from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
+from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
+from flowing_puppet_ros.stream.sensor_places import SensorPlace
+from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
+from flowing_puppet_ros.units import NANOSECONDS
+
+MAX_INSTANTS = 60
+"""Instants whose silhouettes are kept."""
+MAX_APART_NS = NANOSECONDS
+"""From a moment to the nearest silhouettes, within which they are of these cameras but not of this time."""
+
+
+class RigFitSettings(Protocol):
+    """The settings of a body fitter that fits of silhouettes and depth take."""
+
+    @property
+    def rig(self) -> DepthRigSettings:
+        """`slop`: silhouettes belong to a moment that is no farther from them."""
+        ...
+
+    @property
+    def fusion(self) -> FusionSettings:
+        """`wait`: how long moments wait for silhouettes."""
+        ...
+
+    @property
+    def silhouettes(self) -> SilhouetteFitterSettings:
+        """Of the fits."""
+        ...
+
+    @property
+    def tracker(self) -> MultiBodyTrackerSettings:
+        """Of the tracks."""
+        ...
+
+
+class RigSilhouettes:
+    """Keeps silhouettes until what the depth sensors saw at their time is there, and fits bodies to both."""
+
+    def __init__(self, people: PeopleFitter, settings: RigFitSettings, frames: FrameTree, report: Report) -> None:
+        """Fit with `people`; `frames` take what comes on /tf and /tf_static."""
+        tracks = settings.tracker
+        self._people = RigPeople(people, settings.silhouettes, tracks, tracks.hold, report)
+        self._frames, self._report = frames, report
+        self._slop_ns, self._wait_ns = (round(1e9 * each) for each in (settings.rig.slop, settings.fusion.wait))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everybody and what waits."""
+        self.reset_people()
+        self._instants: dict[int, dict[str, Any]] = {}
+
+    def reset_people(self) -> None:
+        """Forget everybody."""
+        self._people.reset()
+
+    @property
+    def occluded_ids(self) -> list[str]:
+        """Ids of the people who have had a body and have none in the last moment."""
+        return self._people.occluded_ids
+
+    def add(self, message: Any) -> None:
+        """Take a SilhouetteSet."""
+        stamp = stamp_ns(message)
+        if self._instants and stamp < max(self._instants) - BACKWARD_JUMP_NS:
+            self._instants = {}
+        self._instants.setdefault(stamp, {})[message.person.id] = message
+        while len(self._instants) > MAX_INSTANTS:
+            del self._instants[min(self._instants)]
+
+    def is_awaited(self, stamp: int, first: int, last: int) -> bool:
+        """Return whether silhouettes of a moment at a stamp may still come.
+
+        `first` is the stamp of the first moment of all and `last` that of the last one that waits, nanoseconds.
+        """
+        newest = max(self._instants, default=None)
+        if newest is None or newest < stamp - self._slop_ns:
+            return last - (first if newest is None else newest) <= self._wait_ns
+        return not self._is_complete(newest) and newest <= stamp + self._slop_ns
+
+    def _is_complete(self, stamp: int) -> bool:
+        sets = self._instants[stamp]
+        return all(set(message.people) <= set(sets) for message in sets.values())
+
+    def fit(self, scene: SceneCloud, stamp: int, frame: str, place: SensorPlace) -> tuple[list[TrackedBody], Bools]:
+        """Return the bodies of everybody whom silhouettes show or have shown, and which points (N,) are theirs.
+
+        Args:
+            scene: what the sensors saw, in the frame of the tracks.
+            stamp: nanoseconds, by the clock of the messages.
+            frame: the fixed frame.
+            place: that of the fixed frame in the one of the tracks.
+        """
+        people = [person for message in self._take(stamp) if (person := self._decode(message, stamp, frame, place))]
+        return self._people.step(scene, people, scene.stamp)
+
+    def _take(self, stamp: int) -> list[Any]:
+        """Return the sets of the instant nearest to a stamp; those before the next moment are dropped."""
+        nearest = min(self._instants, key=lambda each: (abs(each - stamp), each), default=None)
+        if nearest is None:
+            return []
+        apart = abs(nearest - stamp)
+        found = list(self._instants[nearest].values()) if apart <= self._slop_ns else []
+        if self._slop_ns < apart <= MAX_APART_NS:
+            self._report.counters["moments without silhouettes"] += 1
+            self._report.warn(
+                f"the silhouettes nearest to what depth sensors saw are {apart / NANOSECONDS:.3f} s from it, beyond "
+                f"the rig.slop of {self._slop_ns / NANOSECONDS:g} s: such moments have bodies from depth alone"
+            )
+        for old in [each for each in self._instants if each <= stamp - self._slop_ns]:
+            del self._instants[old]
+        return sorted(found, key=lambda message: str(message.person.id))
+
+    def _decode(self, message: Any, stamp: int, frame: str, place: SensorPlace) -> SilhouettePerson | None:
+        """Return the person of a set in the frame of the tracks, None where it cannot be used."""
+        own = message.header.frame_id.lstrip("/")
+        pose = self._frames.lookup_pose(own, frame, stamp)
+        if pose is None:
+            why = self._frames.describe_missing(own, frame, stamp)
+            self._report.count_unusable(InputError(f"silhouettes are left out: {why}"))
+            return None
+        views = {}
+        for name, made in decode_views(message).items():
+            if isinstance(made, InputError):
+                self._report.count_unusable(made)
+            else:
+                views[name] = made
+        person = SilhouettePerson(message.person.id or "a1", views, decode_body_joints(message.person))
+        return person.move(place.rotation @ pose[1], place.rotation @ pose[0] + place.translation)
