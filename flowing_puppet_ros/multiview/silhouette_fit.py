@@ -18,7 +18,7 @@ from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, flip_heading, make_joint_targets
 from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
-from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights, SurfaceTerm
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -42,8 +42,11 @@ _KERNEL_WIDTH_M = 0.04
 _MIN_SEEN_SHARE, _MIN_NEAR_SHARE = 0.64, 0.25
 # Joints place limbs along the rays and in front of the body; outlines determine everything else better.
 _WEIGHTS = RefineWeights(pose=1e-7, pairwise=1e-7, shape=2e-6, sigma_start=0.08, sigma_end=0.05)
-# Depth tells more of the surface: first it attracts what the joints place roughly, then it is followed closely.
-_WITH_DEPTH = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.12, sigma_end=0.03)
+# With depth: first everything attracts what the joints place roughly; then depth, which tells more of the surface than
+# rough outlines and joints do, is followed closely, and outlines hold what it does not see.
+_WITH_DEPTH = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.12, sigma_end=0.03, iterations=14)
+_CLOSE_TO_DEPTH = replace(_WITH_DEPTH, sigma_start=0.06, iterations=8)
+_RIM_BESIDE_DEPTH = 0.2
 
 
 @dataclass(frozen=True)
@@ -51,9 +54,6 @@ class SilhouetteFitterSettings(Settings):
     """Settings of `SilhouetteFitter`."""
 
     gauss_newton_steps: int = setting(8, "Gauss-Newton steps on silhouettes", low=1, high=200, advanced=True)
-    depth_steps: int = setting(
-        14, "Gauss-Newton steps on silhouettes and depth together", low=1, high=200, advanced=True
-    )
     joint_weight: float = setting(
         0.02, "weight of an initial joint relative to all silhouettes", low=0.0, high=100.0, advanced=True
     )
@@ -161,17 +161,24 @@ class SilhouetteFitter:
         return best
 
     def _refine(self, start: BodyState, evidence: _Evidence, targets: JointTargets) -> _Candidate:
-        cloud, outlines = evidence.cloud, evidence.outlines
-        terms: list[SurfaceTerm] = [RimTerm(outlines, self.model.faces, self._edges)]
-        weights = replace(_WEIGHTS, iterations=self.settings.gauss_newton_steps)
-        if cloud is not None:
-            terms.append(cloud.free_space_term)
-            weights = replace(_WITH_DEPTH, iterations=self.settings.depth_steps)
-        state = self._refiner.run(start, cloud, targets.scale(self.settings.joint_weight), weights, terms)
+        outlines, scaled = evidence.outlines, targets.scale(self.settings.joint_weight)
+        rim = RimTerm(outlines, self.model.faces, self._edges)
+        if evidence.cloud is None:
+            weights = replace(_WEIGHTS, iterations=self.settings.gauss_newton_steps)
+            state = self._refiner.run(start, None, scaled, weights, [rim])
+        else:
+            state = self._refine_with_depth(start, evidence.cloud, rim, scaled)
         vertices = self.model.vertices(state)
         return _Candidate(
             state, vertices, tuple(range(len(outlines))), float(self._measure_overlaps(vertices, outlines).mean())
         )
+
+    def _refine_with_depth(
+        self, start: BodyState, cloud: SingleViewCloud, rim: RimTerm, targets: JointTargets
+    ) -> BodyState:
+        free, none = cloud.free_space_term, JointTargets.none(self.model)
+        near = self._refiner.run(start, cloud, targets, _WITH_DEPTH, [rim, free])
+        return self._refiner.run(near, cloud, none, _CLOSE_TO_DEPTH, [rim.scale(_RIM_BESIDE_DEPTH), free])
 
     def _measure_overlaps(self, vertices: F64, outlines: Sequence[Outline]) -> F64:
         faces = self.model.faces
