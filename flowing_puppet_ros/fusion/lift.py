@@ -8,7 +8,7 @@ without points of the person around it has no depth: it counts across the ray on
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +40,9 @@ SURFACE_GAP_M, MIN_SURFACE_SHARE, MAX_SURFACES = 0.08, 0.15, 3
 """Between the depths of two surfaces, share of a surface in the points around a joint, and how many there may be."""
 CHOSEN = {name for chain in CHAINS for name in chain}
 """Joints whose depth is chosen among several."""
+SAME_PLACE_M, MIN_TRUNK_GAP_M, MIN_OTHER_CONFIDENCE = 0.12, 0.1, 0.3
+"""Between the joints of two people of which one was lifted onto the other, by how much it is nearer to the other's trunk
+than to its own along the axis, and what a joint that may be the other's counts at least."""
 MAX_TRUNK_DEPTH_M, MAX_LIMB_DEPTH_M = 0.45, 0.8
 """From the trunk's depth, within which the joints of trunk and limbs are."""
 
@@ -111,6 +114,27 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
     found = np.isfinite(points).all(axis=1)
     confidence = np.where(found, puppet.confidence, 0.0)
     return LiftedJoints(points, rays, confidence, hidden, depth, cloud.camera.centre, choices)
+
+
+def find_lifted_onto_others(people: Sequence[LiftedJoints], axis: F64) -> list[Bools]:
+    """Return which joints (J,) of each of the people of one image were probably lifted onto another of them.
+
+    Where an arm is behind a neighbour's, a network may take that for it, and be sure. The neighbour has a joint there,
+    and a trunk that is clearly nearer to it along the camera's `axis` (3,).
+    """
+    found = []
+    depth = [(joints.points - joints.centre) @ axis for joints in people]
+    for own, (joints, along) in enumerate(zip(people, depth, strict=True)):
+        onto = np.zeros(len(along), dtype=bool)
+        for other, theirs in enumerate(people):
+            sure = theirs.found & ~theirs.hidden & (theirs.confidence >= MIN_OTHER_CONFIDENCE)
+            if other == own or not sure.any():
+                continue
+            gap = np.linalg.norm(joints.points[:, None] - theirs.points[sure], axis=2).min(axis=1)
+            nearer = np.abs(along - theirs.depth) + MIN_TRUNK_GAP_M < np.abs(along - joints.depth)
+            onto |= (gap < SAME_PLACE_M) & nearer
+        found.append(onto)
+    return found
 
 
 def _find_outside(puppet: PuppetJoints, cloud: SeenCloud) -> Bools:

@@ -44,6 +44,9 @@ MAX_GAP_M, MAX_SEEN_GAP_M = 0.06, 0.12
 """Between a joint and its ray, and its place on a surface, beyond which a limb may be in a wrong place."""
 LOST_GAP_M, LOST_SEEN_GAP_M = 0.09, 0.15
 """The same of a tracked body, beyond which its limb is lost."""
+STRAYED_M, STRAYED_SEEN_M = 0.2, 0.1
+"""The same from where a tracked body's motion would bring it: so far that the guesses of hidden joints miss by less, and
+the width of the kernel of closest points."""
 WRONG_GAP_M, WRONG_SEEN_GAP_M = 0.12, 0.2
 """The same, beyond which a body cannot be relied on."""
 MIN_SEEN_SHARE = 0.9  # probability that a joint is seen, below which its limb may be in a wrong place
@@ -111,6 +114,30 @@ class LimbSearcher:
         """Return the limbs of a tracked body of which a joint is certainly not where the puppet sees it."""
         across, gap = self._measure_gaps(body, joints)
         return self._find_limbs((across > LOST_GAP_M) | (~_find_doubtful(joints) & (gap > LOST_SEEN_GAP_M)), joints)
+
+    def find_strayed(self, body: BodyState, joints: LiftedJoints) -> list[int]:
+        """Return the limbs of a predicted body of which a joint is surely elsewhere: nearest points would miss these."""
+        across, gap = self._measure_gaps(body, joints)
+        return self._find_limbs((across > STRAYED_M) | (~_find_doubtful(joints) & (gap > STRAYED_SEEN_M)), joints)
+
+    def point(self, body: BodyState, joints: LiftedJoints, limbs: Sequence[int]) -> BodyState:
+        """Return the body with `limbs` pointed from where they join the trunk to where their joints are.
+
+        That is where they were lifted to, or, where that is in doubt, the nearest place on their rays; joints that do
+        not count leave their part as it is bent.
+        """
+        before, used, doubtful = states_to_particles(self._model, [body]), _can_count(joints), _find_doubtful(joints)
+        groups, places = list(before), self._model.joints(self._model.vertices(body))
+        along = ((places - joints.centre) * joints.rays).sum(axis=1, keepdims=True)
+        places = np.where(doubtful[:, None], joints.centre + along * joints.rays, joints.points)
+        for limb in limbs:
+            for part in self._limbs[limb][0]:
+                above = self._model.tree.parents[part]
+                groups[part] = self._proposer.reattach(part, groups[above], before, above)
+                joint = self._far_joint.get(part)
+                if joint is not None and used[joint]:
+                    groups[part] = self._proposer.point_to(part, groups[part], joint, places[joint][None])
+        return particles_to_state(self._model, groups, np.zeros(len(groups), dtype=np.int64))
 
     def contradicts(self, body: BodyState, joints: LiftedJoints) -> bool:
         """Return whether a joint of a limb is far from where the puppet surely sees it."""

@@ -17,7 +17,7 @@ from flowing_puppet_ros.body.segmentation.planes import PlaneCache, find_planes,
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.fusion.joint_fit import FEW_STEPS, HIDDEN_SHARE, MIN_LIMB_CONFIDENCE, JointFitter
-from flowing_puppet_ros.fusion.lift import LiftedJoints, lift_joints
+from flowing_puppet_ros.fusion.lift import LiftedJoints, find_lifted_onto_others, lift_joints
 from flowing_puppet_ros.fusion.ownership import assign_points
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, trunk_rows
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
@@ -144,7 +144,7 @@ class PeopleFitter:
             The claims of the puppets that have enough points, and the points (N,) of the others.
         """
         bodies = list(known) or [None] * len(puppets)
-        own = [clear] * len(puppets)
+        puppets, own = list(puppets), [clear] * len(puppets)
         claims: list[Claim | None] = []
         extra = [self._list_body(body) for body in others]
         for _round in range(CLAIM_ROUNDS if any(body is None for body in bodies) else 1):
@@ -152,6 +152,8 @@ class PeopleFitter:
                 self._start(cloud, puppet, points, body)
                 for puppet, points, body in zip(puppets, own, bodies, strict=True)
             ]
+            for number in self._hide_others(puppets, claims, cloud):
+                claims[number] = self._start(cloud, puppets[number], own[number], bodies[number])
             limbs = [np.empty((0, 8)) if claim is None else self._list_capsules(claim) for claim in claims]
             owner = np.full(len(cloud.points), -1, dtype=np.int32)
             owner[clear] = assign_points(cloud.points[clear], [*limbs, *extra])
@@ -162,6 +164,18 @@ class PeopleFitter:
             if claim is not None and np.count_nonzero(points) >= self.min_points
         ]
         return found, [owner == len(puppets) + number for number in range(len(others))] if claims or others else []
+
+    @staticmethod
+    def _hide_others(puppets: list[PuppetJoints], claims: Sequence[Claim | None], cloud: SeenCloud) -> list[int]:
+        """Call the joints hidden that were lifted onto another person; return the numbers of the puppets with such."""
+        known = [(number, claim.joints) for number, claim in enumerate(claims) if claim is not None]
+        onto = find_lifted_onto_others([joints for _, joints in known], cloud.camera.rotation[2])
+        changed = []
+        for (number, _), hidden in zip(known, onto, strict=True):
+            if (hidden & ~puppets[number].hidden).any():
+                puppets[number] = replace(puppets[number], hidden=puppets[number].hidden | hidden)
+                changed.append(number)
+        return changed
 
     def _start(self, cloud: SeenCloud, puppet: PuppetJoints, usable: Bools, body: BodyState | None) -> Claim | None:
         """Return a puppet's joints on the `usable` (N,) points and the body that they describe, None without one.
@@ -175,11 +189,11 @@ class PeopleFitter:
             return None
 
     def _list_capsules(self, claim: Claim) -> F64:
-        """Return the capsules (C, 8) of a body, and of limbs with known joints, should the body miss them."""
-        names, joints = self.model.joint_names, claim.joints
-        usable = joints.found & (joints.confidence >= MIN_LIMB_CONFIDENCE)
-        seen = {name: place for name, place, sure in zip(names, joints.points, usable, strict=True) if sure}
-        limbs = list_capsules(seen)
+        """Return the capsules (C, 8) of a body, and of limbs that end in sure joints, should the body miss them."""
+        joints, numbers = claim.joints, {name: number for number, name in enumerate(self.model.joint_names)}
+        found = {name: joints.points[number] for name, number in numbers.items() if joints.found[number]}
+        sure = {name for name in found if joints.confidence[numbers[name]] >= MIN_LIMB_CONFIDENCE}
+        limbs = list_capsules(found, sure)
         limbs = limbs[np.linalg.norm(limbs[:, :3] - limbs[:, 3:6], axis=1) < MAX_LIMB_M]
         return np.concatenate([self._list_body(claim.start), limbs])
 

@@ -224,12 +224,17 @@ class BodyTracker:
         return self._record(fit, lost, prepared)
 
     def track(
-        self, person: PersonCloud, targets: JointTargets | None = None, places: JointTargets | None = None
+        self,
+        person: PersonCloud,
+        targets: JointTargets | None = None,
+        places: JointTargets | None = None,
+        start: BodyState | None = None,
     ) -> BodyFit | None:
         """Fit the next cloud like `track_or_refit`, but never by a full fit: None when there is no body to start from.
 
         `targets` are where somebody else sees the joints, and `places` are the same with their depths, to which a body
-        is moved that is lost or comes after a gap. `lost` tells whether the body is not where the person is.
+        is moved that is lost or comes after a gap. `start` is where the body should be, None where it is `predict`'s.
+        `lost` tells whether the body is not where the person is.
         """
         if self._state.last is None:
             # Normals take long, and nothing would use them.
@@ -237,7 +242,7 @@ class BodyTracker:
             return None
         with one_blas_thread():
             prepared = self._prepare(person, targets, places)
-            fit, lost = self._track(prepared)
+            fit, lost = self._track(prepared, start)
         if fit is None:
             self._state = replace(self._state, lost=lost)
             return None
@@ -268,7 +273,7 @@ class BodyTracker:
         pull = self._no_joints if targets is None else targets
         return _Prepared(cloud, stamp, occluded, oriented, person.floor if on_floor else None, pull, places)
 
-    def _track(self, prepared: _Prepared) -> tuple[BodyFit | None, bool]:
+    def _track(self, prepared: _Prepared, start: BodyState | None = None) -> tuple[BodyFit | None, bool]:
         """Return the last body after a few steps on the new cloud, and whether it is lost.
 
         The little that is seen of an occluded person would bend the body: it moves on in the pose that it has.
@@ -279,7 +284,9 @@ class BodyTracker:
             return self._fitter.assess(translate(self._state.before, last, prepared.stamp), cloud), False
         if last is None:
             return None, True
-        fit = self._step(self._predict(last, cloud.points.mean(axis=0), prepared.stamp), prepared)
+        if start is None:
+            start = self._predict(last, cloud.points.mean(axis=0), prepared.stamp)
+        fit = self._step(start, prepared)
         return fit, self._is_lost(fit)
 
     def _record(self, fit: BodyFit, lost: bool, prepared: _Prepared) -> BodyFit:

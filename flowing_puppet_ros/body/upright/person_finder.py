@@ -27,8 +27,9 @@ from flowing_puppet_ros.threads import one_blas_thread
 
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
 """Points, probability by shape, and score of what a full search is made for though no upright body explains it."""
-MIN_WORTHWHILE = 0.15
-"""Probability by the bank's best body from which on its other bodies are refined too."""
+MIN_WORTHWHILE, MIN_SHAPELY = 0.15, 0.5
+"""Probability by the bank's best body from which on its other bodies are refined too, and probability by shape from
+which on they are whatever the best says: somebody who leans is often nearer to another one."""
 MIN_TRACKED = 0.5
 """Probability of a tracked body below which a new one is tried where few points show the person."""
 MIN_COME_SHARE, COME_ODDS, COME_FILTER = 0.15, 1.5, 0.3
@@ -273,7 +274,8 @@ class PersonFinder:
         starts = self.upright.find_rough(cloud, candidate.floor)
         first = self.upright.refine(starts[:1], cloud, candidate.floor)
         judged = weigh(first)
-        if judged.probability >= MIN_WORTHWHILE and len(starts) > 1:
+        worthwhile = judged.probability >= MIN_WORTHWHILE or probability >= MIN_SHAPELY
+        if worthwhile and len(starts) > 1:
             others = self.upright.refine(starts[1:], cloud, candidate.floor)
             if others.score < first.score:
                 judged = weigh(others)

@@ -24,8 +24,10 @@ _MEDIAN_STEPS = 12
 _MIN_DEPTH_M = 0.1  # of a joint in front of a camera
 _STEPS = 3  # of Gauss-Newton in a round: new weights help more than many steps
 # How far a camera is expected to be from where the former calibration has it: this keeps what the joints leave free,
-# and is robust, so that a camera that was pushed is not held back.
-_TURN, _MOVE_M, _CLOCK_PERIODS, _FOCAL, _CENTRE = np.radians(0.3), 0.02, 100.0, 0.003, 0.003
+# and is robust, so that a camera that was pushed is not held back. About its own axis a camera is held hardly at all:
+# people on one spot tell that angle five times worse than the others, and a camera that was rolled would stay so.
+_TURN, _ROLL, _MOVE_M = np.radians(3.0), np.radians(10.0), 0.02
+_CLOCK_PERIODS, _FOCAL, _CENTRE = 100.0, 0.003, 0.003
 _PRIOR_JOINTS = 10.0  # joints that weigh as much as the expectation
 _TURN_AND_MOVE = slice(0, 6)  # among the unknowns of a camera
 _CLOCK_STEP = 0.25  # periods over which the velocity of joints is measured
@@ -229,7 +231,7 @@ def _adjust_round(
     free[:, :6] = True
     free[1:, 6] = freedom.clocks
     free[:, 7:] = freedom.intrinsics
-    sigma = np.array([_TURN] * 3 + [_MOVE_M] * 3 + [_CLOCK_PERIODS, _FOCAL, _CENTRE, _CENTRE])
+    sigma = np.array([_TURN] * 2 + [_ROLL] + [_MOVE_M] * 3 + [_CLOCK_PERIODS, _FOCAL, _CENTRE, _CENTRE])
     weight = weight * (focal / focal.mean() / width)[:, None] ** 2
     trust = _find_trust(state.subtract(expected, period) / sigma) / sigma
     start, known = state.offset, free.ravel()

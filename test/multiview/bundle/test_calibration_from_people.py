@@ -110,12 +110,14 @@ def test_a_camera_that_was_turned_before_somebody_on_one_spot_stays_where_it_sto
             frames[name].append((k / RATE, [replace(p, joints=p.joints + bias[name]) for p in group]))
     tracks = associate_tracks(NAMES, CAMERAS, frames, {}, AssociationSettings(), TriangulationSettings())
     turned = CAMERAS | {"cam2": turn(CAMERAS["cam2"], 2.0, (0.6, 0.8, 0.0))}
+    rolled = CAMERAS | {"cam2": turn(CAMERAS["cam2"], 1.2, (0.0, 0.0, 1.0))}
     start = dict.fromkeys(CAMERAS, 0.0)
     found = {
         case: adjust(former, start, former, tracks, Freedom(clocks=False)).cameras["cam2"]
-        for case, former in (("right", CAMERAS), ("turned", turned))
+        for case, former in (("right", CAMERAS), ("turned", turned), ("rolled", rolled))
     }
-    assert angle(found["turned"], found["right"]) < 0.2
+    assert angle(found["turned"], found["right"]) < 0.1
+    assert angle(found["rolled"], found["right"]) < 0.1
     assert np.linalg.norm(found["turned"].centre - CAMERAS["cam2"].centre) < 0.02
 
 
