@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Silhouettes joined with depth: one body of a man of capsules from both, and what is said when they do not belong."""
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from camera_circle import (  # type: ignore[import-not-found]
+    AWAY_M,
+    FACTORY,
+    HEIGHT,
+    LIMBS,
+    MAN,
+    MATRIX,
+    TENTH,
+    WIDTH,
+    axes_of,
+    depth_from,
+    frames_of,
+    messages_of,
+)
+from capsule_man import cloud_of  # type: ignore[import-not-found]
+
+from flowing_puppet_ros.body.fit.visibility import Visibility
+from flowing_puppet_ros.fusion.rig.silhouette_person import SilhouettePerson
+from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
+from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_silhouettes, make_silhouettes
+from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform, stamp_ns
+from flowing_puppet_ros.stream.messages.puppets import decode_body_joints, make_joints
+
+ANGLES = (0.3, 2.2, -1.8)
+POINTS = cloud_of(MAN, 60_000)[0]
+DEPTHS = [depth_from(angle, POINTS) for angle in ANGLES]
+HALL_M = np.array([1.0, -2.0, 0.5])  # where the frame of the colour cameras begins in the world
+SHOWN = [name for name in MAN if name.partition("_")[2] in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")]
+
+
+def camera_at(angle: float) -> Camera:
+    place, axes = AWAY_M * np.array([np.cos(angle), np.sin(angle), 0.0]), axes_of(angle)
+    return Camera.from_info(MATRIX, [], WIDTH, HEIGHT, axes.T, -axes.T @ place)
+
+
+def mask_of(depth: np.ndarray) -> np.ndarray:
+    return 255 * cv2.morphologyEx((depth > 0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+
+
+def lose(depth: np.ndarray, angle: float, above: float) -> np.ndarray:
+    """Return a depth image without what lies higher than `above` m, as a black shirt leaves it."""
+    rows = np.arange(HEIGHT)[:, None] - (HEIGHT - 1) / 2
+    return np.asarray(np.where(-rows * depth / MATRIX[0] > above, 0.0, depth))
+
+
+def silhouettes_at(stamp: int, masks: Mapping[int, np.ndarray] | None = None, frame: str = "world") -> Any:
+    """Return the SilhouetteSet of the man, whose joints are 1 cm off; `masks` are others than his own."""
+    shift = HALL_M if frame == "hall" else np.zeros(3)
+    rng = np.random.default_rng(3)
+    places = np.array([MAN[name] for name in SHOWN]) + 0.01 * rng.standard_normal((len(SHOWN), 3)) - shift
+    seen = [Visibility.SEEN] * len(SHOWN)
+    joints = make_joints(FACTORY, SHOWN, places, np.full(len(SHOWN), 0.8), seen)
+    person = FACTORY.make("flowing_puppet_msgs/msg/Body", id="a7", confidence=0.8, joints=joints)
+    cameras, shown, headers = {}, {}, {}
+    for number, angle in enumerate(ANGLES):
+        name, camera = f"colour{number}", camera_at(angle)
+        cameras[name] = Camera(
+            camera.matrix, camera.distortion, camera.size, camera.rotation, camera.translation + camera.rotation @ shift
+        )
+        shown[name] = (masks or {}).get(number, mask_of(DEPTHS[number]))
+        headers[name] = make_header(FACTORY, stamp, name)
+    header = make_header(FACTORY, stamp, frame)
+    return make_silhouettes(FACTORY, header, person, cameras, shown, headers, ["a7"])
+
+
+def run(
+    stamps: Iterable[int],
+    sets: Mapping[int, Any],
+    depths: Mapping[int, np.ndarray],
+    settings: Mapping[str, Any] | None = None,
+) -> tuple[dict[int, list[Any]], BodyFitterComponent]:
+    """Return stamp -> bodies of a fitter that is given depth images (by the cameras' numbers) and sets (by stamp)."""
+    names = ",".join(f"cam{number}" for number in depths)
+    component = BodyFitterComponent(
+        BodyFitterSettings.from_mapping({"rig.cameras": names, **(settings or {})}), FACTORY
+    )
+    component.set_expected("silhouettes", True)
+    frames = frames_of(ANGLES)
+    frames.transforms.append(make_transform(FACTORY, make_header(FACTORY, 0, "world"), "hall", HALL_M, np.eye(3)))
+    outputs = component.handle("/tf_static", frames)
+    for stamp in stamps:
+        for number, depth in depths.items():
+            for port, message in messages_of(number, stamp, depth):
+                outputs += component.handle(port, message)
+        if stamp in sets:
+            outputs += component.handle("silhouettes", sets[stamp])
+    outputs += component.flush()
+    return {stamp_ns(message): list(message.bodies) for name, message in outputs if name == "bodies"}, component
+
+
+def error_of(body: Any, names: list[str] = LIMBS) -> float:
+    joints = decode_body_joints(body)
+    return float(np.mean([np.linalg.norm(np.array(joints[name][:3]) - MAN[name]) for name in names]))
+
+
+def test_a_moved_person_is_seen_at_the_same_pixels() -> None:
+    camera, turn, step = camera_at(0.4), axes_of(1.1), np.array([1.0, -2.0, 0.5])
+    person = SilhouettePerson(
+        "a1", {"cam": (camera, np.ones((HEIGHT, WIDTH), np.uint8))}, {"neck": (0.1, 0.2, 0.3, 0.9)}
+    )
+    moved = person.move(turn, step)
+    place = np.array([0.1, 0.2, 0.3])
+    np.testing.assert_allclose(moved.joints["neck"][:3], turn @ place + step)
+    seen, depth = camera.project(place)
+    again, same_depth = moved.views["cam"][0].project(turn @ place + step)
+    np.testing.assert_allclose(again, seen, atol=1e-9)
+    assert same_depth == pytest.approx(depth)
+
+
+def test_only_the_silhouette_that_points_do_not_lie_in_is_contradicted() -> None:
+    views = dict(zip(("a", "b", "c"), decode_silhouettes(silhouettes_at(TENTH)), strict=True))
+    mask = np.roll(views["b"][1], 40, axis=1)  # 0.4 m
+    person = SilhouettePerson("a1", views | {"b": (views["b"][0], mask)}, {})
+    assert SilhouettePerson("a1", views, {}).find_contradicted(POINTS[::20]) == []
+    assert person.find_contradicted(POINTS[::20]) == ["b"]
+    assert person.find_contradicted(POINTS[:50]) == []  # too few to tell
+
+
+def test_a_moment_waits_for_its_silhouettes_but_not_for_ever() -> None:
+    component = BodyFitterComponent(BodyFitterSettings.from_mapping({"rig.cameras": "cam0"}), FACTORY)
+    joined, second = component._joined, 10 * TENTH
+    assert joined.is_awaited(second, second, second)  # the first may still come
+    assert not joined.is_awaited(second, second, 4 * second)  # fusion.wait is 2 s
+    joined.add(silhouettes_at(second))
+    assert not joined.is_awaited(second, second, second)
+    assert not joined.is_awaited(second + TENTH // 5, second, 2 * second)  # within rig.slop
+    assert joined.is_awaited(second + TENTH, second, 2 * second)
+    two = silhouettes_at(second + TENTH)
+    two.people = ["a7", "a8"]
+    joined.add(two)
+    assert joined.is_awaited(second + TENTH, second, 2 * second)  # the other one's is to come
+    other = silhouettes_at(second + TENTH)
+    other.person.id, other.people = "a8", two.people
+    joined.add(other)
+    assert not joined.is_awaited(second + TENTH, second, 2 * second)
+
+
+@pytest.mark.slow
+def test_where_depth_is_missing_silhouettes_complete_the_body() -> None:
+    """Depth sees him up to the hips only; arms are known by the silhouettes, which are in a frame of their own."""
+    arms = [name for name in LIMBS if "elbow" in name or "wrist" in name]
+    low = {number: lose(DEPTHS[number], ANGLES[number], 0.0) for number in range(3)}
+    both, component = run([TENTH], {TENTH: silhouettes_at(TENTH, frame="hall")}, low)
+    (body,) = both[TENTH]
+    assert body.id == "a7" and body.reliable
+    assert error_of(body) < 0.045 and error_of(body, arms) < 0.045
+    assert component.report.drain_warnings() == []
+    alone, _ = run([TENTH], {}, low, {"fusion.wait": 0.0})
+    assert all(error_of(other, arms) > 0.1 or not other.reliable for other in alone[TENTH])
+
+
+@pytest.mark.slow
+def test_one_depth_camera_among_colour_cameras_gives_the_same_on_one_thread_and_two() -> None:
+    found = []
+    for threads in (1, 2):
+        bodies, _ = run([TENTH], {TENTH: silhouettes_at(TENTH)}, {0: DEPTHS[0]}, {"fitter.threads": threads})
+        (body,) = bodies[TENTH]
+        assert error_of(body) < 0.045
+        found.append(decode_body_joints(body))
+    assert found[0] == found[1]
+
+
+@pytest.mark.slow
+def test_a_silhouette_of_somebody_else_is_left_out_and_told_of() -> None:
+    stamps = [number * TENTH for number in (10, 11, 12)]
+    wrong = np.roll(mask_of(DEPTHS[1]), 45, axis=1)
+    sets = {stamp: silhouettes_at(stamp, {1: wrong}) for stamp in stamps}
+    bodies, component = run(stamps, sets, {0: DEPTHS[0], 2: DEPTHS[2]})
+    assert [error_of(body) < 0.045 for stamp in stamps for body in bodies[stamp]] == [True] * 3
+    (sentence,) = component.report.drain_warnings()
+    assert sentence.startswith("what the depth sensors saw of a person lies beside the silhouette of colour1")
+    assert component.counters["silhouettes that depth contradicts"] == 3
+
+
+@pytest.mark.slow
+def test_who_has_no_silhouettes_for_a_moment_keeps_body_and_id() -> None:
+    stamps = [number * TENTH for number in range(10, 14)]
+    sets = {stamp: silhouettes_at(stamp) for stamp in (stamps[0], stamps[1], stamps[3])}
+    bodies, _ = run(stamps, sets, {0: DEPTHS[0], 2: DEPTHS[2]})
+    assert {stamp: [body.id for body in found] for stamp, found in bodies.items()} == {each: ["a7"] for each in stamps}
+    assert all(error_of(found[0]) < 0.045 for found in bodies.values())
+
+
+@pytest.mark.slow
+def test_silhouettes_of_another_time_or_of_an_unknown_place_are_told_of_and_depth_goes_on() -> None:
+    late, depths = {TENTH: silhouettes_at(TENTH + TENTH // 2)}, {0: DEPTHS[0], 2: DEPTHS[2]}
+    bodies, component = run([TENTH], late, depths)
+    assert len(bodies[TENTH]) == 1 and error_of(bodies[TENTH][0]) < 0.06
+    (sentence,) = component.report.drain_warnings()
+    assert "are 0.050 s from it, beyond the rig.slop of 0.035 s" in sentence
+    bodies, component = run([TENTH], {TENTH: silhouettes_at(TENTH, frame="elsewhere")}, depths)
+    assert len(bodies[TENTH]) == 1
+    (sentence,) = component.report.drain_warnings()
+    assert sentence.startswith("silhouettes are left out: ") and "elsewhere" in sentence
