@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Protocol
+
+import numpy as np
 
 from flowing_puppet_ros.arrays import Bools
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTrackerSettings
@@ -27,6 +31,10 @@ MAX_INSTANTS = 60
 """Instants whose silhouettes are kept."""
 MAX_APART_NS = NANOSECONDS
 """From a moment to the nearest silhouettes, within which they are of these cameras but not of this time."""
+MAX_MISSED = 10
+"""Moments in a row that lie between silhouettes; then these are never of the time of the depth."""
+MAX_SAME_PERSON_M = 0.5
+"""Between the mean joints of a body from depth alone and of the silhouettes of the same person a moment later."""
 
 
 class RigFitSettings(Protocol):
@@ -68,15 +76,13 @@ class RigSilhouettes:
         """Forget everybody and what waits."""
         self.reset_people()
         self._instants: dict[int, dict[str, Any]] = {}
+        self._missed = 0
 
     def reset_people(self) -> None:
         """Forget everybody."""
         self._people.reset()
-
-    @property
-    def occluded_ids(self) -> list[str]:
-        """Ids of the people who have had a body and have none in the last moment."""
-        return self._people.occluded_ids
+        self._others: list[TrackedBody] = []
+        self._names: dict[str, str] = {}
 
     def add(self, message: Any) -> None:
         """Take a SilhouetteSet."""
@@ -111,7 +117,33 @@ class RigSilhouettes:
             place: that of the fixed frame in the one of the tracks.
         """
         people = [person for message in self._take(stamp) if (person := self._decode(message, stamp, frame, place))]
+        for person in people:
+            self._names.setdefault(person.id, self._find_name(person))
+        people = [replace(person, id=self._names[person.id]) for person in people]
         return self._people.step(scene, people, scene.stamp)
+
+    def add_others(self, others: Sequence[TrackedBody], occluded: Sequence[str]) -> list[str]:
+        """Take note of the bodies of this moment that are from depth alone, in the frame of the tracks.
+
+        Whose silhouettes come later keeps the id. `occluded` are the ids of those who are out of the depth's sight;
+        returns the ids of everybody who has had a body and has none in this moment.
+        """
+        self._others = list(others)
+        return sorted({*self._people.occluded_ids, *occluded} - self._people.shown_ids)
+
+    def _find_name(self, person: SilhouettePerson) -> str:
+        """Return the id of the body from depth alone that is where a new person is, or else the person's own."""
+        places = np.array([joint[:3] for joint in person.joints.values() if np.isfinite(joint).all()])
+        if not len(places):
+            return person.id
+        taken = set(self._names.values())
+        near = {
+            body.id: float(np.linalg.norm(body.fit.joints.mean(axis=0) - places.mean(axis=0)))
+            for body in self._others
+            if body.id not in taken
+        }
+        nearest = min(near, key=lambda each: near[each], default="")
+        return nearest if nearest and near[nearest] < MAX_SAME_PERSON_M else person.id
 
     def _take(self, stamp: int) -> list[Any]:
         """Return the sets of the instant nearest to a stamp; those before the next moment are dropped."""
@@ -120,8 +152,10 @@ class RigSilhouettes:
             return []
         apart = abs(nearest - stamp)
         found = list(self._instants[nearest].values()) if apart <= self._slop_ns else []
-        if self._slop_ns < apart <= MAX_APART_NS:
-            self._report.counters["moments without silhouettes"] += 1
+        is_between = self._slop_ns < apart <= MAX_APART_NS
+        self._missed = self._missed + 1 if is_between else 0
+        self._report.counters["moments without silhouettes"] += is_between
+        if self._missed == MAX_MISSED:
             self._report.warn(
                 f"the silhouettes nearest to what depth sensors saw are {apart / NANOSECONDS:.3f} s from it, beyond "
                 f"the rig.slop of {self._slop_ns / NANOSECONDS:g} s: such moments have bodies from depth alone"

@@ -192,10 +192,21 @@ def test_who_has_no_silhouettes_for_a_moment_keeps_body_and_id() -> None:
 
 
 @pytest.mark.slow
+def test_who_was_found_by_depth_alone_keeps_the_id_when_silhouettes_come() -> None:
+    stamps = [number * TENTH for number in range(10, 14)]
+    sets = {stamp: silhouettes_at(stamp) for stamp in stamps[2:]}
+    bodies, component = run(stamps, sets, {0: DEPTHS[0], 2: DEPTHS[2]})
+    assert [[body.id for body in bodies[stamp]] for stamp in stamps] == [["b1"]] * 4
+    assert component.counters["people of silhouettes and depth"] == 2
+    assert component.report.drain_warnings() == []
+
+
+@pytest.mark.slow
 def test_silhouettes_of_another_time_or_of_an_unknown_place_are_told_of_and_depth_goes_on() -> None:
-    late, depths = {TENTH: silhouettes_at(TENTH + TENTH // 2)}, {0: DEPTHS[0], 2: DEPTHS[2]}
-    bodies, component = run([TENTH], late, depths)
-    assert len(bodies[TENTH]) == 1 and error_of(bodies[TENTH][0]) < 0.06
+    depths, stamps = {0: DEPTHS[0], 2: DEPTHS[2]}, [number * TENTH for number in range(10, 21)]
+    late = {stamp: silhouettes_at(stamp + TENTH // 2) for stamp in stamps}
+    bodies, component = run(stamps, late, depths)
+    assert [len(bodies[stamp]) for stamp in stamps] == [1] * 11 and error_of(bodies[TENTH * 20][0]) < 0.06
     (sentence,) = component.report.drain_warnings()
     assert "are 0.050 s from it, beyond the rig.slop of 0.035 s" in sentence
     bodies, component = run([TENTH], {TENTH: silhouettes_at(TENTH, frame="elsewhere")}, depths)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.arrays import F64, I32, Bools
 from flowing_puppet_ros.body.cloud.limb_crop import list_capsules
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
@@ -86,17 +86,13 @@ class RigPeople:
         self._planes = PlaneCache(MAX_PLANE_MOMENTS)
         self._stamp: int | None = None
         self._contradictions: dict[str, int] = {}
-        self._shown: set[str] = set()
-
-    @property
-    def has_people(self) -> bool:
-        """Whether anybody is known."""
-        return bool(self._tracks)
+        self.shown_ids: frozenset[str] = frozenset()
+        """Ids of the people who have a body in the last moment."""
 
     @property
     def occluded_ids(self) -> list[str]:
         """Ids of the people who have had a body and have none in the last moment."""
-        return sorted(set(self._tracks) - self._shown)
+        return sorted(set(self._tracks) - self.shown_ids)
 
     def step(
         self, scene: SceneCloud, people: Sequence[SilhouettePerson], stamp: int
@@ -121,7 +117,7 @@ class RigPeople:
             elif fit is not None:
                 job.track.stamp = stamp
                 found.append(job.track.motion.add(job.track.id, stamp, fit))
-        self._shown = {body.id for body in found}
+        self.shown_ids = frozenset(body.id for body in found)
         self._report.counters["people of silhouettes and depth"] += len(found)
         for identity, track in list(self._tracks.items()):
             if stamp - track.stamp > self._hold_ns:
@@ -147,7 +143,7 @@ class RigPeople:
         ]
         return jobs, owner >= 0
 
-    def _cut_out(self, scene: SceneCloud, owner: F64, count: int, stamp: int) -> list[PersonCloud | None]:
+    def _cut_out(self, scene: SceneCloud, owner: I32, count: int, stamp: int) -> list[PersonCloud | None]:
         """Return the points of each of `count` people with what the sensors know of them; None for too few points."""
         rows = [np.flatnonzero(owner == number) for number in range(count)]
         enough = [number for number in range(count) if len(rows[number]) >= self._people.min_points]
