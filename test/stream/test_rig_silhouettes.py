@@ -121,9 +121,12 @@ def test_only_the_silhouette_that_points_do_not_lie_in_is_contradicted() -> None
     views = dict(zip(("a", "b", "c"), decode_silhouettes(silhouettes_at(TENTH)), strict=True))
     mask = np.roll(views["b"][1], 40, axis=1)  # 0.4 m
     person = SilhouettePerson("a1", views | {"b": (views["b"][0], mask)}, {})
-    assert SilhouettePerson("a1", views, {}).find_contradicted(POINTS[::20]) == []
-    assert person.find_contradicted(POINTS[::20]) == ["b"]
-    assert person.find_contradicted(POINTS[:50]) == []  # too few to tell
+    own = POINTS[::20]
+    assert SilhouettePerson("a1", views, {}).find_unusable(own, []) == ([], [])
+    assert person.find_unusable(own, []) == ([], ["b"])
+    assert person.find_unusable(own[:50], []) == ([], [])  # too few to tell
+    other = SilhouettePerson("a2", {"b": views["b"]}, {})  # who stands before him
+    assert person.find_unusable(own, [other]) == (["b"], [])
 
 
 def test_a_moment_waits_for_its_silhouettes_but_not_for_ever() -> None:

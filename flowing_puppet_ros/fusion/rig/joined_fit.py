@@ -21,7 +21,7 @@ from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitter, SilhouetteFitterSettings
 from flowing_puppet_ros.multiview.visual_hull import MIN_VIEWS
 
-MIN_DEPTH_CONFIDENCE, MIN_OVERLAP = 0.5, 0.7
+MIN_DEPTH_CONFIDENCE, MIN_OVERLAP = 0.3, 0.7
 """Of a body that is reliable: the confidence that depth gives it, and the overlap with the silhouettes, if the other
 one says that it is."""
 

@@ -85,7 +85,7 @@ class RigPeople:
         self._tracks: dict[str, _RigTrack] = {}
         self._planes = PlaneCache(MAX_PLANE_MOMENTS)
         self._stamp: int | None = None
-        self._contradictions: dict[str, int] = {}
+        self._contradictions: dict[tuple[str, str], int] = {}
         self.shown_ids: frozenset[str] = frozenset()
         """Ids of the people who have a body in the last moment."""
 
@@ -138,7 +138,7 @@ class RigPeople:
         tracks = [self._tracks.setdefault(person.id, self._start_track(person.id, stamp)) for person in people]
         clouds = self._cut_out(scene, owner, len(bodies), stamp)
         jobs = [
-            _RigJob(track, cloud, None if person is None else self._drop_contradicted(person, cloud))
+            _RigJob(track, cloud, None if person is None else self._drop_unusable(person, cloud, people))
             for track, cloud, person in zip([*tracks, *missing], clouds, [*people, *[None] * len(missing)], strict=True)
         ]
         return jobs, owner >= 0
@@ -171,18 +171,26 @@ class RigPeople:
     def _start_track(self, identity: str, stamp: int) -> _RigTrack:
         return _RigTrack(identity, BodyTracker(self._people.fitter, self._settings), stamp)
 
-    def _drop_contradicted(self, person: SilhouettePerson, cloud: PersonCloud | None) -> SilhouettePerson:
-        """Return a person without the silhouettes that the points contradict; go on about it in one sentence."""
-        wrong = [] if cloud is None else person.find_contradicted(cloud.points)
+    def _drop_unusable(
+        self, person: SilhouettePerson, cloud: PersonCloud | None, people: Sequence[SilhouettePerson]
+    ) -> SilhouettePerson:
+        """Return a person without the silhouettes that do not show where their points are.
+
+        Others may hide them; silhouettes that contradict moment after moment are told of in one sentence.
+        """
+        others = [other for other in people if other is not person]
+        hidden, wrong = ([], []) if cloud is None else person.find_unusable(cloud.points, others)
         for name in person.views:
-            self._contradictions[name] = self._contradictions.get(name, 0) + 1 if name in wrong else 0
-            if self._contradictions[name] == MAX_CONTRADICTIONS:
+            key = person.id, name
+            self._contradictions[key] = self._contradictions.get(key, 0) + 1 if name in wrong else 0
+            if self._contradictions[key] == MAX_CONTRADICTIONS:
                 self._report.warn(
                     f"what the depth sensors saw of a person lies beside the silhouette of {name}, which is left out: "
                     "check the transforms on /tf, the camera_info and the clocks of both"
                 )
         self._report.counters["silhouettes that depth contradicts"] += len(wrong)
-        return replace(person, views={name: view for name, view in person.views.items() if name not in wrong})
+        kept = {name: view for name, view in person.views.items() if name not in (*hidden, *wrong)}
+        return replace(person, views=kept)
 
     def _fit(self, job: _RigJob, stamp: int) -> BodyFit | InputError | None:
         """Return a person's body; None where too little is known."""

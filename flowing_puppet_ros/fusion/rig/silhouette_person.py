@@ -3,12 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, U8
+from flowing_puppet_ros.arrays import F64, U8, Bools
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.rim_term import Outline, measure_outside
 
@@ -48,14 +48,32 @@ class SilhouettePerson:
             {name: (float(p[0]), float(p[1]), float(p[2]), self.joints[name][3]) for name, p in placed.items()},
         )
 
-    def find_contradicted(self, points: F64) -> list[str]:
-        """Return the cameras in whose silhouettes much of the person's own `points` (N, 3) m does not lie."""
+    def find_unusable(self, points: F64, others: Sequence[SilhouettePerson]) -> tuple[list[str], list[str]]:
+        """Return the cameras that do not show much of the person's own `points` (N, 3) m where they should.
+
+        Those in which `others` hide the person, and those that show another person, moment or place.
+        """
+        hidden, contradicted = [], []
         few = points[:: 1 + len(points) // MAX_JUDGING_POINTS]
-        return [name for name, view in self.views.items() if _is_contradicted(*view, few)]
+        for name, (camera, mask) in self.views.items():
+            if not 0 < np.count_nonzero(mask) < mask.size:
+                continue
+            seen, distance, _ = measure_outside(few, Outline.of(camera, mask))
+            outside = few[seen[distance > OUTSIDE_M]]
+            if len(seen) < MIN_JUDGING_POINTS or len(outside) <= MAX_OUTSIDE_SHARE * len(seen):
+                continue
+            in_front = [other.views[name] for other in others if name in other.views]
+            free = len(outside) - np.count_nonzero(_find_covered(outside, in_front))
+            (contradicted if free > MAX_OUTSIDE_SHARE * len(seen) else hidden).append(name)
+        return hidden, contradicted
 
 
-def _is_contradicted(camera: Camera, mask: U8, points: F64) -> bool:
-    if not 0 < np.count_nonzero(mask) < mask.size:
-        return False
-    seen, distance, _ = measure_outside(points, Outline.of(camera, mask))
-    return len(seen) >= MIN_JUDGING_POINTS and bool((distance > OUTSIDE_M).mean() > MAX_OUTSIDE_SHARE)
+def _find_covered(points: F64, views: Sequence[tuple[Camera, U8]]) -> Bools:
+    """Return which of the points (N, 3) m project into any of the masks (h, w)."""
+    covered = np.zeros(len(points), dtype=bool)
+    for camera, mask in views:
+        pixels, _ = camera.project(points)
+        column, row = np.rint(np.nan_to_num(pixels, nan=-1e6)).astype(np.int64).T
+        inside = (column >= 0) & (row >= 0) & (column < mask.shape[1]) & (row < mask.shape[0])
+        covered[inside] |= mask[row[inside], column[inside]] > 0
+    return covered
