@@ -17,7 +17,7 @@ from flowing_puppet_ros import threads
 from flowing_puppet_ros.evidence.image.features import ImageFeatures
 from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
-from flowing_puppet_ros.multiview.silhouette import _grab_cut
+from flowing_puppet_ros.multiview.silhouette import _Colours, _grab_cut
 from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread, parallel_map
 
 COUNT = 3
@@ -113,7 +113,9 @@ def test_one_thread_of_the_user_stays_one() -> None:
         lambda: OpticalFlow()(IMAGE, IMAGE),
         lambda: ImageFeatures.of(IMAGE).level(0),
         lambda: PartDetector.load().detect(IMAGE),
-        lambda: _grab_cut(IMAGE, np.where(IMAGE[..., 0] > 99, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8), 1),
+        lambda: _grab_cut(
+            IMAGE, np.where(IMAGE[..., 0] > 99, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8), 1, _Colours()
+        ),
     ],
     ids=["flow", "evidence", "detector", "silhouette"],
 )

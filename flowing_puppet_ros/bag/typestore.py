@@ -7,7 +7,8 @@ taken from the recording itself. ROS is not needed.
 
 from __future__ import annotations
 
-from functools import cache, lru_cache
+from collections.abc import Callable
+from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -67,22 +68,33 @@ def typestore_with(type_name: str, definition: str) -> Typestore:
 class BagMessageFactory:
     """Makes `rosbags` messages; `node.factory` makes those of rclpy."""
 
-    def __init__(self) -> None:
-        self._store = typestore()
+    def __init__(self, store: Typestore | None = None) -> None:
+        """Make messages of a store, by default that of this package."""
+        self._store = store or typestore()
+        self._kinds: dict[str, tuple[Any, dict[str, Callable[[Any], Any]]]] = {}
 
     def make(self, type_name: str, **values: Any) -> Any:
         """Make a message of type `package/msg/Name`; fields without a value are zero, empty or False."""
-        fields = dict(self._store.fielddefs[type_name][1])
-        for name in values:
-            if name not in fields:
-                raise TypeError(f"{type_name} has no field {name!r}")
-        filled = {name: self._convert(kind, values.get(name)) for name, kind in fields.items()}
-        return self._store.types[type_name](**filled)
+        kind, converters = self._kinds.get(type_name) or self._add_kind(type_name)
+        if not values.keys() <= converters.keys():
+            wrong = next(name for name in values if name not in converters)
+            raise TypeError(f"{type_name} has no field {wrong!r}")
+        return kind(*[convert(values.get(name)) for name, convert in converters.items()])
+
+    def _add_kind(self, type_name: str) -> tuple[Any, dict[str, Callable[[Any], Any]]]:
+        """Keep the class of a type with what converts each field, in order: outlines have 100,000s of points."""
+        fields: list[tuple[str, tuple[int, Any]]] = self._store.fielddefs[type_name][1]
+        converters = {
+            name: _SCALARS.get(detail[0], _to_int) if node == Nodetype.BASE else partial(self._convert, (node, detail))
+            for name, (node, detail) in fields
+        }
+        found = self._kinds[type_name] = (self._store.types[type_name], converters)
+        return found
 
     def _convert(self, kind: tuple[int, Any], value: Any) -> Any:
         node, detail = kind
         if node == Nodetype.BASE:
-            return _convert_scalar(detail[0], value)
+            return _SCALARS.get(detail[0], _to_int)(value)
         if node == Nodetype.NAME:
             return self.make(detail) if value is None else value
         (element, element_detail), count = detail
@@ -97,14 +109,27 @@ class BagMessageFactory:
         return list(value)
 
 
-def _convert_scalar(name: str, value: Any) -> Any:
-    if name == "string":
-        return "" if value is None else str(value)
-    if name == "bool":
-        return bool(value)
-    if name == "float32":
-        # Serialisation drops these digits; a message that is not serialised must not keep them.
-        return 0.0 if value is None else float(np.float32(value))
-    if name == "float64":
-        return 0.0 if value is None else float(value)
+def _to_text(value: Any) -> str:
+    return "" if value is None else str(value)
+
+
+def _to_single(value: Any) -> float:
+    # Serialisation drops the other digits; a message that is not serialised must not keep them.
+    return 0.0 if value is None else float(np.float32(value))
+
+
+def _to_float(value: Any) -> float:
+    return 0.0 if value is None else float(value)
+
+
+def _to_int(value: Any) -> int:
     return 0 if value is None else int(value)
+
+
+_SCALARS: dict[str, Callable[[Any], Any]] = {
+    "string": _to_text,
+    "bool": bool,
+    "float32": _to_single,
+    "float64": _to_float,
+}
+"""What converts a value, or None, for a field; all others are whole numbers."""

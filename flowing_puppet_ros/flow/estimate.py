@@ -15,7 +15,7 @@ import numpy as np
 from flowing_puppet_ros.arrays import U8, Flow
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.settings import FlowSettings
-from flowing_puppet_ros.images import as_image
+from flowing_puppet_ros.images import as_image, reduce_image
 from flowing_puppet_ros.threads import one_opencv_thread
 
 type FlowPair = tuple[Flow, Flow]
@@ -60,7 +60,7 @@ class OpticalFlow:
         image = as_image(image, MIN_SIDE_PX)
         size = working_size(image.shape, self.settings.max_side)
         if (image.shape[1], image.shape[0]) != size:
-            image = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+            image = reduce_image(image, size)
         if image.ndim == 3:
             image = np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         return np.ascontiguousarray(image)

@@ -14,13 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.fusion.limb_depths import (
     CHAINS,
+    HALF_SEEN_CONFIDENCE,
     LIMB_REACH_M,
     TRUNK_REACH_M,
     DepthChoices,
     choose_depths,
+    expect_depth,
     list_choices,
     measure_seen_share,
 )
@@ -36,6 +38,8 @@ BEHIND_SURFACE_M = {
 RADIUS_M, MIN_RADIUS_PX = 0.04, 2.5
 """Around a joint, within which the person's points give its depth."""
 MIN_POINTS = 3
+MISSED_FACTOR = 2.0
+"""Of the radius around a sure joint without any of the person's points within it: its pixel is beside a thin limb."""
 SURFACE_GAP_M, MIN_SURFACE_SHARE, MAX_SURFACES = 0.08, 0.15, 3
 """Between the depths of two surfaces, share of a surface in the points around a joint, and how many there may be."""
 CHOSEN = {name for chain in CHAINS for name in chain}
@@ -75,7 +79,9 @@ class LiftedJoints:
         return np.isfinite(self.points).all(axis=1)
 
 
-def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, usable: Bools) -> LiftedJoints:
+def lift_joints(
+    model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, usable: Bools, expected: F64 | None = None
+) -> LiftedJoints:
     """Lift the joints of a puppet into a cloud.
 
     Args:
@@ -83,13 +89,22 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
         puppet: joints in the image of the cloud's camera.
         cloud: the cloud with pixels.
         usable: (N,) which points may be the person's.
+        expected: (J, 3) metres, where the joints should be, None for a person who is new.
     """
     offsets = np.array([BEHIND_SURFACE_M.get(_kind(name), 0.0) for name in model.joint_names])
-    samples, beyond = _collect_samples(puppet, cloud, usable)
+    rays, axis = cloud.camera.cast_rays(puppet.pixels), cloud.camera.rotation[2]
+    samples, beyond = _collect_samples(puppet, cloud, usable, np.flatnonzero(puppet.known))
     outside = _find_outside(puppet, cloud)
     trunk = trunk_rows(model)
-    depth = _find_trunk_depth(puppet, samples, trunk)
-    rays, axis = cloud.camera.cast_rays(puppet.pixels), cloud.camera.rotation[2]
+    should = None if expected is None else (expected - cloud.camera.centre) @ axis
+    depth = _find_trunk_depth(puppet, samples, trunk, None if should is None else float(should[trunk].mean()))
+    missed = [
+        joint
+        for joint, values in samples.items()
+        if puppet.confidence[joint] >= HALF_SEEN_CONFIDENCE
+        and np.count_nonzero(np.abs(values - depth) < MAX_LIMB_DEPTH_M) < MIN_POINTS
+    ]
+    samples.update(_collect_samples(puppet, cloud, usable, np.array(missed, dtype=np.int64), MISSED_FACTOR)[0])
     points = np.full((len(offsets), 3), np.nan)
     hidden = puppet.hidden.copy()
     choices: dict[int, DepthChoices] = {}
@@ -108,6 +123,8 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
             TRUNK_REACH_M if near_trunk else LIMB_REACH_M,
             measure_seen_share(puppet.confidence[joint], bool(puppet.hidden[joint])),
         )  # fmt: skip
+        if should is not None:
+            choices[joint] = expect_depth(choices[joint], float(should[joint]))
     for joint, choice in choose_depths(model, choices).items():
         points[joint] = choices[joint].points[choice]
         hidden[joint] |= not choices[joint].seen[choice]
@@ -182,12 +199,16 @@ def _find_surfaces(depth: F64) -> F64:
     return found
 
 
-def _collect_samples(puppet: PuppetJoints, cloud: SeenCloud, usable: Bools) -> tuple[dict[int, F64], dict[int, F64]]:
-    """Return for every known joint the depths, in metres, of the `usable` (N,) points around it, and of the others."""
-    known = np.flatnonzero(puppet.known)
+def _collect_samples(
+    puppet: PuppetJoints, cloud: SeenCloud, usable: Bools, known: I64, factor: float = 1.0
+) -> tuple[dict[int, F64], dict[int, F64]]:
+    """Return for the `known` joints the depths, in metres, of the `usable` (N,) points around each, and of the others.
+
+    They are within `factor` of the usual radius.
+    """
     if not len(known):
         return {}, {}
-    joint, row = _find_around(puppet.pixels[known], cloud.pixels, cloud.depth, cloud.camera.focal)
+    joint, row = _find_around(puppet.pixels[known], cloud.pixels, cloud.depth, factor * cloud.camera.focal)
     own, depth = usable[row], cloud.depth[row]
     return (
         {int(number): depth[(joint == k) & own] for k, number in enumerate(known)},
@@ -217,16 +238,20 @@ def _find_around(joints, pixels, depth, focal):  # type: ignore[no-untyped-def]
     return found_joint[:count], found_row[:count]
 
 
-def _find_trunk_depth(puppet: PuppetJoints, samples: dict[int, F64], trunk: list[int]) -> float:
+def _find_trunk_depth(puppet: PuppetJoints, samples: dict[int, F64], trunk: list[int], expected: float | None) -> float:
     """Return the median depth of the trunk, of all joints where the trunk has none, or NaN.
 
-    Joints count by their squared confidence: at hidden hips, the cloud shows the table before them.
+    Joints count by their squared confidence: at hidden hips, the cloud shows the table before them. Where it is
+    `expected` within reach, metres, the wall beside the shoulders does not count.
     """
     for joints in (trunk, list(samples)):
-        known = [joint for joint in joints if len(samples.get(joint, ())) >= MIN_POINTS]
+        known = {joint: samples[joint] for joint in joints if len(samples.get(joint, ())) >= MIN_POINTS}
+        if expected is not None:
+            near = {joint: values[np.abs(values - expected) < MAX_TRUNK_DEPTH_M] for joint, values in known.items()}
+            known = {joint: values for joint, values in near.items() if len(values) >= MIN_POINTS} or known
         if known:
-            depth = np.array([np.median(samples[joint]) for joint in known])
-            return _find_weighted_median(depth, puppet.confidence[known] ** 2)
+            depth = np.array([np.median(values) for values in known.values()])
+            return _find_weighted_median(depth, puppet.confidence[list(known)] ** 2)
     return float("nan")
 
 

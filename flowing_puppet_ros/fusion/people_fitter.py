@@ -27,6 +27,8 @@ from flowing_puppet_ros.threads import one_blas_thread, parallel_map, usable_thr
 
 MAX_LIMB_M = 0.6
 """Length of a limb that takes points by itself."""
+JOINT_RADIUS_M = 0.04
+"""Of a limb at a sure joint, which takes points though the next joint towards the trunk is not known."""
 MIN_PLACES, PLACE_WEIGHT = 4, 0.1
 """Joints by whose places a body is moved, at least, and the weight of a certain one."""
 CLAIM_ROUNDS = 2
@@ -159,8 +161,8 @@ class PeopleFitter:
             owner[clear] = assign_points(cloud.points[clear], [*limbs, *extra])
             own = [owner == number for number in range(len(puppets))]
         found = [
-            replace(claim, joints=lift_joints(self.model, claim.puppet, cloud, points), own=points)
-            for claim, points in zip(claims, own, strict=True)
+            replace(claim, joints=self._lift(claim.puppet, cloud, points, body), own=points)
+            for claim, points, body in zip(claims, own, bodies, strict=True)
             if claim is not None and np.count_nonzero(points) >= self.min_points
         ]
         return found, [owner == len(puppets) + number for number in range(len(others))] if claims or others else []
@@ -182,11 +184,16 @@ class PeopleFitter:
 
         Where the body should be is known better from the clouds before: then it is `body`.
         """
-        joints = lift_joints(self.model, puppet, cloud, usable)
+        joints = self._lift(puppet, cloud, usable, body)
         try:
             return Claim(puppet, joints, self.joint_fitter.start(joints, FEW_STEPS) if body is None else body, usable)
         except InputError:
             return None
+
+    def _lift(self, puppet: PuppetJoints, cloud: SeenCloud, usable: Bools, body: BodyState | None) -> LiftedJoints:
+        """Lift a puppet's joints onto the `usable` (N,) points, those of somebody known to where `body` has them."""
+        expected = None if body is None else self.model.joints(self.model.vertices(body))
+        return lift_joints(self.model, puppet, cloud, usable, expected)
 
     def _list_capsules(self, claim: Claim) -> F64:
         """Return the capsules (C, 8) of a body, and of limbs that end in sure joints, should the body miss them."""
@@ -195,7 +202,8 @@ class PeopleFitter:
         sure = {name for name in found if joints.confidence[numbers[name]] >= MIN_LIMB_CONFIDENCE}
         limbs = list_capsules(found, sure)
         limbs = limbs[np.linalg.norm(limbs[:, :3] - limbs[:, 3:6], axis=1) < MAX_LIMB_M]
-        return np.concatenate([self._list_body(claim.start), limbs])
+        ends = np.array([[*found[name], *found[name], JOINT_RADIUS_M, JOINT_RADIUS_M] for name in sure if "_" in name])
+        return np.concatenate([self._list_body(claim.start), limbs, ends.reshape(-1, 8)])
 
     def _list_body(self, body: BodyState) -> F64:
         return list_capsules(

@@ -18,8 +18,9 @@ def distance_transform(mask: Bools) -> F64:
     Squared distances between pixel centres are integers: rounding to them removes the difference.
     """
     empty: Array = np.ascontiguousarray(~mask).astype(np.uint8)
-    rough = np.minimum(cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), MAX_DISTANCE_PX)
-    return np.sqrt(np.rint(rough.astype(np.float64) ** 2))
+    rough = np.minimum(cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32(MAX_DISTANCE_PX))
+    rough *= rough  # up to 2**18, of which 32 bits hold a 64th
+    return np.sqrt(np.rint(rough, out=rough), dtype=np.float64)
 
 
 def signed_distance(mask: U8) -> F64:

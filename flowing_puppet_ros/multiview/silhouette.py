@@ -8,13 +8,15 @@ the rest by colour. Everything is causal: a frame's mask uses that frame and ear
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from weakref import ref
 
 import cv2
 import numpy as np
 
-from flowing_puppet_ros.arrays import U8, Bools
+from flowing_puppet_ros.arrays import F64, U8, Bools
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.images import reduce_image
 from flowing_puppet_ros.multiview.background import Background, BackgroundSettings
 from flowing_puppet_ros.multiview.distance_transform import distance_transform
 from flowing_puppet_ros.settings import Settings, nested, setting
@@ -28,6 +30,7 @@ _BARE_DISTANCE_M = 0.10  # pixels farther outside the puppet are background
 _MAX_LIMB_ERROR_M = 0.7  # distance of a limb from where the puppet has it
 _CROP_MARGIN_M = 0.15  # surroundings from which GrabCut learns the colours of the background
 _OPENING_RADIUS_M = 0.006  # removes specks and threads
+_COLOUR_IMAGES = 15  # that start with the colours of the image before
 
 # Differences from the background, in grey levels and in standard deviations with the camera's noise added.
 _NOISE_LEVELS = 3.0
@@ -92,11 +95,14 @@ class SilhouetteEstimator:
         self.settings = settings or SilhouetteSettings()
         self.background = Background(self.settings.background)
         self._areas: dict[str, deque[float]] = {}
+        self._colours: dict[str, _Colours] = {}
+        self._reduced: tuple[ref[U8], U8] | None = None  # the last image, which is observed once for each person in it
 
     def reset(self) -> None:
         """Forget the background and the areas."""
         self.background.reset()
         self._areas.clear()
+        self._colours.clear()
 
     def update_background(
         self,
@@ -134,7 +140,9 @@ class SilhouetteEstimator:
         height, width = image.shape[:2]
         factor = min(1.0, self.settings.max_side / max(height, width))
         size = (max(1, round(width * factor)), max(1, round(height * factor)))
-        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA) if factor < 1 else image
+        if self._reduced is None or self._reduced[0]() is not image:
+            self._reduced = ref(image), reduce_image(image, size)
+        small = self._reduced[1]
         everyone = cv2.resize(labels, size, interpolation=cv2.INTER_NEAREST) > 0
         puppet = cv2.resize(person, size, interpolation=cv2.INTER_NEAREST) > 0
         return Observation(small, puppet, everyone & ~puppet, scale * factor)
@@ -150,7 +158,10 @@ class SilhouetteEstimator:
         seed = self._make_seed(observation)
         sure = seed == cv2.GC_FGD
         window = _crop(observation.puppet | sure, _CROP_MARGIN_M * observation.scale)
-        body = _grab_cut(np.ascontiguousarray(observation.image[window]), seed[window], self.settings.grabcut_rounds)
+        colours = self._colours.setdefault(identity, _Colours())
+        body = _grab_cut(
+            np.ascontiguousarray(observation.image[window]), seed[window], self.settings.grabcut_rounds, colours
+        )
         mask = np.zeros(observation.puppet.shape, np.uint8)
         mask[window] = _clean(body, sure[window], _OPENING_RADIUS_M * observation.scale)
         return Silhouette(mask, self._check_area(mask, observation.scale, identity))
@@ -224,17 +235,31 @@ def _crop(puppet: Bools, margin: float) -> tuple[slice, slice]:
     return slices[0], slices[1]
 
 
-def _grab_cut(image: U8, seed: U8, rounds: int) -> Bools:
-    """Run GrabCut with fixed randomness; a seed that leaves nothing to decide is returned as it is."""
+@dataclass(slots=True, eq=False)
+class _Colours:
+    """GrabCut's mixtures of colours (1, 65) of background and body, and in how many more images others start with them.
+
+    To find mixtures from nothing takes as long as the cut itself. Those of the image before are a better start, but a
+    component that has lost all pixels never comes back, so they are found anew from time to time.
+    """
+
+    background: F64 = field(default_factory=lambda: np.zeros((1, 65)))
+    body: F64 = field(default_factory=lambda: np.zeros((1, 65)))
+    images_left: int = 0
+
+
+def _grab_cut(image: U8, seed: U8, rounds: int, colours: _Colours) -> Bools:
+    """Run GrabCut with fixed randomness and change the `colours`; a seed that leaves nothing to decide is returned."""
     body = (seed == cv2.GC_FGD) | (seed == cv2.GC_PR_FGD)
     if body.all() or not body.any():
         return body
     labels = seed.copy()
-    models = np.zeros((1, 65)), np.zeros((1, 65))
+    mode = cv2.GC_EVAL if colours.images_left > 0 else cv2.GC_INIT_WITH_MASK
+    colours.images_left = colours.images_left - 1 if colours.images_left > 0 else _COLOUR_IMAGES
     # The result depends on the number of threads otherwise.
     with one_opencv_thread():
         cv2.setRNGSeed(0)
-        cv2.grabCut(image, labels, None, *models, rounds, cv2.GC_INIT_WITH_MASK)
+        cv2.grabCut(image, labels, None, colours.background, colours.body, rounds, mode)
     return (labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)
 
 

@@ -86,7 +86,8 @@ class ForeignFactory(BagMessageFactory):
         store.register(typestore().fielddefs)
         for name, text in DEFINITIONS.items():
             store.register(get_types_from_msg(text, name))
-        self.store = self._store = store
+        super().__init__(store)
+        self.store = store
 
 
 FACTORY = ForeignFactory()

@@ -22,13 +22,9 @@ from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.seen_free import SeenFree
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
-from flowing_puppet_ros.body.upright.person_finder import (
-    FoundBody,
-    JudgedFit,
-    PersonFinder,
-    PersonFinderSettings,
-    RejectedCandidate,
-)
+from flowing_puppet_ros.body.upright.found_body import FoundBody, JudgedFit
+from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
+from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.reporting import Report

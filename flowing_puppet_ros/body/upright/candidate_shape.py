@@ -13,16 +13,21 @@ RING_M, MAX_RADIUS_M = 0.5, 0.95  # of the surroundings
 RING_HEIGHTS_M = (0.12, 0.7, 1.3, 2.2)
 MAX_RING = 5.0  # points of the surroundings for each of the candidate's, beyond which more tell nothing
 OVERHEAD_M = 0.6  # over the top, of what is over a candidate's head
+MAX_SEEN_ABOVE_M, MIN_REACH_M = 0.5, 0.3
+"""Height over the top that the sensor sees, beyond which more tells nothing, and distance from which rays are asked for
+that: where it sees nothing above the top, the head may be cut off."""
 SHAPE_NAMES = (
     "top", "lowest", "longer", "shorter", "flatness", "whole", "share_inside", "overhead", "head_width", "head_share",
     *(f"width_{k}" for k in range(len(SLICES_M) - 1)), *(f"depth_{k}" for k in range(len(SLICES_M) - 1)),
     *(f"share_{k}" for k in range(len(SLICES_M) - 1)), *(f"ring_{k}" for k in range(len(RING_HEIGHTS_M) - 1)),
+    "seen_above",
 )  # fmt: skip
 
 
 def describe_candidates(candidates: list[Candidate], scene: SceneHeights, viewpoint: np.ndarray) -> np.ndarray:
     """Return the numbers (C, len(SHAPE_NAMES)) of candidates in a scene seen from `viewpoint` (3,) m."""
     shape = np.empty((len(candidates), len(SHAPE_NAMES)))
+    slope = _find_steepest(scene.points, viewpoint) if candidates else 0.0
     for row, candidate in enumerate(candidates):
         near, away = scene.index.find_near(scene.points, candidate.middle, MAX_RADIUS_M)
         ahead = candidate.middle - viewpoint[:2]
@@ -36,12 +41,17 @@ def describe_candidates(candidates: list[Candidate], scene: SceneHeights, viewpo
             float(candidate.whole),
             shape[row],
         )
+        ceiling = viewpoint[2] + slope * np.hypot(*ahead) - candidate.floor
+        shape[row, -1] = np.clip(ceiling - candidate.top, 0.0, MAX_SEEN_ABOVE_M)
     return shape
 
 
 @njit(cache=True, nogil=True)
 def _describe(points, height, middle, ahead, around, away, whole, shape):  # type: ignore[no-untyped-def]
-    """Fill `shape` in the order of `SHAPE_NAMES`; `around` and `away` are heights and distances of what is near."""
+    """Fill `shape` in the order of `SHAPE_NAMES`, but for the last.
+
+    `around` and `away` are heights and distances of what is near.
+    """
     count, top, slices = len(points), height.max(), len(SLICES_M) - 1
     depth, across = np.empty(count), np.empty(count)
     for k in range(count):
@@ -72,6 +82,18 @@ def _describe(points, height, middle, ahead, around, away, whole, shape):  # typ
         shape[10 + 2 * slices + level] = own.mean()
     for level in range(len(ring)):
         shape[10 + 3 * slices + level] = min(ring[level] / count, MAX_RING)
+
+
+@njit(cache=True, nogil=True)
+def _find_steepest(points, viewpoint):  # type: ignore[no-untyped-def]
+    """Return the slope of the highest ray of a scan with points (N, 3) m."""
+    steepest = -np.inf
+    for row in range(len(points)):
+        x, y, z = points[row, 0] - viewpoint[0], points[row, 1] - viewpoint[1], points[row, 2] - viewpoint[2]
+        reach = np.sqrt(x * x + y * y)
+        if reach > MIN_REACH_M:
+            steepest = max(steepest, z / reach)
+    return steepest
 
 
 @njit(cache=True, nogil=True)

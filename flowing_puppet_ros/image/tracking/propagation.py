@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, U16, Flow
+from flowing_puppet_ros.arrays import F64, U8, U16, Flow
 from flowing_puppet_ros.flow.affine import RegionMotions, apply_affine
 from flowing_puppet_ros.flow.estimate import FlowPair
 from flowing_puppet_ros.flow.puppet_flow import PuppetFlow, explained_fraction, fit_part_motions, motion_field
@@ -52,13 +53,30 @@ def render_label_map(
     `headings` (rad) tell which limbs of a person seen from the side are behind the torso. Larger people are drawn
     last, as the nearer ones.
     """
-    width, height = grid.work
-    labels = np.zeros((height, width), dtype=np.uint16)
-    for k in sorted(range(len(shapes)), key=lambda k: shapes[k].scale):
-        contours = tuple(grid.to_work(contour) for contour in shapes[k].contours)
-        own = render_labels(contours, depth_order(model, shapes[k].view, headings[k]), (height, width))
+    labels = np.zeros(grid.work[::-1], dtype=np.uint16)
+    for k, own in _render_people(model, shapes, headings, grid):
         np.copyto(labels, own + np.uint16(k * len(model.tree)), where=own > 0)
     return labels
+
+
+def render_part_map(
+    model: DeformableStructures, shapes: Sequence[PuppetShape], headings: Sequence[float], grid: ImageScale
+) -> U8:
+    """Draw labels (h, w) as `render_label_map` does, but with part i of everybody as i + 1."""
+    parts = np.zeros(grid.work[::-1], dtype=np.uint8)
+    for _, own in _render_people(model, shapes, headings, grid):
+        cv2.copyTo(own, own, parts)
+    return parts
+
+
+def _render_people(
+    model: DeformableStructures, shapes: Sequence[PuppetShape], headings: Sequence[float], grid: ImageScale
+) -> Iterator[tuple[int, U8]]:
+    """Yield the number of each person with the own part labels (h, w), in the order in which they cover each other."""
+    width, height = grid.work
+    for k in sorted(range(len(shapes)), key=lambda k: shapes[k].scale):
+        contours = tuple(grid.to_work(contour) for contour in shapes[k].contours)
+        yield k, render_labels(contours, depth_order(model, shapes[k].view, headings[k]), (height, width))
 
 
 def render_tracks(model: DeformableStructures, tracks: Sequence[Track], grid: ImageScale) -> U16:

@@ -12,6 +12,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, U8
 from flowing_puppet_ros.flow.estimate import FlowPair
+from flowing_puppet_ros.images import reduce_image
 
 CELLS = (3, 2)  # columns and rows of the image with a histogram each
 BINS = 8  # per channel
@@ -26,10 +27,8 @@ SAMPLING_STEP_PX = 4  # one in so many of the flow's pixels is sampled in each d
 
 def colour_histogram(image: U8) -> F64:
     """Return the shares (cells, channels, BINS) of each channel's levels in an `image` (H, W, 3) or (H, W)."""
-    # A quarter of a large image's pixels in each direction counts as well, and is read in a sixteenth of the time.
-    step = max(1, min(image.shape[1] // SMALL_SIZE_PX[0], image.shape[0] // SMALL_SIZE_PX[1]) // 4)
-    small = cv2.resize(np.ascontiguousarray(image[::step, ::step]), SMALL_SIZE_PX, interpolation=cv2.INTER_AREA)
-    levels = (np.asarray(small).reshape(SMALL_SIZE_PX[1], SMALL_SIZE_PX[0], -1) >> 5).astype(np.int64)
+    small = reduce_image(image, SMALL_SIZE_PX)
+    levels = (small.reshape(SMALL_SIZE_PX[1], SMALL_SIZE_PX[0], -1) >> 5).astype(np.int64)
     rows, columns = SMALL_SIZE_PX[1] // CELLS[1], SMALL_SIZE_PX[0] // CELLS[0]
     blocks = levels.reshape(CELLS[1], rows, CELLS[0], columns, -1).transpose(0, 2, 4, 1, 3)
     flat = blocks.reshape(CELLS[0] * CELLS[1], levels.shape[2], -1)

@@ -26,7 +26,7 @@ from flowing_puppet_ros.image.tracking.propagation import (
     ImageScale,
     Propagation,
     propagate_tracks,
-    render_label_map,
+    render_part_map,
     render_tracks,
 )
 from flowing_puppet_ros.image.tracking.settings import TrackerSettings
@@ -102,9 +102,7 @@ class TrackResult:
         height, width = shape or (self.grid.image[1], self.grid.image[0])
         grid = ImageScale(self.grid.image, (width, height))
         shapes, headings = ([getattr(each, name) for each in self.puppets] for name in ("shape", "side_heading"))
-        labels = render_label_map(self._model, shapes, headings, grid)
-        parts = len(self._model.tree)
-        return np.where(labels > 0, (labels - 1) % parts + 1, 0).astype(np.uint8)
+        return render_part_map(self._model, shapes, headings, grid)
 
     def puppet_flow(self) -> PuppetFlow | None:
         """Return the puppet flow from the previous image, on the grid of `flow`; None if that is None."""

@@ -24,6 +24,7 @@ from flowing_puppet_ros.multiview.bundle.adjustment import (
 from flowing_puppet_ros.multiview.bundle.clocks import find_coarse_offsets
 from flowing_puppet_ros.multiview.bundle.gauge import match_baselines, place_as_before, scale_to
 from flowing_puppet_ros.multiview.bundle.joint_tracks import CameraFrames, PeopleTracks, associate_tracks
+from flowing_puppet_ros.multiview.bundle.uncertainty import PoseUncertainty, bound_uncertainty
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
 
@@ -73,7 +74,10 @@ class Agreement:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedRig:
-    """A refined rig: cameras, seconds to add to each camera's stamps, agreement before and after, heights m."""
+    """A refined rig: cameras, seconds to add to each camera's stamps, agreement before and after, heights m.
+
+    `uncertainty` is what the joints cannot tell of each camera.
+    """
 
     cameras: dict[str, Camera]
     offsets: dict[str, float]
@@ -81,6 +85,7 @@ class RefinedRig:
     after: Agreement
     heights: dict[str, float]
     period: float
+    uncertainty: dict[str, PoseUncertainty]
 
 
 def refine_rig(
@@ -122,6 +127,7 @@ def refine_rig(
         measure_agreement(refined.cameras, refined.offsets, tracks),
         {person: height * factor for person, height in heights.items()},
         tracks.period,
+        bound_uncertainty(refined.cameras, refined.offsets, tracks),
     )
 
 

@@ -83,7 +83,8 @@ def _measure_distance(
     The samples that the other camera does not show count as _UNSEEN_DISTANCE_M.
     """
     both = np.minimum(weight, their_weight)
-    share = float((both > 0).any(axis=1).sum() / max((weight > 0).any(axis=1).sum(), 1))
+    shown, seen_by_both = (int(np.count_nonzero((each > 0).any(axis=1))) for each in (weight, both))
+    share = seen_by_both / max(shown, 1)
     if share < _MIN_SHARE:
         return np.inf
     rays = [

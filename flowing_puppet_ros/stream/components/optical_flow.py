@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -17,6 +18,8 @@ from flowing_puppet_ros.stream.components import warm_up
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.images import decode_image, make_image
 from flowing_puppet_ros.stream.messages.message_types import IMAGE, MessageFactory
+
+MAX_PREVIEW_SIDE_PX = 640
 
 
 class OpticalFlowComponent(Component[FlowSettings]):
@@ -68,21 +71,29 @@ class OpticalFlowComponent(Component[FlowSettings]):
             ("flow/backward", make_image(self.factory, message.header, backward, "32FC2")),
         ]
         if "flow/preview" in self._subscribed:
-            outputs.append(("flow/preview", make_flow_preview(self.factory, header, [forward])))
+            outputs.append(("flow/preview", make_image(self.factory, header, FlowPicture(forward).rgb, "rgb8")))
         return outputs
 
 
-def make_flow_preview(factory: MessageFactory, header: Any, flows: list[F32], max_side: int = 640) -> Any:
-    """Return an rgb8 Image of `flows` (H, W, 2) side by side, coloured by the range of the first one.
+class FlowPicture:
+    """The picture of a flow, for several previews, and of others in the same colours.
 
-    Each flow is scaled down to at most `max_side` pixels on its longer side.
+    Each flow is scaled down to at most `MAX_PREVIEW_SIDE_PX` on its longer side.
     """
-    scale = flow_scale(flows[0])
-    factor = min(1.0, max_side / max(flows[0].shape[:2]))
-    pictures = []
-    for flow in flows:
-        picture = flow_to_rgb(flow, scale)
+
+    def __init__(self, flow: F32) -> None:
+        """Take the range of colours from `flow` (H, W, 2)."""
+        self._flow, self._scale = flow, flow_scale(flow)
+
+    @cached_property
+    def rgb(self) -> U8:
+        """The picture (h, w, 3) of the flow itself."""
+        return self.colour(self._flow)
+
+    def colour(self, flow: F32) -> U8:
+        """Return the picture (h, w, 3) of another flow (H, W, 2)."""
+        picture = flow_to_rgb(flow, self._scale)
+        factor = min(1.0, MAX_PREVIEW_SIDE_PX / max(flow.shape[:2]))
         if factor < 1:
-            picture = np.asarray(cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
-        pictures.append(picture)
-    return make_image(factory, header, np.hstack(pictures), "rgb8")
+            picture = cv2.resize(picture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+        return np.asarray(picture, np.uint8)

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import cv2
 import numpy as np
 
 from flowing_puppet_ros.arrays import U8
@@ -20,12 +19,13 @@ from flowing_puppet_ros.image.tracking.settings import TrackerSettings
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.image.video.live_tracker import LiveTracker, make_live_tracker
 from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
+from flowing_puppet_ros.images import reduce_image
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.settings import Settings, nested, setting
 from flowing_puppet_ros.stream.component import COMPRESSED, Component, Output, Port
 from flowing_puppet_ros.stream.components import warm_up
-from flowing_puppet_ros.stream.components.optical_flow import make_flow_preview
+from flowing_puppet_ros.stream.components.optical_flow import FlowPicture
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriPublisher, Ros4HriSettings, make_image_messages
 from flowing_puppet_ros.stream.messages.detections import (
     OTHER_DETECTIONS,
@@ -261,18 +261,18 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
         if "overlay" in self._subscribed:
             outputs.append(("overlay", self._overlay(header, image, puppets)))
         if result.flow is not None and earlier is not None:
-            forward = result.flow[0]
+            forward = FlowPicture(result.flow[0])
             if "flow/preview" in self._subscribed and "flow/forward" not in self._expected:
-                outputs.append(("flow/preview", make_flow_preview(self.factory, earlier, [forward])))
+                outputs.append(("flow/preview", make_image(self.factory, earlier, forward.rgb, "rgb8")))
             moved = result.puppet_flow() if "puppet_flow/preview" in self._subscribed else None
             if moved is not None:
-                picture = make_flow_preview(self.factory, earlier, [forward, moved.field])
-                outputs.append(("puppet_flow/preview", picture))
+                both = np.hstack([forward.rgb, forward.colour(moved.field)])
+                outputs.append(("puppet_flow/preview", make_image(self.factory, earlier, both, "rgb8")))
         return outputs
 
     def _overlay(self, header: Any, image: U8, puppets: Any) -> Any:
         factor = min(1.0, self.settings.overlay_max_side / max(image.shape[:2]))
         drawn = [DrawnPuppet.from_message(puppet).transform(factor) for puppet in puppets.puppets]
         if factor < 1:
-            image = np.asarray(cv2.resize(image, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA))
+            image = reduce_image(image, (round(factor * image.shape[1]), round(factor * image.shape[0])))
         return make_image(self.factory, header, draw_puppets(image, drawn), "rgb8")

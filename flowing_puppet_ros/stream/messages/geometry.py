@@ -50,7 +50,7 @@ def make_header(factory: MessageFactory, nanoseconds: int, frame_id: str) -> Any
 
 def make_point(factory: MessageFactory, xyz: Sequence[float] | Array) -> Any:
     """Return a geometry_msgs/Point."""
-    return factory.make("geometry_msgs/msg/Point", x=float(xyz[0]), y=float(xyz[1]), z=float(xyz[2]))
+    return factory.make("geometry_msgs/msg/Point", x=xyz[0], y=xyz[1], z=xyz[2])
 
 
 def make_vector(factory: MessageFactory, xyz: Sequence[float] | Array) -> Any:

@@ -35,6 +35,7 @@ CERTAIN = 0.5
 """Confidence from which a joint is drawn as a disc; below it is a ring."""
 LINE_LOOP, LINE_LIST = 2, 4  # of foxglove_msgs/PointsAnnotation
 _VISION, _FOXGLOVE = "vision_msgs/msg/", "foxglove_msgs/msg/"
+_POINT = _FOXGLOVE + "Point2"
 _CORNER = 0.5  # of a pixel, from its centre
 _DARK, _WHITE = (20, 20, 20), (255, 255, 255)
 
@@ -131,7 +132,10 @@ class _Drawing:
             self._add_label(puppet.id, box)
 
     def _point(self, xy: Array) -> Any:
-        return self._make(_FOXGLOVE + "Point2", x=xy[0], y=xy[1])
+        return self._make_points(xy[None])[0]
+
+    def _make_points(self, points: Array) -> list[Any]:
+        return [self._make(_POINT, x=x, y=y) for x, y in points.tolist()]
 
     def _add_lines(self, kind: int, points: Array, colour: Rgb, fill: float) -> None:
         self.points.append(
@@ -139,7 +143,7 @@ class _Drawing:
                 _FOXGLOVE + "PointsAnnotation",
                 timestamp=self._stamp,
                 type=kind,
-                points=[self._point(xy) for xy in points + _CORNER],
+                points=self._make_points(points + _CORNER),
                 outline_color=self._color(colour, 1.0),
                 fill_color=self._color(colour, fill),
                 thickness=self._width,

@@ -30,7 +30,7 @@ def make_mesh_marker(
 
     `inferred` (V,) bool are the vertices that only the model tells: they are pale.
     """
-    points = [make_point(factory, vertex) for vertex in vertices]
+    points = [make_point(factory, vertex) for vertex in vertices.tolist()]
     corners = np.asarray(faces).ravel()
     skin, pale = (factory.make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=1.0) for r, g, b in (_SKIN_RGB, _PALE_RGB))
     return factory.make(
@@ -72,7 +72,7 @@ def make_topology(factory: MessageFactory, model: StitchedPuppet) -> Any:
     triangles = [
         factory.make("shape_msgs/msg/MeshTriangle", vertex_indices=np.asarray(face, np.uint32)) for face in model.faces
     ]
-    vertices = [make_point(factory, vertex) for vertex in model.vertices(model.rest_state())]
+    vertices = [make_point(factory, vertex) for vertex in model.vertices(model.rest_state()).tolist()]
     return factory.make(MESH, triangles=triangles, vertices=vertices)
 
 
