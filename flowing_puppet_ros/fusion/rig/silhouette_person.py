@@ -53,7 +53,7 @@ class SilhouettePerson:
 
         Those in which `others` hide the person, and those that show another person, moment or place.
         """
-        hidden, contradicted = [], []
+        hidden, contradicted = list[str](), list[str]()
         few = points[:: 1 + len(points) // MAX_JUDGING_POINTS]
         for name, (camera, mask) in self.views.items():
             if not 0 < np.count_nonzero(mask) < mask.size:
