@@ -7,7 +7,7 @@ taken from the recording itself. ROS is not needed.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -83,7 +83,7 @@ class BagMessageFactory:
 
     def _add_kind(self, type_name: str) -> tuple[Any, dict[str, Callable[[Any], Any]]]:
         """Keep the class of a type with what converts each field, in order: outlines have 100,000s of points."""
-        fields: list[tuple[str, tuple[int, Any]]] = self._store.fielddefs[type_name][1]
+        fields: Sequence[tuple[str, tuple[int, Any]]] = self._store.fielddefs[type_name][1]
         converters = {
             name: _SCALARS.get(detail[0], _to_int) if node == Nodetype.BASE else partial(self._convert, (node, detail))
             for name, (node, detail) in fields

@@ -45,8 +45,8 @@ SURFACE_GAP_M, MIN_SURFACE_SHARE, MAX_SURFACES = 0.08, 0.15, 3
 CHOSEN = {name for chain in CHAINS for name in chain}
 """Joints whose depth is chosen among several."""
 SAME_PLACE_M, MIN_TRUNK_GAP_M, MIN_OTHER_CONFIDENCE = 0.12, 0.1, 0.3
-"""Between the joints of two people of which one was lifted onto the other, by how much it is nearer to the other's trunk
-than to its own along the axis, and what a joint that may be the other's counts at least."""
+"""Between the joints of two people of which one was lifted onto the other, by how much it is nearer to the other's
+trunk than to its own along the axis, and what a joint that may be the other's counts at least."""
 MAX_TRUNK_DEPTH_M, MAX_LIMB_DEPTH_M = 0.45, 0.8
 """From the trunk's depth, within which the joints of trunk and limbs are."""
 

@@ -45,8 +45,8 @@ MAX_GAP_M, MAX_SEEN_GAP_M = 0.06, 0.12
 LOST_GAP_M, LOST_SEEN_GAP_M = 0.09, 0.15
 """The same of a tracked body, beyond which its limb is lost."""
 STRAYED_M, STRAYED_SEEN_M = 0.2, 0.1
-"""The same from where a tracked body's motion would bring it: so far that the guesses of hidden joints miss by less, and
-the width of the kernel of closest points."""
+"""The same from where a tracked body's motion would bring it: so far that the guesses of hidden joints miss by less,
+and the width of the kernel of closest points."""
 WRONG_GAP_M, WRONG_SEEN_GAP_M = 0.12, 0.2
 """The same, beyond which a body cannot be relied on."""
 MIN_SEEN_SHARE = 0.9  # probability that a joint is seen, below which its limb may be in a wrong place
@@ -116,7 +116,7 @@ class LimbSearcher:
         return self._find_limbs((across > LOST_GAP_M) | (~_find_doubtful(joints) & (gap > LOST_SEEN_GAP_M)), joints)
 
     def find_strayed(self, body: BodyState, joints: LiftedJoints) -> list[int]:
-        """Return the limbs of a predicted body of which a joint is surely elsewhere: nearest points would miss these."""
+        """Return the limbs of a predicted body that nearest points would miss: a joint is surely elsewhere."""
         across, gap = self._measure_gaps(body, joints)
         return self._find_limbs((across > STRAYED_M) | (~_find_doubtful(joints) & (gap > STRAYED_SEEN_M)), joints)
 
