@@ -4,73 +4,39 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from camera_circle import (  # type: ignore[import-not-found]
-    AWAY_M,
+    ANGLES,
+    DEPTHS,
     FACTORY,
+    HALL_M,
     HEIGHT,
     LIMBS,
     MAN,
     MATRIX,
+    POINTS,
     TENTH,
     WIDTH,
     axes_of,
-    depth_from,
+    camera_at,
     frames_of,
+    mask_of,
     messages_of,
+    silhouettes_at,
 )
-from capsule_man import cloud_of  # type: ignore[import-not-found]
 
-from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.fusion.rig.silhouette_person import SilhouettePerson
-from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
-from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_silhouettes, make_silhouettes
+from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_silhouettes
 from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform, stamp_ns
-from flowing_puppet_ros.stream.messages.puppets import decode_body_joints, make_joints
-
-ANGLES = (0.3, 2.2, -1.8)
-POINTS = cloud_of(MAN, 60_000)[0]
-DEPTHS = [depth_from(angle, POINTS) for angle in ANGLES]
-HALL_M = np.array([1.0, -2.0, 0.5])  # where the frame of the colour cameras begins in the world
-SHOWN = [name for name in MAN if name.partition("_")[2] in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")]
-
-
-def camera_at(angle: float) -> Camera:
-    place, axes = AWAY_M * np.array([np.cos(angle), np.sin(angle), 0.0]), axes_of(angle)
-    return Camera.from_info(MATRIX, [], WIDTH, HEIGHT, axes.T, -axes.T @ place)
-
-
-def mask_of(depth: np.ndarray) -> np.ndarray:
-    return 255 * cv2.morphologyEx((depth > 0).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
 
 
 def lose(depth: np.ndarray, angle: float, above: float) -> np.ndarray:
     """Return a depth image without what lies higher than `above` m, as a black shirt leaves it."""
     rows = np.arange(HEIGHT)[:, None] - (HEIGHT - 1) / 2
     return np.asarray(np.where(-rows * depth / MATRIX[0] > above, 0.0, depth))
-
-
-def silhouettes_at(stamp: int, masks: Mapping[int, np.ndarray] | None = None, frame: str = "world") -> Any:
-    """Return the SilhouetteSet of the man, whose joints are 1 cm off; `masks` are others than his own."""
-    shift = HALL_M if frame == "hall" else np.zeros(3)
-    rng = np.random.default_rng(3)
-    places = np.array([MAN[name] for name in SHOWN]) + 0.01 * rng.standard_normal((len(SHOWN), 3)) - shift
-    seen = [Visibility.SEEN] * len(SHOWN)
-    joints = make_joints(FACTORY, SHOWN, places, np.full(len(SHOWN), 0.8), seen)
-    person = FACTORY.make("flowing_puppet_msgs/msg/Body", id="a7", confidence=0.8, joints=joints)
-    cameras, shown, headers = {}, {}, {}
-    for number, angle in enumerate(ANGLES):
-        name, camera = f"colour{number}", camera_at(angle)
-        cameras[name] = Camera(
-            camera.matrix, camera.distortion, camera.size, camera.rotation, camera.translation + camera.rotation @ shift
-        )
-        shown[name] = (masks or {}).get(number, mask_of(DEPTHS[number]))
-        headers[name] = make_header(FACTORY, stamp, name)
-    header = make_header(FACTORY, stamp, frame)
-    return make_silhouettes(FACTORY, header, person, cameras, shown, headers, ["a7"])
 
 
 def run(
