@@ -122,14 +122,15 @@ class RigSilhouettes:
         people = [replace(person, id=self._names[person.id]) for person in people]
         return self._people.step(scene, people, scene.stamp)
 
-    def add_others(self, others: Sequence[TrackedBody], occluded: Sequence[str]) -> list[str]:
+    def add_others(self, others: Sequence[TrackedBody], occluded: Sequence[str]) -> tuple[list[TrackedBody], list[str]]:
         """Take note of the bodies of this moment that are from depth alone, in the frame of the tracks.
 
-        Whose silhouettes come later keeps the id. `occluded` are the ids of those who are out of the depth's sight;
-        returns the ids of everybody who has had a body and has none in this moment.
+        Whose silhouettes come later keeps the id. `occluded` are the ids of those who are out of the depth's sight.
+        Returns those of other people than silhouettes show, and the ids of all who had a body and have none now.
         """
-        self._others = list(others)
-        return sorted({*self._people.occluded_ids, *occluded} - self._people.shown_ids)
+        shown = self._people.shown_ids
+        self._others = [body for body in others if body.id not in shown]
+        return self._others, sorted({*self._people.occluded_ids, *occluded} - shown)
 
     def _find_name(self, person: SilhouettePerson) -> str:
         """Return the id of the body from depth alone that is where a new person is, or else the person's own."""

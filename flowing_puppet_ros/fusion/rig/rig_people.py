@@ -25,6 +25,7 @@ from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerS
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.fusion.joint_fit import FEW_STEPS
 from flowing_puppet_ros.fusion.ownership import assign_points
 from flowing_puppet_ros.fusion.people_fitter import PeopleFitter
@@ -39,6 +40,8 @@ MAX_AGE_NS = 1_000_000_000
 """Age of a person's last body up to which it helps the next fit."""
 MAX_PLANE_MOMENTS = 40
 """Moments after which floor and walls are searched again though they are still there."""
+MAX_BESIDE_M = 0.15
+"""From a fitted body, within which points are nobody else's: hair, clothes and pixels at edges would be new people."""
 MAX_CONTRADICTIONS = 3
 """Moments in a row in which a camera's silhouette of somebody contradicts the depth, from which on it is said."""
 
@@ -122,6 +125,8 @@ class RigPeople:
         for identity, track in list(self._tracks.items()):
             if stamp - track.stamp > self._hold_ns:
                 del self._tracks[identity]
+        for body in found:
+            own |= _find_beside(scene.points, body.fit.vertices)
         return found, own
 
     def _share_out(
@@ -209,3 +214,12 @@ class RigPeople:
             return error
         track.tracker.start(cloud or PersonCloud(fit.vertices, None, stamp), fit)
         return fit
+
+
+def _find_beside(points: F64, vertices: F64) -> Bools:
+    """Return which points (N, 3) m lie at a body with `vertices` (V, 3) m."""
+    low, high = vertices.min(axis=0) - MAX_BESIDE_M, vertices.max(axis=0) + MAX_BESIDE_M
+    beside = ((points > low) & (points < high)).all(axis=1)
+    near = NearestPoints(vertices).query(np.ascontiguousarray(points[beside]))[0] < MAX_BESIDE_M
+    beside[beside] = near
+    return beside

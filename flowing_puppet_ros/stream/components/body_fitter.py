@@ -351,7 +351,8 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         if "silhouettes" in self._expected:
             bodies, own = self._joined.fit(scene, stamp, header.frame_id, place)
             others, occluded = ([], []) if own.all() else step(scene.take(~own), seed)
-            return [*bodies, *others], self._joined.add_others(others, occluded), []
+            others, occluded = self._joined.add_others(others, occluded)
+            return [*bodies, *others], occluded, []
         if "puppets" not in self._expected or not self.settings.scene:
             return *step(scene, seed), []
         try:
