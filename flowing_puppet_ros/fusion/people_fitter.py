@@ -53,7 +53,7 @@ class FusionSettings(Settings):
     )  # fmt: skip
     wait: float = setting(
         2.0,
-        "time by which the puppets may lag behind the clouds before these are used without waiting for them",
+        "time by which puppets or silhouettes may lag behind the clouds before these are used without waiting for them",
         unit="s", low=0.0, high=10.0, advanced=True,
     )  # fmt: skip
     colour_only: bool = setting(
