@@ -17,8 +17,8 @@ from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.body.track.seen_free import SeenFree
 from flowing_puppet_ros.body.upright import person_finder
-from flowing_puppet_ros.body.upright.decision_trees import DecisionTrees
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder
+from flowing_puppet_ros.body.upright.person_model import DecisionTrees
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
 from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank
 from flowing_puppet_ros.evaluate.scene.scene_meshes import MAKERS

@@ -19,8 +19,8 @@ from flowing_puppet_ros.body.fit import hypotheses
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.pose_bank import PoseBank
 from flowing_puppet_ros.body.fit.single_view_search import SingleViewSearch
-from flowing_puppet_ros.body.refine import gauss_newton
 from flowing_puppet_ros.body.refine.normal_equations import NormalEquations
+from flowing_puppet_ros.body.refine.tree_solution import TreeSolution
 from flowing_puppet_ros.body.search import dpmp
 from flowing_puppet_ros.body.search.body_energy import BodyEnergy
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch
@@ -51,7 +51,7 @@ REFINEMENT: dict[str, list[tuple[Any, str]]] = {
     "correspondences": [(TwoWayCorrespondence, "attract")],
     "points of the body": [(BodyPoints, "pose")],
     "normal equations": [(NormalEquations, name) for name in ("add_surface", "add_stitching", "add_joint_prior")],
-    "solution": [(gauss_newton, "_solve_lower")],
+    "solution": [(TreeSolution, "solve")],
     "confidence": [(fitting, "assess_fit"), (hypotheses, "assess_fit")],
     "energy": [(BodyEnergy, "measure")],
 }

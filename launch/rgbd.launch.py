@@ -12,7 +12,7 @@ from launch import LaunchDescription
 from launch_ros.actions import Node
 
 from flowing_puppet_ros.node.launching.actions import Values, describe_launch, humans, make_node
-from flowing_puppet_ros.node.launching.rgbd_topics import find_rgbd
+from flowing_puppet_ros.node.launching.rgbd_topics import find_rgbd, list_depth_topics
 
 ARGUMENTS = {
     "camera": (
@@ -33,12 +33,10 @@ def start(values: Values) -> list[Node]:
 
     Of several cameras, the body fitter of all their depth images.
     """
-    cameras = [name.strip("/") for name in values["camera"].split(",")]
+    cameras = values["camera"].split(",")
     if len(cameras) > 1:
-        found = {name: find_rgbd(name) for name in cameras}
-        inputs = {f"{name}/depth": topics.depth for name, topics in found.items()}
-        inputs |= {f"{name}/camera_info": topics.depth_info for name, topics in found.items()}
-        return [make_node(values, "body_fitter", inputs, **{"rig.cameras": ",".join(cameras)}, **humans(values))]
+        inputs, rig = list_depth_topics(cameras)
+        return [make_node(values, "body_fitter", inputs, **rig, **humans(values))]
     topics = find_rgbd(values["camera"])
     images = {"image": topics.image, "detections": values["detections"]}
     tracker = make_node(values, "puppet_tracker", images, **{"flow.preset": values["flow"]})

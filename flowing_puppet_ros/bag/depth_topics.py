@@ -25,6 +25,8 @@ PREFERRED_NAMES = ("depth", "image_rect", "image_rect_raw", "image_raw")
 RIG_DEPTHS_M, RIG_GRID, MIN_COMMON_SHARE = (1.0, 2.0, 3.0, 4.0, 5.0), 5, 0.1
 """Depths and pixels of the places by which it is told whether two cameras see the same, and the share of those that one
 of them sees and the other could."""
+MIN_BASELINE_M = 0.5
+"""Between a depth camera and a colour camera from which on this sees another side of people."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +196,30 @@ def find_rig(depths: Sequence[DepthTopic], infos: Mapping[str, Any], frames: Fra
         if any(_see_the_same(infos[depth.info], infos[other.info], frames) for other in usable if other is not depth)
     ]
     return found if len(found) > 1 else []
+
+
+def find_rig_of_cameras(
+    depths: Sequence[DepthTopic], cameras: Sequence[Any], infos: Mapping[str, Any], frames: FrameTree
+) -> list[DepthTopic]:
+    """Return the depth cameras that look at the people whom colour `cameras` (CameraInfo) around them show.
+
+    Of those that stand beside a depth camera it has no need: they would show the same side.
+    """
+    return [
+        depth
+        for depth in depths
+        if depth.info in infos
+        and any(
+            _see_the_same(infos[depth.info], camera, frames) and _stand_apart(infos[depth.info], camera, frames)
+            for camera in cameras
+        )
+    ]
+
+
+def _stand_apart(first: Any, second: Any, frames: FrameTree) -> bool:
+    """Return whether two cameras, by their CameraInfo, are no pair side by side in one housing."""
+    pose = frames.lookup_pose(*(info.header.frame_id.lstrip("/") for info in (first, second)))
+    return pose is not None and float(np.linalg.norm(pose[0])) >= MIN_BASELINE_M
 
 
 def _see_the_same(first: Any, second: Any, frames: FrameTree) -> bool:

@@ -8,7 +8,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from flowing_puppet_ros.bag.colour_topics import ColourTopics, choose_colour, find_colour_topics
-from flowing_puppet_ros.bag.depth_topics import DepthTopic, ImageSample, find_rig, holds_depth, select_depth_topics
+from flowing_puppet_ros.bag.depth_topics import (
+    DepthTopic,
+    ImageSample,
+    find_rig,
+    find_rig_of_cameras,
+    holds_depth,
+    select_depth_topics,
+)
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.settings import Settings
@@ -119,7 +126,8 @@ def build_graph(
     - One tracker per camera.
     - One visual hull of two or more cameras that `frames` connects (`infos`: topic -> its first CameraInfo), and one
       body fitter for its silhouettes.
-    - One body fitter for all depth cameras that `frames` connects and that look at the same people.
+    - One body fitter for all depth cameras that `frames` connects and that look at the same people; it is the one for
+      the silhouettes too, if these are of the same people.
     - One body fitter for every other topic of clouds or depth images (`samples`: image topic -> its first image;
       `cloud_frames`: cloud topic -> its frame), joined with the puppets of a colour camera that looks there too.
 
@@ -135,6 +143,7 @@ def build_graph(
         raise InputError("; ".join([_describe_unusable(topics), *depth_notes]))
     graph = Graph([_make_tracker(camera, topics, settings, factory) for camera in cameras])
     graph.notes += [*_note_missing_detections(graph.instances, topics), *depth_notes]
+    calibrated: list[CameraTopics] = []
     if len(cameras) >= MIN_CAMERAS:
         calibrated, note = _select_calibrated(cameras, moving or frames, infos)
         graph.notes += [note] if note else []
@@ -142,8 +151,13 @@ def build_graph(
             graph.instances += _make_hull_and_fitter(calibrated, settings, factory)
     made = graph.find_outputs()
     rig = find_rig(depths, infos, frames)
+    around = [infos[f"{camera.namespace}/camera_info"] for camera in calibrated] if len(calibrated) > 1 else []
+    joined = find_rig_of_cameras(depths, around, infos, frames)
+    if joined:  # what the silhouettes show and what depth shows is one body
+        rig = [depth for depth in depths if depth in (*rig, *joined)]
+        graph.instances = [each for each in graph.instances if each.name != "body_fitter"]
     if rig:
-        graph.instances.append(_make_rig_fitter(rig, "/bodies" in made, settings, factory))
+        graph.instances.append(_make_rig_fitter(rig, bool(joined), "/bodies" in made, settings, factory))
         depths = [depth for depth in depths if depth not in rig]
     sources: list[str | DepthTopic] = [*(cloud for cloud in clouds if cloud not in made), *depths]
     trackers = {tracker.resolve("image"): tracker for tracker in graph.instances if "image" in tracker.remapped}
@@ -303,17 +317,25 @@ def _make_scene_fitter(
 
 
 def _make_rig_fitter(
-    rig: list[DepthTopic], has_bodies: bool, settings: Mapping[str, Mapping[str, Any]], factory: MessageFactory
+    rig: list[DepthTopic],
+    has_silhouettes: bool,
+    has_bodies: bool,
+    settings: Mapping[str, Mapping[str, Any]],
+    factory: MessageFactory,
 ) -> Instance:
-    """Return the body fitter for several depth cameras together; below `depth_cameras` where others make /bodies."""
+    """Return the body fitter for depth cameras together, with the silhouettes of the same people if there are any.
+
+    Without, it is below `depth_cameras` where others make /bodies.
+    """
     fixed = {"rig.cameras": ",".join(depth.name for depth in rig)}
     chosen = {"": {**fixed, **settings.get("body_fitter", {})}}
-    remapped = {"silhouettes": ""}
+    remapped = {"silhouettes": "/silhouettes" if has_silhouettes else ""}
     for depth in rig:
         remapped |= {f"{depth.name}/depth": depth.image, f"{depth.name}/camera_info": depth.info}
         remapped[f"{depth.name}/points"] = ""
     fitter = BodyFitterComponent(_make_settings(BodyFitterSettings, "", chosen), factory)
-    namespace = "/depth_cameras" if has_bodies else ""
+    fitter.set_expected("silhouettes", has_silhouettes)
+    namespace = "/depth_cameras" if has_bodies and not has_silhouettes else ""
     return Instance(f"{namespace}/body_fitter".lstrip("/"), fitter, namespace, remapped)
 
 

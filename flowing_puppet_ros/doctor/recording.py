@@ -137,7 +137,9 @@ def _describe(instance: Instance, recorded: Mapping[str, str], samples: Mapping[
         return f"silhouettes, visual hull and triangulated joints from the cameras {', '.join(cameras)}"
     if isinstance(rig := instance.component.settings.values().get("rig.cameras"), str) and rig:
         seen = sorted(name for port, name in recorded.items() if port.endswith(("/depth", "/points")))
-        return f"one body a person from {' and '.join(seen) or rig} together, joined by /tf"
+        seen = [" and ".join(seen) or rig]
+        seen += [f"the silhouettes on {silhouettes}"] if (silhouettes := instance.resolve("silhouettes")) else []
+        return f"one body a person from {' with '.join(seen)} together, joined by /tf"
     if "points" in recorded:
         return f"bodies in the clouds on {rated('points')}"
     if "depth" in recorded:

@@ -14,7 +14,9 @@ from dataclasses import replace
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
@@ -31,13 +33,15 @@ from flowing_puppet_ros.fusion.limb_search import LimbSearcher, find_on_surface
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-PULLED = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=14)
+PULLED = RefineWeights(
+    pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=14, alternate=2
+)
 """With joints, from far away."""
-EXCHANGED = replace(PULLED, iterations=8, alternate=2)
+EXCHANGED = replace(PULLED, iterations=8)
 """The same with left and right exchanged, enough to see whether it is worth more."""
 FREE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.06, sigma_end=0.03, iterations=8)
 """Without joints, at the end."""
-CLOSE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.08, sigma_end=0.04, iterations=6)
+CLOSE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.08, sigma_end=0.04, iterations=6, alternate=2)
 """With joints, after a limb has been hung anew."""
 MAX_FIT_POINTS = 4000
 MAX_SWAP_RATIO = 0.9
@@ -109,6 +113,12 @@ class JointFitter:
         points = downsample(points, None, MAX_FIT_POINTS)[0]
         viewpoint = np.zeros(3) if viewpoint is None else viewpoint
         return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, field=field)
+
+    def take_cloud(self, person: PersonCloud, known: Cloud | None) -> SingleViewCloud:
+        """Return a person's cloud, as it is `known` already where that is one of a single view."""
+        if isinstance(known, SingleViewCloud):
+            return known
+        return self.make_cloud(person.points, person.field, person.viewpoint)
 
     def fit(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
         """Fit a body to the person's points, from `start`.

@@ -8,19 +8,21 @@ without points of the person around it has no depth: it counts across the ray on
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
-from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.fusion.limb_depths import (
     CHAINS,
+    HALF_SEEN_CONFIDENCE,
     LIMB_REACH_M,
     TRUNK_REACH_M,
     DepthChoices,
     choose_depths,
+    expect_depth,
     list_choices,
     measure_seen_share,
 )
@@ -36,10 +38,18 @@ BEHIND_SURFACE_M = {
 RADIUS_M, MIN_RADIUS_PX = 0.04, 2.5
 """Around a joint, within which the person's points give its depth."""
 MIN_POINTS = 3
+MISSED_FACTOR = 2.0
+"""Of the radius around a sure joint without any of the person's points within it: its pixel is beside a thin limb."""
 SURFACE_GAP_M, MIN_SURFACE_SHARE, MAX_SURFACES = 0.08, 0.15, 3
 """Between the depths of two surfaces, share of a surface in the points around a joint, and how many there may be."""
 CHOSEN = {name for chain in CHAINS for name in chain}
 """Joints whose depth is chosen among several."""
+MAX_EXPECTED_GAP_M, MIN_EXPECTED = 0.12, 3
+"""Between a ray and where its joint is expected, beyond which the depth there tells nothing, and joints of the trunk
+that tell its depth."""
+SAME_PLACE_M, MIN_TRUNK_GAP_M, MIN_OTHER_CONFIDENCE = 0.12, 0.1, 0.3
+"""Between the joints of two people of which one was lifted onto the other, by how much it is nearer to the other's
+trunk than to its own along the axis, and what a joint that may be the other's counts at least."""
 MAX_TRUNK_DEPTH_M, MAX_LIMB_DEPTH_M = 0.45, 0.8
 """From the trunk's depth, within which the joints of trunk and limbs are."""
 
@@ -72,7 +82,9 @@ class LiftedJoints:
         return np.isfinite(self.points).all(axis=1)
 
 
-def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, usable: Bools) -> LiftedJoints:
+def lift_joints(
+    model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, usable: Bools, expected: F64 | None = None
+) -> LiftedJoints:
     """Lift the joints of a puppet into a cloud.
 
     Args:
@@ -80,13 +92,22 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
         puppet: joints in the image of the cloud's camera.
         cloud: the cloud with pixels.
         usable: (N,) which points may be the person's.
+        expected: (J, 3) metres, where the joints should be, None for a person who is new.
     """
     offsets = np.array([BEHIND_SURFACE_M.get(_kind(name), 0.0) for name in model.joint_names])
-    samples, beyond = _collect_samples(puppet, cloud, usable)
+    rays, axis = cloud.camera.cast_rays(puppet.pixels), cloud.camera.rotation[2]
+    samples, beyond = _collect_samples(puppet, cloud, usable, np.flatnonzero(puppet.known))
     outside = _find_outside(puppet, cloud)
     trunk = trunk_rows(model)
-    depth = _find_trunk_depth(puppet, samples, trunk)
-    rays, axis = cloud.camera.cast_rays(puppet.pixels), cloud.camera.rotation[2]
+    should = _expect_depths(expected, rays, cloud)
+    depth = _find_trunk_depth(puppet, samples, trunk, should[trunk])
+    missed = [
+        joint
+        for joint, values in samples.items()
+        if puppet.confidence[joint] >= HALF_SEEN_CONFIDENCE
+        and np.count_nonzero(np.abs(values - depth) < MAX_LIMB_DEPTH_M) < MIN_POINTS
+    ]
+    samples.update(_collect_samples(puppet, cloud, usable, np.array(missed, dtype=np.int64), MISSED_FACTOR)[0])
     points = np.full((len(offsets), 3), np.nan)
     hidden = puppet.hidden.copy()
     choices: dict[int, DepthChoices] = {}
@@ -105,12 +126,44 @@ def lift_joints(model: StitchedPuppet, puppet: PuppetJoints, cloud: SeenCloud, u
             TRUNK_REACH_M if near_trunk else LIMB_REACH_M,
             measure_seen_share(puppet.confidence[joint], bool(puppet.hidden[joint])),
         )  # fmt: skip
+        if np.isfinite(should[joint]):
+            choices[joint] = expect_depth(choices[joint], float(should[joint]))
     for joint, choice in choose_depths(model, choices).items():
         points[joint] = choices[joint].points[choice]
         hidden[joint] |= not choices[joint].seen[choice]
     found = np.isfinite(points).all(axis=1)
     confidence = np.where(found, puppet.confidence, 0.0)
     return LiftedJoints(points, rays, confidence, hidden, depth, cloud.camera.centre, choices)
+
+
+def find_lifted_onto_others(people: Sequence[LiftedJoints], axis: F64) -> list[Bools]:
+    """Return which joints (J,) of each of the people of one image were probably lifted onto another of them.
+
+    Where an arm is behind a neighbour's, a network may take that for it, and be sure. The neighbour has a joint there,
+    and a trunk that is clearly nearer to it along the camera's `axis` (3,).
+    """
+    found = []
+    depth = [(joints.points - joints.centre) @ axis for joints in people]
+    for own, (joints, along) in enumerate(zip(people, depth, strict=True)):
+        onto = np.zeros(len(along), dtype=bool)
+        for other, theirs in enumerate(people):
+            sure = theirs.found & ~theirs.hidden & (theirs.confidence >= MIN_OTHER_CONFIDENCE)
+            if other == own or not sure.any():
+                continue
+            gap = np.linalg.norm(joints.points[:, None] - theirs.points[sure], axis=2).min(axis=1)
+            nearer = np.abs(along - theirs.depth) + MIN_TRUNK_GAP_M < np.abs(along - joints.depth)
+            onto |= (gap < SAME_PLACE_M) & nearer
+        found.append(onto)
+    return found
+
+
+def _expect_depths(expected: F64 | None, rays: F64, cloud: SeenCloud) -> F64:
+    """Return the depths (J,) m of `expected` joints, NaN where the puppet sees a joint elsewhere."""
+    if expected is None:
+        return np.full(len(rays), np.nan)
+    place = expected - cloud.camera.centre
+    across = np.linalg.norm(np.cross(place, rays), axis=1)
+    return np.where(across < MAX_EXPECTED_GAP_M, place @ cloud.camera.rotation[2], np.nan)
 
 
 def _find_outside(puppet: PuppetJoints, cloud: SeenCloud) -> Bools:
@@ -158,12 +211,16 @@ def _find_surfaces(depth: F64) -> F64:
     return found
 
 
-def _collect_samples(puppet: PuppetJoints, cloud: SeenCloud, usable: Bools) -> tuple[dict[int, F64], dict[int, F64]]:
-    """Return for every known joint the depths, in metres, of the `usable` (N,) points around it, and of the others."""
-    known = np.flatnonzero(puppet.known)
+def _collect_samples(
+    puppet: PuppetJoints, cloud: SeenCloud, usable: Bools, known: I64, factor: float = 1.0
+) -> tuple[dict[int, F64], dict[int, F64]]:
+    """Return for the `known` joints the depths, in metres, of the `usable` (N,) points around each, and of the others.
+
+    They are within `factor` of the usual radius.
+    """
     if not len(known):
         return {}, {}
-    joint, row = _find_around(puppet.pixels[known], cloud.pixels, cloud.depth, cloud.camera.focal)
+    joint, row = _find_around(puppet.pixels[known], cloud.pixels, cloud.depth, factor * cloud.camera.focal)
     own, depth = usable[row], cloud.depth[row]
     return (
         {int(number): depth[(joint == k) & own] for k, number in enumerate(known)},
@@ -193,16 +250,20 @@ def _find_around(joints, pixels, depth, focal):  # type: ignore[no-untyped-def]
     return found_joint[:count], found_row[:count]
 
 
-def _find_trunk_depth(puppet: PuppetJoints, samples: dict[int, F64], trunk: list[int]) -> float:
+def _find_trunk_depth(puppet: PuppetJoints, samples: dict[int, F64], trunk: list[int], expected: F64) -> float:
     """Return the median depth of the trunk, of all joints where the trunk has none, or NaN.
 
-    Joints count by their squared confidence: at hidden hips, the cloud shows the table before them.
+    Joints count by their squared confidence: at hidden hips, the cloud shows the table before them. Where most of its
+    joints have an `expected` depth, metres, NaN elsewhere, the wall beside the shoulders does not count.
     """
+    middle = float(np.nanmean(expected)) if np.count_nonzero(np.isfinite(expected)) >= MIN_EXPECTED else np.nan
     for joints in (trunk, list(samples)):
-        known = [joint for joint in joints if len(samples.get(joint, ())) >= MIN_POINTS]
+        known = {joint: samples[joint] for joint in joints if len(samples.get(joint, ())) >= MIN_POINTS}
+        near = {joint: values[np.abs(values - middle) < MAX_TRUNK_DEPTH_M] for joint, values in known.items()}
+        known = {joint: values for joint, values in near.items() if len(values) >= MIN_POINTS} or known
         if known:
-            depth = np.array([np.median(samples[joint]) for joint in known])
-            return _find_weighted_median(depth, puppet.confidence[known] ** 2)
+            depth = np.array([np.median(values) for values in known.values()])
+            return _find_weighted_median(depth, puppet.confidence[list(known)] ** 2)
     return float("nan")
 
 

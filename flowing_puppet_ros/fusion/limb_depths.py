@@ -11,7 +11,7 @@ sizes.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -42,6 +42,9 @@ SEEN_RANGE = (0.05, 0.95)
 """Of the probability that a joint is seen."""
 OWN_HIDDEN_FACTOR = 0.3
 """Of the probability that a joint is seen which the puppet's own parts hide."""
+EXPECTED_DEVIATION_M, MAX_EXPECTED_COST = 0.1, 4.0
+"""Standard deviation of a joint's depth where the clouds before let it be expected, and what it costs at most to be
+elsewhere."""
 MISSED = 0.1
 """Probability that the pixel misses the person so far that the joint is nearer than what the pixel shows."""
 
@@ -105,6 +108,15 @@ def measure_seen_share(confidence: float, hidden: bool) -> float:
     """Return the probability that a joint of a confidence (0 to 1) is seen; `hidden` by the puppet's own parts."""
     share = 1 / (1 + np.exp(-(confidence - HALF_SEEN_CONFIDENCE) / CONFIDENCE_WIDTH))
     return float(np.clip(share * (OWN_HIDDEN_FACTOR if hidden else 1.0), *SEEN_RANGE))
+
+
+def expect_depth(choices: DepthChoices, expected: float) -> DepthChoices:
+    """Return the choices of a joint that should be at an `expected` depth, metres, as it was in the clouds before.
+
+    A pixel beside a thin limb shows what is behind it.
+    """
+    gap = (choices.depth - expected) / EXPECTED_DEVIATION_M
+    return replace(choices, cost=choices.cost + np.minimum(0.5 * gap**2, MAX_EXPECTED_COST))
 
 
 def choose_depths(model: StitchedPuppet, choices: Mapping[int, DepthChoices]) -> dict[int, int]:

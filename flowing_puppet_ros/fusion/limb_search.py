@@ -17,7 +17,13 @@ from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
 from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
 from flowing_puppet_ros.fusion.lift import LiftedJoints
-from flowing_puppet_ros.fusion.limb_depths import SLOPE_M, measure_bone_cost, measure_limb_cost, measure_seen_share
+from flowing_puppet_ros.fusion.limb_depths import (
+    HALF_SEEN_CONFIDENCE,
+    SLOPE_M,
+    measure_bone_cost,
+    measure_limb_cost,
+    measure_seen_share,
+)
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
 LIMB_PARTS = {
@@ -44,6 +50,10 @@ MAX_GAP_M, MAX_SEEN_GAP_M = 0.06, 0.12
 """Between a joint and its ray, and its place on a surface, beyond which a limb may be in a wrong place."""
 LOST_GAP_M, LOST_SEEN_GAP_M = 0.09, 0.15
 """The same of a tracked body, beyond which its limb is lost."""
+GUESSED_GAP_M = 0.2
+"""Between a joint that is as likely hidden as seen and its ray, which a guess of it misses by less."""
+STRAYED_GAP_M, STRAYED_SEEN_GAP_M = 0.1, 0.2
+"""Between a joint and its ray, and its place on a surface, beyond which closest points would not bring a limb back."""
 WRONG_GAP_M, WRONG_SEEN_GAP_M = 0.12, 0.2
 """The same, beyond which a body cannot be relied on."""
 MIN_SEEN_SHARE = 0.9  # probability that a joint is seen, below which its limb may be in a wrong place
@@ -109,8 +119,35 @@ class LimbSearcher:
 
     def find_lost(self, body: BodyState, joints: LiftedJoints) -> list[int]:
         """Return the limbs of a tracked body of which a joint is certainly not where the puppet sees it."""
+        return self._find_far(body, joints, LOST_GAP_M, LOST_SEEN_GAP_M)
+
+    def find_strayed(self, body: BodyState, joints: LiftedJoints) -> list[int]:
+        """Return the limbs of which a joint is certainly not where a tracked body's motion would bring it."""
+        return self._find_far(body, joints, STRAYED_GAP_M, STRAYED_SEEN_GAP_M)
+
+    def _find_far(self, body: BodyState, joints: LiftedJoints, max_across: float, max_gap: float) -> list[int]:
         across, gap = self._measure_gaps(body, joints)
-        return self._find_limbs((across > LOST_GAP_M) | (~_find_doubtful(joints) & (gap > LOST_SEEN_GAP_M)), joints)
+        far = np.where(joints.confidence < HALF_SEEN_CONFIDENCE, GUESSED_GAP_M, max_across)
+        return self._find_limbs((across > far) | (~_find_doubtful(joints) & (gap > max_gap)), joints)
+
+    def point(self, body: BodyState, joints: LiftedJoints, limbs: Sequence[int]) -> BodyState:
+        """Return the body with `limbs` pointed from where they join the trunk to where their joints are.
+
+        That is where they were lifted to, or, where that is in doubt, the nearest place on their rays; joints that do
+        not count leave their part as it is bent.
+        """
+        before, used, doubtful = states_to_particles(self._model, [body]), _can_count(joints), _find_doubtful(joints)
+        groups, places = list(before), self._model.joints(self._model.vertices(body))
+        along = ((places - joints.centre) * joints.rays).sum(axis=1, keepdims=True)
+        places = np.where(doubtful[:, None], joints.centre + along * joints.rays, joints.points)
+        for limb in limbs:
+            for part in self._limbs[limb][0]:
+                above = self._model.tree.parents[part]
+                groups[part] = self._proposer.reattach(part, groups[above], before, above)
+                joint = self._far_joint.get(part)
+                if joint is not None and used[joint]:
+                    groups[part] = self._proposer.point_to(part, groups[part], joint, places[joint][None])
+        return particles_to_state(self._model, groups, np.zeros(len(groups), dtype=np.int64))
 
     def contradicts(self, body: BodyState, joints: LiftedJoints) -> bool:
         """Return whether a joint of a limb is far from where the puppet surely sees it."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.cloud.limb_crop import list_capsules
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
@@ -17,7 +18,7 @@ from flowing_puppet_ros.body.segmentation.planes import PlaneCache, find_planes,
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.fusion.joint_fit import FEW_STEPS, HIDDEN_SHARE, MIN_LIMB_CONFIDENCE, JointFitter
-from flowing_puppet_ros.fusion.lift import LiftedJoints, lift_joints
+from flowing_puppet_ros.fusion.lift import LiftedJoints, find_lifted_onto_others, lift_joints
 from flowing_puppet_ros.fusion.ownership import assign_points
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, trunk_rows
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
@@ -27,6 +28,8 @@ from flowing_puppet_ros.threads import one_blas_thread, parallel_map, usable_thr
 
 MAX_LIMB_M = 0.6
 """Length of a limb that takes points by itself."""
+JOINT_RADIUS_M = 0.04
+"""Of a limb at a sure joint, which takes points though the next joint towards the trunk is not known."""
 MIN_PLACES, PLACE_WEIGHT = 4, 0.1
 """Joints by whose places a body is moved, at least, and the weight of a certain one."""
 CLAIM_ROUNDS = 2
@@ -50,7 +53,7 @@ class FusionSettings(Settings):
     )  # fmt: skip
     wait: float = setting(
         2.0,
-        "time by which the puppets may lag behind the clouds before these are used without waiting for them",
+        "time by which puppets or silhouettes may lag behind the clouds before these are used without waiting for them",
         unit="s", low=0.0, high=10.0, advanced=True,
     )  # fmt: skip
     colour_only: bool = setting(
@@ -144,7 +147,7 @@ class PeopleFitter:
             The claims of the puppets that have enough points, and the points (N,) of the others.
         """
         bodies = list(known) or [None] * len(puppets)
-        own = [clear] * len(puppets)
+        puppets, own = list(puppets), [clear] * len(puppets)
         claims: list[Claim | None] = []
         extra = [self._list_body(body) for body in others]
         for _round in range(CLAIM_ROUNDS if any(body is None for body in bodies) else 1):
@@ -152,46 +155,69 @@ class PeopleFitter:
                 self._start(cloud, puppet, points, body)
                 for puppet, points, body in zip(puppets, own, bodies, strict=True)
             ]
+            for number in self._hide_others(puppets, claims, cloud):
+                claims[number] = self._start(cloud, puppets[number], own[number], bodies[number])
             limbs = [np.empty((0, 8)) if claim is None else self._list_capsules(claim) for claim in claims]
             owner = np.full(len(cloud.points), -1, dtype=np.int32)
             owner[clear] = assign_points(cloud.points[clear], [*limbs, *extra])
             own = [owner == number for number in range(len(puppets))]
         found = [
-            replace(claim, joints=lift_joints(self.model, claim.puppet, cloud, points), own=points)
-            for claim, points in zip(claims, own, strict=True)
+            replace(claim, joints=self._lift(claim.puppet, cloud, points, body), own=points)
+            for claim, points, body in zip(claims, own, bodies, strict=True)
             if claim is not None and np.count_nonzero(points) >= self.min_points
         ]
         return found, [owner == len(puppets) + number for number in range(len(others))] if claims or others else []
+
+    @staticmethod
+    def _hide_others(puppets: list[PuppetJoints], claims: Sequence[Claim | None], cloud: SeenCloud) -> list[int]:
+        """Call the joints hidden that were lifted onto another person; return the numbers of the puppets with such."""
+        known = [(number, claim.joints) for number, claim in enumerate(claims) if claim is not None]
+        onto = find_lifted_onto_others([joints for _, joints in known], cloud.camera.rotation[2])
+        changed = []
+        for (number, _), hidden in zip(known, onto, strict=True):
+            if (hidden & ~puppets[number].hidden).any():
+                puppets[number] = replace(puppets[number], hidden=puppets[number].hidden | hidden)
+                changed.append(number)
+        return changed
 
     def _start(self, cloud: SeenCloud, puppet: PuppetJoints, usable: Bools, body: BodyState | None) -> Claim | None:
         """Return a puppet's joints on the `usable` (N,) points and the body that they describe, None without one.
 
         Where the body should be is known better from the clouds before: then it is `body`.
         """
-        joints = lift_joints(self.model, puppet, cloud, usable)
+        joints = self._lift(puppet, cloud, usable, body)
         try:
             return Claim(puppet, joints, self.joint_fitter.start(joints, FEW_STEPS) if body is None else body, usable)
         except InputError:
             return None
 
+    def _lift(self, puppet: PuppetJoints, cloud: SeenCloud, usable: Bools, body: BodyState | None) -> LiftedJoints:
+        """Lift a puppet's joints onto the `usable` (N,) points, those of somebody known to where `body` has them."""
+        expected = None if body is None else self.model.joints(self.model.vertices(body))
+        return lift_joints(self.model, puppet, cloud, usable, expected)
+
     def _list_capsules(self, claim: Claim) -> F64:
-        """Return the capsules (C, 8) of a body, and of limbs with known joints, should the body miss them."""
-        names, joints = self.model.joint_names, claim.joints
-        usable = joints.found & (joints.confidence >= MIN_LIMB_CONFIDENCE)
-        seen = {name: place for name, place, sure in zip(names, joints.points, usable, strict=True) if sure}
-        limbs = list_capsules(seen)
+        """Return the capsules (C, 8) of a body, and of limbs that end in sure joints, should the body miss them."""
+        joints, numbers = claim.joints, {name: number for number, name in enumerate(self.model.joint_names)}
+        found = {name: joints.points[number] for name, number in numbers.items() if joints.found[number]}
+        sure = {name for name in found if joints.confidence[numbers[name]] >= MIN_LIMB_CONFIDENCE}
+        limbs = list_capsules(found, sure)
         limbs = limbs[np.linalg.norm(limbs[:, :3] - limbs[:, 3:6], axis=1) < MAX_LIMB_M]
-        return np.concatenate([self._list_body(claim.start), limbs])
+        ends = np.array([[*found[name], *found[name], JOINT_RADIUS_M, JOINT_RADIUS_M] for name in sure if "_" in name])
+        return np.concatenate([self._list_body(claim.start), limbs, ends.reshape(-1, 8)])
 
     def _list_body(self, body: BodyState) -> F64:
         return list_capsules(
             dict(zip(self.model.joint_names, self.model.joints(self.model.vertices(body)), strict=True))
         )
 
-    def fit_claim(self, claim: Claim, person: PersonCloud) -> BodyFit | None:
-        """Return the body of a puppet's own points, from its joints; None where there is none."""
+    def fit_claim(self, claim: Claim, person: PersonCloud, known: Cloud | None = None) -> BodyFit | None:
+        """Return the body of a puppet's own points, from its joints; None where there is none.
+
+        `known` is the person's cloud as a tracker has prepared it.
+        """
         try:
-            cloud = self.joint_fitter.make_cloud(person.points, person.field, person.viewpoint)
+            cloud = self.joint_fitter.take_cloud(person, known)
             return self.joint_fitter.fit(cloud, self.joint_fitter.start(claim.joints), claim.joints)
         except InputError:
             return None

@@ -203,14 +203,15 @@ class FusedTracker:
         """Return the person's body: tracked, or fitted from the joints where there is none, or none that is good."""
         tracker, claim = job.track.tracker, job.claim
         try:
-            targets = None if claim is None else self._make_targets(claim, tracker.predict(stamp))
+            predicted = tracker.predict(stamp)
+            targets = None if claim is None else self._make_targets(claim, predicted)
             places = None if claim is None else self._people.find_places(claim)
-            fit = tracker.track(job.person, targets, places)
+            fit = tracker.track(job.person, targets, places, self._point_limbs(predicted, claim))
             if claim is None:
                 return None if tracker.lost else fit
             doubtful = fit is not None and not fit.reliable and not tracker.hidden and job.track.refit.is_due(stamp)
             if fit is None or tracker.lost or doubtful:
-                fresh = self._people.fit_claim(claim, job.person)
+                fresh = self._people.fit_claim(claim, job.person, tracker.cloud)
                 limit = np.inf if fit is None else BETTER_SHARE * fit.two_way_distance
                 better = fresh is not None and fresh.two_way_distance < limit
                 job.track.refit.record(stamp, better)
@@ -224,6 +225,17 @@ class FusedTracker:
             return error
         return fit
 
+    def _point_limbs(self, body: BodyState | None, claim: Claim | None) -> BodyState | None:
+        """Return the predicted body with the limbs pointed to their joints that are surely seen elsewhere."""
+        if body is None or claim is None:
+            return body
+        limbs = self._people.joint_fitter.limbs
+        strayed = limbs.find_strayed(body, claim.joints)
+        if not strayed:
+            return body
+        self._report.counters["limbs pointed to their joints"] += len(strayed)
+        return limbs.point(body, claim.joints, strayed)
+
     def _find_lost_limbs(self, job: _TrackJob, fit: BodyFit, claim: Claim, stamp: int) -> BodyFit:
         """Return the body with the limbs hung anew that the puppet sees elsewhere."""
         track, fitter = job.track, self._people.joint_fitter
@@ -232,7 +244,7 @@ class FusedTracker:
         lost = [limb for limb in lost if tries[limb].is_due(stamp)]
         if not lost or track.tracker.hidden:
             return fit
-        cloud = fitter.make_cloud(job.person.points, job.person.field)
+        cloud = fitter.take_cloud(job.person, track.tracker.cloud)
         found = fitter.hang_anew(cloud, fit.state, claim.joints, lost)
         for limb in lost:
             tries[limb].record(stamp, found is not None)

@@ -78,15 +78,19 @@ def mesh_edges(faces: I32) -> I64:
 class RimTerm:
     """The term of a mesh with fixed faces on outlines, a `SurfaceTerm` of `body.refine.gauss_newton`."""
 
-    def __init__(self, outlines: Sequence[Outline], faces: I32, edges: I64) -> None:
+    def __init__(self, outlines: Sequence[Outline], faces: I32, edges: I64, strength: float = 1.0) -> None:
         """Match with `outlines`; `faces` (F, 3) face outwards and `edges` (E, 2) are theirs."""
-        self._outlines, self._faces, self._edges = outlines, faces, edges
+        self._outlines, self._faces, self._edges, self._strength = outlines, faces, edges, strength
+
+    def scale(self, strength: float) -> RimTerm:
+        """Return the same term with `strength` times the weight."""
+        return RimTerm(self._outlines, self._faces, self._edges, strength * self._strength)
 
     def __call__(self, vertices: F64, sigma: float) -> VertexQuadratic:
         """Match vertices (V, 3) and return the quadratic that attracts them, with `geman_mcclure` of width `sigma` m.
 
         In every view all vertices have a total weight of 1, of which only those outside count, and so have the points
-        of the outline; the result is the mean over the views.
+        of the outline; the result is the mean over the views, times the strength.
         """
         normals = vertex_normals(vertices, self._faces)
         terms = [
@@ -98,7 +102,7 @@ class RimTerm:
             )
         ]
         vertex, direction, gap, weight = (np.concatenate(column) for column in zip(*terms, strict=True))
-        weight = weight / len(self._outlines)
+        weight = weight * self._strength / len(self._outlines)
         count = len(vertices)
         outer = weight[:, None, None] * direction[:, :, None] * direction[:, None, :]
         vector = (weight * gap)[:, None] * direction

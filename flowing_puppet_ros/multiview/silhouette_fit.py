@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of a Stitched Puppet to the silhouettes of one person in several calibrated cameras.
+"""The fit of a Stitched Puppet to the silhouettes of one person in several calibrated cameras, and to depth if known.
 
-Triangulated joints place the body, and Gauss-Newton over all parts fits its rim to the outlines. The body is then
-rendered: the overlap of its silhouettes with the observed ones tells a correct body from one with sides or limbs
-confused, which the outlines' residuals do not.
+Triangulated joints place the body, and Gauss-Newton over all parts fits its rim to the outlines, and its surface to
+what depth sensors saw. The body is then rendered: the overlap of its silhouettes with the observed ones tells a correct
+body from one with sides or limbs confused, which the outlines' residuals do not.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, I8, U8
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, flip_heading, make_joint_targets
 from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
@@ -41,6 +42,11 @@ _KERNEL_WIDTH_M = 0.04
 _MIN_SEEN_SHARE, _MIN_NEAR_SHARE = 0.64, 0.25
 # Joints place limbs along the rays and in front of the body; outlines determine everything else better.
 _WEIGHTS = RefineWeights(pose=1e-7, pairwise=1e-7, shape=2e-6, sigma_start=0.08, sigma_end=0.05)
+# With depth: first everything attracts what the joints place roughly; then depth, which tells more of the surface than
+# rough outlines and joints do, is followed closely, and outlines hold what it does not see.
+_WITH_DEPTH = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.12, sigma_end=0.03, iterations=14)
+_CLOSE_TO_DEPTH = replace(_WITH_DEPTH, sigma_start=0.06, iterations=8)
+_RIM_BESIDE_DEPTH = 0.2
 
 
 @dataclass(frozen=True)
@@ -71,8 +77,20 @@ class _Candidate:
     overlap: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evidence:
+    """What a body is fitted to: one or more `outlines`, and what depth sensors saw, None if nothing."""
+
+    outlines: Sequence[Outline]
+    cloud: SingleViewCloud | None
+
+    def take(self, views: Sequence[int]) -> _Evidence:
+        """Return the same with some of the outlines, by their indices."""
+        return replace(self, outlines=[self.outlines[view] for view in views])
+
+
 class SilhouetteFitter:
-    """The fit of one model to silhouettes, without randomness."""
+    """The fit of one model to silhouettes, and to depth where it is known, without randomness."""
 
     def __init__(self, model: StitchedPuppet, settings: SilhouetteFitterSettings | None = None) -> None:
         """Prepare Gauss-Newton for `model`."""
@@ -80,13 +98,13 @@ class SilhouetteFitter:
         self.settings = settings or SilhouetteFitterSettings()
         self._refiner = GaussNewton(model)
         self._edges = mesh_edges(model.faces)
-        self._weights = replace(_WEIGHTS, iterations=self.settings.gauss_newton_steps)
 
     def fit(
         self,
         views: Sequence[tuple[Camera, U8]],
         initial: Mapping[str, tuple[float, float, float, float]],
         previous: BodyState | None = None,
+        cloud: SingleViewCloud | None = None,
     ) -> BodyFit:
         """Fit the model to one person.
 
@@ -95,24 +113,28 @@ class SilhouetteFitter:
             initial: joints by name as (x, y, z in metres, confidence 0 to 1), in the cameras' world; NaN where unknown.
             previous: the body of the same person a moment ago. The fit starts from its shape, and from its pose only
                 where the joints are wrong or too few.
+            cloud: the person's own points of one or more depth sensors, in the same world.
 
         Returns:
             The fit; its `confidence` is the rendered overlap, its `energy` the mean squared residual in square metres.
+            Of the `cloud` they say nothing.
 
         Raises:
-            InputError: when fewer than two masks have an outline, or neither joints nor `previous` give a body.
+            InputError: when fewer than two masks have an outline, or none beside a `cloud`, or neither joints nor
+                `previous` give a body.
         """
         with one_blas_thread():
             outlines = [Outline.of(camera, mask) for camera, mask in views if 0 < np.count_nonzero(mask) < mask.size]
-            if len(outlines) < MIN_VIEWS:
+            needed = MIN_VIEWS if cloud is None else 1
+            if len(outlines) < needed:
                 raise InputError(
-                    f"{len(outlines)} of {len(views)} silhouettes show a person's outline, and a fit needs {MIN_VIEWS}"
+                    f"{len(outlines)} of {len(views)} silhouettes show a person's outline, and a fit needs {needed}"
                 )
-            return self._assess(self._find_best(outlines, initial, previous), outlines)
+            return self._assess(self._find_best(_Evidence(outlines, cloud), initial, previous), outlines)
 
     def _find_best(
         self,
-        outlines: Sequence[Outline],
+        evidence: _Evidence,
         initial: Mapping[str, tuple[float, float, float, float]],
         previous: BodyState | None,
     ) -> _Candidate:
@@ -123,13 +145,13 @@ class SilhouetteFitter:
         except InputError:
             if previous is None:
                 raise
-            return self._refit_without_outliers(outlines, self._refine(previous, outlines, none))
+            return self._refit_without_outliers(evidence, self._refine(previous, evidence, none))
         start = body_from_joints(self.model, self._refiner, targets)
         if previous is not None:
             start = replace(start, shape=previous.shape)
-        best = self._refit_without_outliers(outlines, self._refine(start, outlines, targets))
+        best = self._refit_without_outliers(evidence, self._refine(start, evidence, targets))
         if best.overlap < self.settings.min_iou:
-            seen = [outlines[view] for view in best.views]
+            seen = evidence.take(best.views)
             others = [self._refine(flip_heading(self.model, start), seen, self._swap_sides(targets))]
             if previous is not None:
                 others.append(self._refine(previous, seen, none))
@@ -138,27 +160,37 @@ class SilhouetteFitter:
             )
         return best
 
-    def _refine(self, start: BodyState, outlines: Sequence[Outline], targets: JointTargets) -> _Candidate:
-        term = RimTerm(outlines, self.model.faces, self._edges)
-        scaled = targets.scale(self.settings.joint_weight)
-        state = self._refiner.run(start, None, scaled, self._weights, [term])
+    def _refine(self, start: BodyState, evidence: _Evidence, targets: JointTargets) -> _Candidate:
+        outlines, scaled = evidence.outlines, targets.scale(self.settings.joint_weight)
+        rim = RimTerm(outlines, self.model.faces, self._edges)
+        if evidence.cloud is None:
+            weights = replace(_WEIGHTS, iterations=self.settings.gauss_newton_steps)
+            state = self._refiner.run(start, None, scaled, weights, [rim])
+        else:
+            state = self._refine_with_depth(start, evidence.cloud, rim, scaled)
         vertices = self.model.vertices(state)
         return _Candidate(
             state, vertices, tuple(range(len(outlines))), float(self._measure_overlaps(vertices, outlines).mean())
         )
 
+    def _refine_with_depth(
+        self, start: BodyState, cloud: SingleViewCloud, rim: RimTerm, targets: JointTargets
+    ) -> BodyState:
+        free, none = cloud.free_space_term, JointTargets.none(self.model)
+        near = self._refiner.run(start, cloud, targets, _WITH_DEPTH, [rim, free])
+        return self._refiner.run(near, cloud, none, _CLOSE_TO_DEPTH, [rim.scale(_RIM_BESIDE_DEPTH), free])
+
     def _measure_overlaps(self, vertices: F64, outlines: Sequence[Outline]) -> F64:
         faces = self.model.faces
         return np.array([silhouette_iou(render_mask(each.camera, vertices, faces), each.mask) for each in outlines])
 
-    def _refit_without_outliers(self, outlines: Sequence[Outline], candidate: _Candidate) -> _Candidate:
+    def _refit_without_outliers(self, evidence: _Evidence, candidate: _Candidate) -> _Candidate:
         """Fit again to the views that agree, when others overlap much less than the median view."""
-        overlaps = self._measure_overlaps(candidate.vertices, outlines)
+        overlaps = self._measure_overlaps(candidate.vertices, evidence.outlines)
         agree = tuple(np.flatnonzero(overlaps >= _MIN_OVERLAP_RATIO * np.median(overlaps)).tolist())
-        if len(agree) == len(outlines) or len(agree) < MIN_VIEWS:
+        if len(agree) == len(evidence.outlines) or (len(agree) < MIN_VIEWS and evidence.cloud is None):
             return candidate
-        none = JointTargets.none(self.model)
-        again = self._refine(candidate.state, [outlines[view] for view in agree], none)
+        again = self._refine(candidate.state, evidence.take(agree), JointTargets.none(self.model))
         return replace(again, views=agree)
 
     def _swap_sides(self, targets: JointTargets) -> JointTargets:

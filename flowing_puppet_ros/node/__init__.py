@@ -2,5 +2,5 @@
 """rclpy nodes: the only package that imports rclpy.
 
 Messages on topics come in and go out; between them works a component of `stream`. Read `component_node` first, then
-`session` and `worker`; `main` has the programs.
+`session` with its `inputs`, `outputs` and `worker`; `main` has the programs.
 """

@@ -5,18 +5,15 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
-from dataclasses import replace
 from functools import cache, partial
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_policy_name_from_kind, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
@@ -24,7 +21,7 @@ from rclpy.timer import Timer
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.node.diagnostics import Diagnostics
-from flowing_puppet_ros.node.factory import is_installed, message_type
+from flowing_puppet_ros.node.factory import message_type
 from flowing_puppet_ros.node.inputs import (
     AUTO,
     CHECK_INTERVAL_S,
@@ -34,11 +31,11 @@ from flowing_puppet_ros.node.inputs import (
     check_no_loop,
     choose_type,
 )
+from flowing_puppet_ros.node.outputs import Outputs, transport_topic
 from flowing_puppet_ros.node.worker import Worker
 from flowing_puppet_ros.stream.component import Component, Output, Port
 from flowing_puppet_ros.stream.messages.detections import BodySkeleton
 from flowing_puppet_ros.stream.messages.geometry import header_ns
-from flowing_puppet_ros.stream.messages.images import compress_image
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, TRANSFORMS
 from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 from flowing_puppet_ros.units import NANOSECONDS
@@ -51,10 +48,6 @@ _SUBSCRIPTION_QOS = {
     "sensor": qos_profile_sensor_data,
     "reliable": QoSProfile(depth=10),
     "latched": QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL),
-}
-_PUBLISHER_QOS = {
-    "reliable": QoSProfile(depth=10),
-    "latched": QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL),
 }
 _PEOPLE_FIELDS = {"puppets": "puppets", "bodies": "bodies"}
 """Output ports whose messages list people, and the field that does."""
@@ -96,16 +89,7 @@ class Session[C: Component[Any]]:
             for port in component.inputs
             if port.alternatives
         }
-        self._lazy = [port for port in component.outputs if port.lazy]
-        self._outputs: dict[str, list[tuple[Publisher, Callable[[Any], Any]]]] = {}
-        self._unavailable = [port for port in component.outputs if port.optional and not is_installed(port.type)]
-        try:
-            for port in component.outputs:
-                if not port.per_person and port not in self._unavailable:
-                    self._outputs[port.name] = self._open_output(port)
-        except Exception:
-            self._close_outputs()
-            raise
+        self._outputs = Outputs(node, component, self._on_incompatible_qos)
         component.background = _background_executor()
         self.worker = Worker(max(queue, component.min_queue), self._on_task_error)
         component.is_behind = self.worker.is_behind
@@ -145,15 +129,7 @@ class Session[C: Component[Any]]:
         self.worker.stop()
         # The worker accepts no more tasks; what runs in the background must end too.
         self.component.reset()
-        self._close_outputs()
-
-    def _close_output(self, name: str) -> None:
-        for publisher, _ in self._outputs.pop(name, []):
-            self._node.destroy_publisher(publisher)
-
-    def _close_outputs(self, kept: Collection[str] = ()) -> None:
-        for name in set(self._outputs) - set(kept):
-            self._close_output(name)
+        self._outputs.close()
 
     def reset(self) -> None:
         """Drop the messages that wait; the next one starts a new recording."""
@@ -164,7 +140,7 @@ class Session[C: Component[Any]]:
         self.component.reset()
         self._last_stamp = None
         with self._publishing:
-            self._close_outputs(kept=[port.name for port in self.component.outputs])
+            self._outputs.close_people()
 
     @property
     def stamped(self) -> bool:
@@ -192,17 +168,14 @@ class Session[C: Component[Any]]:
             if port.transport:
                 choice = self._transports[port.name]
                 choice.setting, before = self.image_transport, choice.chosen
-                names = [self._node.resolve_topic_name(topic) for topic in (port.name, self._compressed_topic(port))]
+                names = [
+                    self._node.resolve_topic_name(topic) for topic in (port.name, transport_topic(self._node, port))
+                ]
                 if choice.update(*map(self._node.count_publishers, names)) != before:
                     self._node.destroy_subscription(self._subscriptions.pop(port.name))
                     self._subscribe(port)
-        for port in self._unavailable:
-            topic, package = self._node.resolve_topic_name(port.name), port.type.partition("/")[0]
-            if self._node.count_subscribers(topic):
-                self._warn_once(
-                    f"{topic} is not published, since {package} is not installed: install ros-jazzy-"
-                    + package.replace("_", "-")
-                )
+        for sentence in self._outputs.find_missing():
+            self._warn_once(sentence)
 
     def _follow_type(self, port: Port) -> None:
         """Subscribe to an input as the type that is published there."""
@@ -227,7 +200,7 @@ class Session[C: Component[Any]]:
         """Open an input, for an image that with the transport that is chosen for it."""
         choice = self._transports.get(port.name)
         compressed = choice is not None and choice.chosen == COMPRESSED
-        topic = self._compressed_topic(port) if compressed else port.name
+        topic = transport_topic(self._node, port) if compressed else port.name
         name = self._topics[port.name] = self._node.resolve_topic_name(topic)
         self._subscriptions[port.name] = self._node.create_subscription(
             message_type(COMPRESSED_IMAGE if compressed else self._types[port.name]),
@@ -240,30 +213,6 @@ class Session[C: Component[Any]]:
                 incompatible_type=partial(self._on_incompatible_type, port, name),
                 message_lost=partial(self._on_message_lost, port.name, name),
             ),
-        )
-
-    def _open_output(self, port: Port, person: bool = False) -> list[tuple[Publisher, Callable[[Any], Any]]]:
-        """Return the publishers of a port, each with the conversion from the component's message to its own."""
-        made: list[tuple[Publisher, Callable[[Any], Any]]]
-        made = [(self._create_publisher(message_type(port.type), port.name, port.qos, person), _identity)]
-        if port.transport:
-            compressed = self._create_publisher(
-                message_type(COMPRESSED_IMAGE), self._compressed_topic(port), port.qos, person
-            )
-            made.append((compressed, partial(compress_image, self.component.factory)))
-        return made
-
-    def _compressed_topic(self, port: Port) -> str:
-        """Return the topic of a port's compressed images, which follows the port when that is remapped."""
-        return f"{self._node.resolve_topic_name(port.name)}/{port.transport}"
-
-    def _create_publisher(self, kind: Any, topic: str, qos: str, person: bool) -> Publisher:
-        name = self._node.resolve_topic_name(topic)
-        # Overriding options are parameters; one set per person would accumulate without end.
-        options = None if person else QoSOverridingOptions.with_default_policies()
-        events = PublisherEventCallbacks(incompatible_qos=partial(self._on_incompatible_qos, name, "publisher"))
-        return self._node.create_publisher(
-            kind, topic, copy(_PUBLISHER_QOS[qos]), qos_overriding_options=options, event_callbacks=events
         )
 
     def _on_incompatible_qos(self, topic: str, side: str, event: Any) -> None:
@@ -313,9 +262,7 @@ class Session[C: Component[Any]]:
         for name, optional in self._optional.items():
             usable = name not in self._unusable
             self.component.set_expected(name, usable and self._node.count_publishers(optional) > 0)
-        for lazy in self._lazy:
-            subscribed = any(publisher.get_subscription_count() for publisher, _ in self._outputs.get(lazy.name, []))
-            self.component.set_subscribed(lazy.name, subscribed)
+        self._outputs.tell_subscribed()
         if hasattr(message, "header"):
             self._check_stamp(topic, header_ns(message.header))
         self.publish(self.component.handle(port, message))
@@ -339,20 +286,13 @@ class Session[C: Component[Any]]:
     def publish(self, outputs: Output) -> None:
         """Publish the component's results unless the session has ended meanwhile."""
         for name, message in outputs:
-            port = self.component.find_output(name)
             with self._publishing:
                 if not self.active:
                     return
-                if message is None:
-                    self._close_output(name)
-                    continue
-                if name not in self._outputs:
-                    self._outputs[name] = self._open_output(replace(port, name=name), person=True)
-                publishers = self._outputs[name]
-                for publisher, convert in publishers:
-                    if len(publishers) == 1 or publisher.get_subscription_count():
-                        publisher.publish(convert(message))
-            self._record_published(port, message)
+                self._outputs.publish(name, message)
+            if message is None:
+                continue
+            self._record_published(self.component.find_output(name), message)
 
     def _record_published(self, port: Port, message: Any) -> None:
         self._diagnostics.count_message(port.name)
@@ -384,7 +324,3 @@ def _resolve_topic(node: Node, topic: str) -> str:
 def _background_executor() -> ThreadPoolExecutor:
     """Return the two threads for the slow work of all components of this process, one long and one short task."""
     return ThreadPoolExecutor(2, thread_name_prefix="background")
-
-
-def _identity(message: Any) -> Any:
-    return message

@@ -21,7 +21,14 @@ from flowing_puppet_ros.stream.component import COMPRESSED_DEPTH, Port
 from flowing_puppet_ros.stream.depth_pairs import DepthPairs
 from flowing_puppet_ros.stream.messages.depth import make_depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
-from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, IMAGE, POINT_CLOUD, MessageFactory
+from flowing_puppet_ros.stream.messages.message_types import (
+    CAMERA_INFO,
+    IMAGE,
+    POINT_CLOUD,
+    SILHOUETTES,
+    TRANSFORMS,
+    MessageFactory,
+)
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
 from flowing_puppet_ros.stream.time_synchronizer import TimeSynchronizer
 
@@ -33,6 +40,12 @@ COMPARED_MOMENTS, MAX_FREE_SHARE = 10, 0.3
 """Moments by which it is told whether sensors are where they are said to be, and the median share of what one saw that
 another saw through from which on they are not: it is 0.02 to 0.1 where they are, and half where one is 2 degrees or
 10 cm off."""
+
+_SHARED = (
+    Port("/tf_static", TRANSFORMS, "latched", optional=True),
+    Port("/tf", TRANSFORMS, optional=True),
+    Port("silhouettes", SILHOUETTES, optional=True),
+)
 
 type SensedCloud = tuple[SceneCloud, SensorPlace, bool]
 """A cloud with z up, the place of its sensor, and whether that is known."""
@@ -84,7 +97,7 @@ class DepthRig:
         if len(set(self.names)) < len(self.names):
             raise InputError(f"rig.cameras is {settings.cameras!r}: every sensor has a name of its own")
         self._settings, self._places, self._report, self._factory = settings, places, report, factory
-        self.ports = tuple(port for name in self.names for port in _list_ports(name))
+        self.ports = (*(port for name in self.names for port in _list_ports(name)), *_SHARED)
         self.reset()
 
     def reset(self) -> None:

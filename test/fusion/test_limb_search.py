@@ -38,6 +38,14 @@ def test_an_arm_in_a_wrong_place_is_noticed_and_found(model: StitchedPuppet) -> 
     wrist = model.joint_names.index("left_wrist")
     assert np.linalg.norm(model.joints(model.vertices(wrong))[wrist] - person.joints["left_wrist"]) > 0.3
     assert fitter.limbs.find_lost(wrong, claim.joints) == [number]
+    # Pointed back to its joints, bone by bone, without a look at the cloud; the other limbs stay where they are.
+    assert fitter.limbs.find_strayed(good.state, claim.joints) == []
+    assert fitter.limbs.find_strayed(wrong, claim.joints) == [number]
+    pointed = fitter.limbs.point(wrong, claim.joints, [number])
+    back = model.joints(model.vertices(pointed))
+    assert np.linalg.norm(back[wrist] - person.joints["left_wrist"]) < 0.1
+    others = [part for part in range(len(model.tree)) if part not in fitter.limbs.list_parts(number)]
+    np.testing.assert_allclose(pointed.center[others], wrong.center[others])
     found = fitter.hang_anew(fitter.make_cloud(points.points, points.field), wrong, claim.joints, [number])
     assert found is not None
     assert np.linalg.norm(found.joints[wrist] - person.joints["left_wrist"]) < 0.07

@@ -50,3 +50,9 @@ def test_nobody_owns_anything_without_people_or_points() -> None:
 def test_capsules_of_unknown_joints_are_left_out() -> None:
     capsules = list_capsules({"left_knee": np.zeros(3), "left_ankle": np.array([0, 0, -0.4])})
     np.testing.assert_allclose(capsules, [[0, 0, 0, 0, 0, -0.4, 0.065, 0.045]])
+
+
+def test_capsules_whose_far_end_is_not_sure_are_left_out() -> None:
+    joints = {"left_elbow": np.zeros(3), "left_wrist": np.array([0, 0, -0.3]), "left_hand": np.array([0, 0, -0.4])}
+    capsules = list_capsules(joints, {"left_wrist"})
+    np.testing.assert_allclose(capsules, [[0, 0, 0, 0, 0, -0.3, 0.045, 0.035]])

@@ -98,8 +98,8 @@ def test_fits_that_find_nothing_better_become_rare(model: StitchedPuppet, monkey
     walk, found, fitted = Walk(model), PeopleFitter.fit_claim, list[int]()
     track = BodyTracker.track
 
-    def fit(people: PeopleFitter, claim: Claim, person: PersonCloud) -> BodyFit | None:
-        made = None if fitted else found(people, claim, person)
+    def fit(people: PeopleFitter, claim: Claim, person: PersonCloud, known: Any) -> BodyFit | None:
+        made = None if fitted else found(people, claim, person, known)
         fitted.append(person.stamp // NANOSECONDS - 1)
         return made
 

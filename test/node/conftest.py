@@ -14,8 +14,8 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
-PATIENCE = 120.0
-"""Seconds after which a test gives up on a message; the machine may be busy."""
+PATIENCE = 240.0
+"""Seconds after which a test gives up on a message; a busy machine may have to compile the kernels first."""
 QUICK_FIT = {
     "fitter.particles": 4, "fitter.iterations": 1, "fitter.gauss_newton_steps": 1, "fitter.restarts": 0,
     "fitter.max_limb_repairs": 0, "fitter.nonrigid": "false", "fitter.levenberg_steps": 0,
@@ -81,15 +81,21 @@ def running_nodes(folder: Path) -> Iterator[Callable[..., Path]]:
         running.append((name, process, log))
         return log
 
-    yield run
-    for _, process, _ in running:
-        process.send_signal(signal.SIGINT)
-    for name, process, log in running:
-        try:
-            status = process.wait(60)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            status = process.wait()
+    try:
+        yield run
+    finally:
+        ended = [_interrupt(process) for _, process, _ in running]
+    for (name, _, log), status in zip(running, ended, strict=True):
         assert status == 0, f"{name} ended with {status}:\n{log.read_text()}"
         assert "Traceback" not in log.read_text()
         assert "[ERROR]" not in log.read_text()
+
+
+def _interrupt(process: subprocess.Popen[bytes]) -> int:
+    """Interrupt a node and return its exit status; kill it if it does not end."""
+    process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(60)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()

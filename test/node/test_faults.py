@@ -120,23 +120,25 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     """Return a tracker and a fitter that every test of this file speaks to."""
     rclpy.init()
     peer = Peer()
-    with running_nodes(tmp_path_factory.mktemp("logs")) as run:
-        logs = {}
-        for name, settings, topics in (
-            ("puppet_tracker", {}, ("/image", "/detections")),
-            ("body_fitter", QUICK_FIT, ("/points", "/depth", "/camera_info")),
-        ):
-            given = {"queue": 5, **settings}
-            for topic in topics:
-                given |= kept(topic)
-            logs[name] = run(name, *arguments(given))
-        made = World(peer, logs)
-        peer.spin_until(lambda: len(made.reports) == 2, "reports of both nodes")
-        yield made
-        assert all(b"\0" <= level < DiagnosticStatus.ERROR or level == DiagnosticStatus.STALE
-                   for level in made.worst.values()), f"{made.reports}"  # fmt: skip
-    peer.destroy_node()
-    rclpy.try_shutdown()
+    try:
+        with running_nodes(tmp_path_factory.mktemp("logs")) as run:
+            logs = {}
+            for name, settings, topics in (
+                ("puppet_tracker", {}, ("/image", "/detections")),
+                ("body_fitter", QUICK_FIT, ("/points", "/depth", "/camera_info")),
+            ):
+                given = {"queue": 5, **settings}
+                for topic in topics:
+                    given |= kept(topic)
+                logs[name] = run(name, *arguments(given))
+            made = World(peer, logs)
+            peer.spin_until(lambda: len(made.reports) == 2, "reports of both nodes")
+            yield made
+            assert all(b"\0" <= level < DiagnosticStatus.ERROR or level == DiagnosticStatus.STALE
+                       for level in made.worst.values()), f"{made.reports}"  # fmt: skip
+    finally:
+        peer.destroy_node()
+        rclpy.try_shutdown()
 
 
 def spoilt_images() -> dict[str, Any]:

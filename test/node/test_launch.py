@@ -177,6 +177,23 @@ def test_several_cameras_with_depth_give_one_body_a_person(monkeypatch: pytest.M
     }
 
 
+def test_cameras_with_depth_beside_others_give_one_body_from_silhouettes_and_depth(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    image, info = ["sensor_msgs/msg/Image"], ["sensor_msgs/msg/CameraInfo"]
+    seen = {"/left/color/image_raw": image, "/left/color/camera_info": info}
+    seen |= {"/left/depth/image_rect_raw": image, "/left/depth/camera_info": info}
+    monkeypatch.setattr("flowing_puppet_ros.node.launching.rgbd_topics.list_topics", lambda kind: seen)
+    *trackers, hull, fitter = described("cameras", cameras="left/color,door", image="image_raw", depth="/left")
+    assert [node.named["namespace"] for node in trackers] == ["left/color", "door"]
+    assert parameters_of(hull)["cameras"] == "left/color,door"
+    assert parameters_of(fitter)["rig.cameras"] == "left"
+    assert dict(fitter.named["remappings"]) == {
+        "left/depth": "/left/depth/image_rect_raw",
+        "left/camera_info": "/left/depth/camera_info",
+    }
+
+
 def test_bodies_from_cameras() -> None:
     nodes = described("cameras", cameras="a,b", image="image_raw", namespace="rig")
     started = [(node.named["executable"], node.named["namespace"]) for node in nodes]

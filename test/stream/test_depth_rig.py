@@ -6,48 +6,29 @@ from typing import Any
 
 import numpy as np
 import pytest
-from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
+from camera_circle import (  # type: ignore[import-not-found]
+    AWAY_M,
+    FACTORY,
+    FOCAL,
+    HEIGHT,
+    LIMBS,
+    MAN,
+    TENTH,
+    WIDTH,
+    axes_of,
+    depth_from,
+    frames_of,
+    messages_of,
+)
+from capsule_man import cloud_of  # type: ignore[import-not-found]
 
-from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.depth_rig import MAX_MISSED, DepthRig, DepthRigSettings
-from flowing_puppet_ros.stream.messages.geometry import (
-    FrameTree,
-    make_camera_info,
-    make_header,
-    make_transform,
-    stamp_ns,
-)
-from flowing_puppet_ros.stream.messages.images import make_image
-from flowing_puppet_ros.stream.messages.message_types import TRANSFORMS
+from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
 from flowing_puppet_ros.stream.sensor_places import SensorPlaces
-
-FACTORY = BagMessageFactory()
-FOCAL, WIDTH, HEIGHT, AWAY_M = 220.0, 320, 240, 2.3
-MATRIX = [FOCAL, 0, (WIDTH - 1) / 2, 0, FOCAL, (HEIGHT - 1) / 2, 0, 0, 1]
-TENTH = 100_000_000
-LIMBS = [f"{side}_{name}" for side in ("left", "right") for name in ("elbow", "wrist", "knee", "ankle")]
-MAN = joints_of()
-
-
-def axes_of(angle: float) -> np.ndarray:
-    """Return the axes (3, 3), as columns right, down and forward, of a camera at an angle from x that looks at him."""
-    forward = -np.array([np.cos(angle), np.sin(angle), 0.0])
-    right = np.array([forward[1], -forward[0], 0.0])
-    return np.stack([right, [0.0, 0.0, -1.0], forward], axis=1)
-
-
-def depth_from(angle: float, points: np.ndarray) -> np.ndarray:
-    """Return what a camera at an angle sees of places (N, 3) m: metres (H, W), 0 where nothing is."""
-    local = (points - AWAY_M * np.array([np.cos(angle), np.sin(angle), 0.0])) @ axes_of(angle)
-    columns, rows = np.rint(local[:, :2] / local[:, 2:] * FOCAL + np.array([WIDTH - 1, HEIGHT - 1]) / 2).T.astype(int)
-    inside = (columns >= 0) & (columns < WIDTH) & (rows >= 0) & (rows < HEIGHT)
-    nearest = np.full((HEIGHT, WIDTH), np.inf)
-    np.minimum.at(nearest, (rows[inside], columns[inside]), local[inside, 2])
-    return np.where(np.isfinite(nearest), nearest, 0.0)
 
 
 def room_from(angle: float) -> np.ndarray:
@@ -58,26 +39,6 @@ def room_from(angle: float) -> np.ndarray:
     ends = np.where(rays > 0, np.array([3.5, 3.5, 1.6]), np.array([-3.5, -3.5, -0.92]))
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(np.nanmin((ends - eye) / rays, axis=-1))
-
-
-def frames_of(angles: Iterable[float], shift: float = 0.0) -> Any:
-    """Return where the cameras are in the world; the last one `shift` m beside its true place."""
-    angles = list(angles)
-    transforms = []
-    for number, angle in enumerate(angles):
-        place = AWAY_M * np.array([np.cos(angle), np.sin(angle), 0.0])
-        place = place + (shift * axes_of(angle)[:, 0] if number == len(angles) - 1 else 0.0)
-        header = make_header(FACTORY, 0, "world")
-        transforms.append(make_transform(FACTORY, header, f"cam{number}_optical_frame", place, axes_of(angle)))
-    return FACTORY.make(TRANSFORMS, transforms=transforms)
-
-
-def messages_of(number: int, stamp: int, depth: np.ndarray) -> list[tuple[str, Any]]:
-    """Return (port, message) of a depth image and its camera_info."""
-    header = make_header(FACTORY, stamp, f"cam{number}_optical_frame")
-    info = make_camera_info(FACTORY, header, (WIDTH, HEIGHT), np.reshape(MATRIX, (3, 3)), np.zeros(5))
-    image = make_image(FACTORY, header, depth.astype(np.float32), "32FC1")
-    return [(f"cam{number}/camera_info", info), (f"cam{number}/depth", image)]
 
 
 def make_rig(cameras: str = "cam0,cam1", frames: Any = None) -> tuple[DepthRig, Report]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 
 import numpy as np
 
@@ -40,16 +40,17 @@ def crop_to_limbs(points: np.ndarray, joints: Mapping[str, np.ndarray], factor: 
     return near
 
 
-def list_capsules(joints: Mapping[str, np.ndarray]) -> np.ndarray:
+def list_capsules(joints: Mapping[str, np.ndarray], ends: Container[str] | None = None) -> np.ndarray:
     """Return the capsules (C, 8) of a body: two ends and the radius at each, metres.
 
-    `joints` are positions (3,) m by name; capsules with an unknown joint are left out.
+    `joints` are positions (3,) m by name; capsules with an unknown joint are left out, and those whose second joint,
+    the farther one from the trunk, is not among `ends`, if given.
     """
     sides = [(f"{side}_{a}", f"{side}_{b}", ra, rb) for side in ("left", "right") for a, b, ra, rb in LIMB_CAPSULES]
     rows = [
         [*joints[first], *joints[second], first_radius, second_radius]
         for first, second, first_radius, second_radius in (*sides, *TRUNK_CAPSULES)
-        if first in joints and second in joints
+        if first in joints and second in joints and (ends is None or second in ends)
     ]
     return np.array(rows, dtype=np.float64).reshape(-1, 8)
 

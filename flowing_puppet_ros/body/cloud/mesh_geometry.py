@@ -9,13 +9,23 @@ from numba import njit
 
 def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
     """Return the indices of `count` of `points` (N, 3), or of all, each the farthest from those before it."""
-    chosen = np.empty(min(count, len(points)), dtype=np.int64)
-    distance = np.linalg.norm(points - points.mean(axis=0), axis=1)
+    return np.asarray(_farthest_points(np.ascontiguousarray(points, dtype=np.float64), points.mean(axis=0), count))
+
+
+@njit(cache=True, nogil=True)
+def _farthest_points(points, middle, count):  # type: ignore[no-untyped-def]
+    """Choose points; the first is the farthest from `middle` (3,)."""
+    chosen, squared = np.empty(min(count, len(points)), np.int64), np.full(len(points), np.inf)
+    x, y, z = middle[0], middle[1], middle[2]
     for k in range(len(chosen)):
-        chosen[k] = distance.argmax()
-        if k == 0:
-            distance = np.full(len(points), np.inf)
-        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[k]], axis=1))
+        best = -1.0
+        for row in range(len(points)):
+            own = (points[row, 0] - x) ** 2 + (points[row, 1] - y) ** 2 + (points[row, 2] - z) ** 2
+            if k <= 1 or own < squared[row]:
+                squared[row] = own
+            if squared[row] > best:
+                best, chosen[k] = squared[row], row
+        x, y, z = points[chosen[k], 0], points[chosen[k], 1], points[chosen[k], 2]
     return chosen
 
 

@@ -217,6 +217,19 @@ class BodyFitter:
             points, normals = downsample(points, normals, MAX_COARSE_POINTS)
             return self.hypotheses.find_roughly(self.prepare_cloud(points, normals, viewpoint), thorough)
 
+    def fit_at_once(self, points: np.ndarray, normals: np.ndarray | None) -> BodyFit | None:
+        """Return a body close to a whole cloud, in a fifth of the time of a fit; None where that is not enough.
+
+        Arguments as in `fit`. Its limbs may be wrong, as after a `quick` fit.
+
+        Raises:
+            InputError: when the cloud cannot be the surface of a person.
+        """
+        with one_blas_thread():
+            cloud = self.prepare_cloud(*check_cloud(points, normals), None)
+            state = self.hypotheses.find_close(cloud)
+            return None if state is None else self.assess(state, cloud)
+
     def _fit_from_joints(
         self,
         points: np.ndarray,

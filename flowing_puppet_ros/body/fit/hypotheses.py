@@ -50,7 +50,7 @@ MAX_COST_RATIO, MAX_COST_RATIO_IF_WRONG, MIN_WRONG_UNCOVERED = 0.98, 0.9, 0.25
 PARTIAL = RefineWeights(sigma_start=0.2, sigma_end=0.03, iterations=20)
 # Bodies that are refined to compare frames, and their Gauss-Newton steps.
 ROUGH_STARTS = 4
-ROUGH = RefineWeights(sigma_start=0.2, sigma_end=0.08, iterations=8)
+ROUGH = RefineWeights(sigma_start=0.2, sigma_end=0.08, iterations=8, alternate=2)
 # Share of the particles and rounds in a search for the warm-up.
 RESTART_SHARE = 2.0  # of particles and iterations, in a search after the first
 WARM_UP_SHARE = 0.1
@@ -130,6 +130,11 @@ class BodyHypotheses:
     def _measure_uncovered(self, body: BodyState, cloud: Cloud) -> float:
         """Return the share of a cloud that a body leaves uncovered: of bodies that are as likely, it tells best."""
         return assess_fit(self._model, self._model.vertices(body), cloud).uncovered
+
+    def find_close(self, cloud: Cloud) -> BodyState | None:
+        """Return a body that few poses and steps bring close to a cloud, whatever its limbs do; None without any."""
+        found = self.evaluate(self.find_roughly(cloud, thorough=False).state, cloud)
+        return found.state if self._is_close(found) else None
 
     def _is_close(self, candidate: BodyCandidate) -> bool:
         return candidate.cost < self._settings.restart_distance

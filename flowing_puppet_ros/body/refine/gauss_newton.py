@@ -14,12 +14,11 @@ from functools import partial
 
 import numpy as np
 from numba import njit
-from scipy.linalg import LinAlgError
-from scipy.linalg.lapack import dposv
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, TwoWayCorrespondence, VertexQuadratic, geman_mcclure
 from flowing_puppet_ros.body.refine.joint_rows import JointRows
 from flowing_puppet_ros.body.refine.normal_equations import NormalEquations, System
+from flowing_puppet_ros.body.refine.tree_solution import TreeSolution
 from flowing_puppet_ros.body.search.energy import RAY_SHARE, JointTargets
 from flowing_puppet_ros.model.posing import PosedPoints
 from flowing_puppet_ros.model.rotation import exp_one
@@ -78,6 +77,7 @@ class GaussNewton:
         self._model = model
         self._equations = NormalEquations(model)
         self._joints = JointRows(model, self._equations)
+        self._solution = TreeSolution(model.tree.parents, self._equations.first)
 
     def run(
         self,
@@ -128,7 +128,7 @@ class GaussNewton:
         equations.add_joint_prior(weights.pairwise, state, system)
         self._add_priors(state, weights, system)
         hessian[np.diag_indices(equations.size)] += 1e-9 + 1e-3 * hessian.diagonal()
-        return self._retract(state, _solve_lower(hessian, -gradient))
+        return self._retract(state, -self._solution.solve(hessian, gradient))
 
     def _add_joints(
         self, targets: JointTargets, width: float, posed: PosedPoints, rotation: np.ndarray, system: System
@@ -176,14 +176,3 @@ def _move_parts(center: np.ndarray, rotation: np.ndarray, step: np.ndarray, firs
         center[part] += rotation[part] @ translation
         turned[part] = rotation[part] @ exp_one(turn)
     return turned
-
-
-def _solve_lower(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Solve a positive definite system of which only the lower triangle is filled; `matrix` (U, U) is overwritten.
-
-    LAPACK itself, because `scipy.linalg.solve` takes as long again to copy the matrix and to estimate its condition.
-    """
-    solution, failed = dposv(matrix.T, right, lower=0, overwrite_a=True)[1:]
-    if failed:
-        raise LinAlgError("the normal equations are not positive definite")
-    return np.asarray(solution)

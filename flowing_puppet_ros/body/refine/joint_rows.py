@@ -30,6 +30,7 @@ class JointRows:
         self._weights = np.zeros((len(model.joint_names), len(model.part_of_vertex)))
         for row, (index, weight) in enumerate(zip(model.joint_index, model.joint_weight, strict=True)):
             np.add.at(self._weights[row], index, weight)
+        self._means = (model.joint_index.astype(np.int64), np.asarray(model.joint_weight, dtype=np.float64))
         self._pieces = self._list_pieces(model, equations)
 
     def _list_pieces(self, model: StitchedPuppet, equations: NormalEquations) -> PieceArrays:
@@ -61,7 +62,7 @@ class JointRows:
 
     def find_joints(self, chosen: np.ndarray, vertices: np.ndarray) -> np.ndarray:
         """Return the joints `chosen` (C,) of body `vertices` (V, 3), as (C, 3) in metres."""
-        return np.asarray(self._weights[chosen] @ vertices)
+        return np.asarray(_find_joints(chosen, vertices, self._means))
 
     def derive(self, chosen: np.ndarray, posed: PosedPoints, rotation: np.ndarray) -> np.ndarray:
         """Return the derivatives (C, 3, U) of the joints `chosen` (C,) of a body whose parts have `rotation` (N, 3, 3).
@@ -87,6 +88,17 @@ class JointRows:
         derivatives, as the identity or without what is along a ray.
         """
         _add_joints(chosen, pull, posed.local, np.ascontiguousarray(rotation), self._pieces, self._shape_start, system)
+
+
+@njit(cache=True, nogil=True)
+def _find_joints(chosen, vertices, means):  # type: ignore[no-untyped-def]
+    (index, weight), joints = means, np.zeros((len(chosen), 3))
+    for row in range(len(chosen)):
+        for k in range(index.shape[1]):
+            vertex, share = index[chosen[row], k], weight[chosen[row], k]
+            for axis in range(3):
+                joints[row, axis] += share * vertices[vertex, axis]
+    return joints
 
 
 @njit(cache=True, nogil=True)

@@ -184,7 +184,7 @@ def _add_stitching(strength, points, rotations, edges, stitches, layout, system)
     shapes = len(system[1]) - first[-1]
     max_width = 6 + basis.shape[2]
     above, below = np.empty((3, max_width)), np.empty((3, max_width))
-    line = np.empty(2 * max_width)
+    lines, gap = np.empty((3, 2 * max_width)), np.empty(3)
     block, slope = np.empty((2 * max_width, 2 * max_width)), np.empty(2 * max_width)
     for edge in range(len(edges)):
         parent, child = edges[edge, 0], edges[edge, 1]
@@ -203,7 +203,7 @@ def _add_stitching(strength, points, rotations, edges, stitches, layout, system)
                         + rotations[parent, i, 1] * above[1, column]
                         + rotations[parent, i, 2] * above[2, column]
                     )
-                    line[column if column < up else column + down] = value
+                    lines[i, column if column < up else column + down] = value
                 for column in range(down + shapes):
                     value = (
                         rotations[child, i, 0] * below[0, column]
@@ -211,15 +211,16 @@ def _add_stitching(strength, points, rotations, edges, stitches, layout, system)
                         + rotations[child, i, 2] * below[2, column]
                     )
                     if column < down:
-                        line[up + column] = -value
+                        lines[i, up + column] = -value
                     else:
-                        line[up + column] -= value
-                gap = weight * (world[p, i] - world[c, i])
-                for column in range(width):
-                    slope[column] += line[column] * gap
-                    scaled = weight * line[column]
-                    for other in range(column + 1):
-                        block[column, other] += scaled * line[other]
+                        lines[i, up + column] -= value
+                gap[i] = world[p, i] - world[c, i]
+            # The three coordinates together: to read and write the block takes longer than the products.
+            for column in range(width):
+                a, b, d = weight * lines[0, column], weight * lines[1, column], weight * lines[2, column]
+                slope[column] += a * gap[0] + b * gap[1] + d * gap[2]
+                for other in range(column + 1):
+                    block[column, other] += a * lines[0, other] + b * lines[1, other] + d * lines[2, other]
         _scatter(block, slope, width, (first[parent], up, first[child], down, first[-1]), system)
 
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,6 +131,13 @@ class Proposer:
         drawn = rng.multivariate_normal(joint.mean[:3], joint.covariance[:3, :3], len(parent), method="cholesky")
         relative = np.clip(drawn, self._model.limit_low[edge], self._model.limit_high[edge])
         return self._attach(part, parent, relative, shape, rng)
+
+    def reattach(self, part: int, parent: Particles, before: Sequence[Particles], above: int) -> Particles:
+        """Attach a part to particles of its parent `above` as it was attached to those `before`, of all parts."""
+        own, earlier = before[part], before[above]
+        turn = parent.rotation @ np.swapaxes(earlier.rotation, -1, -2)
+        center = parent.center + (turn @ (own.center - earlier.center)[:, :, None])[:, :, 0]
+        return Particles(center, turn @ own.rotation, own.pose, own.shape)
 
     def point_to(self, part: int, particles: Particles, joint: int, target: np.ndarray) -> Particles:
         """Turn a part about where it joins its parent so that its `joint` lies towards `target` (P, 3) m, if finite."""

@@ -11,6 +11,9 @@ from numba import njit
 CELL_M, MAX_CELLS = 0.5, 2000  # edge of a cell; cells a side, so that the last ones hold whatever lies beyond
 
 MEDIAN_POINTS = 5000  # of a scan, whose median is its middle
+WALL_CELL_M, WALL_BANDS_M = 0.05, (1.85, 2.15, 2.5)
+"""Edge of a cell in which walls are looked for, and heights over the floor between which a wall, a post or a machine
+goes on: nobody fills both bands, and a lamp or a ceiling only the upper one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,6 +43,34 @@ class ColumnIndex:
         """Return the indices (K,) of the points (N, 3) m within `radius` of a place (2,) m, and how far they are."""
         rows, away = _find_near(points, self.order, self.first, self.low, self.shape, place[0], place[1], radius)
         return rows, away
+
+
+def find_walls(points: np.ndarray, height: np.ndarray) -> np.ndarray:
+    """Return which (N,) of the points (N, 3) m, N > 0, with a `height` (N,) over the floor go on above all heads."""
+    low, shape, _ = lay_grid(points, WALL_CELL_M, int(MAX_CELLS * CELL_M / WALL_CELL_M / 10))
+    return np.asarray(_find_walls(points, height, low, shape[0], shape[1]))
+
+
+@njit(cache=True, nogil=True)
+def _find_walls(points, height, low, wide, deep):  # type: ignore[no-untyped-def]
+    """Mark the cells of both bands, and those beside them, and look the points up."""
+    bands = np.zeros((2, wide, deep), np.bool_)
+    for row in range(len(points)):
+        band = -1 if height[row] <= WALL_BANDS_M[0] else 0 if height[row] <= WALL_BANDS_M[1] else 1
+        if band < 0 or height[row] > WALL_BANDS_M[2]:
+            continue
+        i = int(np.floor((points[row, 0] - low[0]) / WALL_CELL_M))
+        j = int(np.floor((points[row, 1] - low[1]) / WALL_CELL_M))
+        for a in range(max(i - 1, 0), min(i + 2, wide)):
+            for b in range(max(j - 1, 0), min(j + 2, deep)):
+                bands[band, a, b] = True
+    found = np.zeros(len(points), np.bool_)
+    for row in range(len(points)):
+        i = int(np.floor((points[row, 0] - low[0]) / WALL_CELL_M))
+        j = int(np.floor((points[row, 1] - low[1]) / WALL_CELL_M))
+        if 0 <= i < wide and 0 <= j < deep:
+            found[row] = bands[0, i, j] and bands[1, i, j]
+    return found
 
 
 def lay_grid(points: np.ndarray, width: float, max_cells: int) -> tuple[np.ndarray, np.ndarray, bool]:

@@ -28,6 +28,8 @@ from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.track.tracked_body import BodyObservation, align, extrapolate, translate
 from flowing_puppet_ros.body.upright.upright_fit import (
     FEW_POINTS,
+    MANY_POINTS,
+    MAX_FIT_POINTS,
     MIN_MANY_POINTS,
     UprightFitter,
     floor_term,
@@ -103,21 +105,28 @@ class _TrackState:
 class _Prepared(NamedTuple):
     """A cloud that is ready to be tracked to; `oriented`: its normals were turned outwards by the predicted body.
 
-    `floor`: z of the floor in metres where few points leave the body to it, else None. `targets` pull at the joints,
-    and `places` say where they are, None where nobody sees them.
+    `few`: so few points that the body is fitted as an upright one. `floor`: z of the floor in metres where the points
+    leave the soles to it, else None. `targets` pull at the joints, and `places` say where they are, None where nobody
+    sees them.
     """
 
     cloud: Cloud
     stamp: int
     occluded: bool
     oriented: bool
+    few: bool
     floor: float | None
     targets: JointTargets
     places: JointTargets | None
 
 
 class BodyTracker:
-    """Tracks one person; `counters` counts clouds by how they were fitted: tracked, widened, searched, hidden."""
+    """Tracks one person.
+
+    Attributes:
+        counters: clouds by how they were fitted: tracked, widened, searched, hidden.
+        cloud: the last cloud of `track`, prepared; None where nothing was to be tracked.
+    """
 
     def __init__(self, fitter: BodyFitter, settings: BodyTrackerSettings) -> None:
         """Track with the model of `fitter`, which also makes the full fits."""
@@ -127,6 +136,7 @@ class BodyTracker:
         self._upright = UprightFitter(fitter)
         self.counters: Counter[str] = Counter()
         self._quick = False
+        self.cloud: Cloud | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -224,20 +234,27 @@ class BodyTracker:
         return self._record(fit, lost, prepared)
 
     def track(
-        self, person: PersonCloud, targets: JointTargets | None = None, places: JointTargets | None = None
+        self,
+        person: PersonCloud,
+        targets: JointTargets | None = None,
+        places: JointTargets | None = None,
+        start: BodyState | None = None,
     ) -> BodyFit | None:
         """Fit the next cloud like `track_or_refit`, but never by a full fit: None when there is no body to start from.
 
         `targets` are where somebody else sees the joints, and `places` are the same with their depths, to which a body
-        is moved that is lost or comes after a gap. `lost` tells whether the body is not where the person is.
+        is moved that is lost or comes after a gap. `start` is where the body should be, None where it is `predict`'s.
+        `lost` tells whether the body is not where the person is.
         """
+        self.cloud = None
         if self._state.last is None:
             # Normals take long, and nothing would use them.
             self._fitter.prepare_points(*check_cloud(person.points, person.normals), person.viewpoint)
             return None
         with one_blas_thread():
             prepared = self._prepare(person, targets, places)
-            fit, lost = self._track(prepared)
+            self.cloud = prepared.cloud
+            fit, lost = self._track(prepared, start)
         if fit is None:
             self._state = replace(self._state, lost=lost)
             return None
@@ -247,28 +264,29 @@ class BodyTracker:
         self, person: PersonCloud, targets: JointTargets | None = None, places: JointTargets | None = None
     ) -> _Prepared:
         stamp, viewpoint = person.stamp, person.viewpoint
-        on_floor = person.floor is not None and viewpoint is not None and len(person.points) < MIN_MANY_POINTS
-        points, normals = (person.points, person.normals) if on_floor else check_cloud(person.points, person.normals)
+        few = person.floor is not None and viewpoint is not None and len(person.points) < MIN_MANY_POINTS
+        floor = person.floor if viewpoint is not None and len(person.points) < MAX_FIT_POINTS else None
+        points, normals = (person.points, person.normals) if few else check_cloud(person.points, person.normals)
         if viewpoint is None:
             points, normals = downsample(points, normals, self._settings.max_points)
         if self._state.last is not None and stamp <= self._state.last.stamp:
             self.reset()
         occluded = viewpoint is not None and self._update_visible(
-            points, stamp, viewpoint, MIN_VISIBLE_OF_FEW if on_floor else MIN_VISIBLE
+            points, stamp, viewpoint, MIN_VISIBLE_OF_FEW if few else MIN_VISIBLE
         )
         last = self._state.last
         oriented = normals is None and viewpoint is None and last is not None
         if oriented and last is not None:
             vertices = self._fitter.model.vertices(self._predict(last, points.mean(axis=0), stamp))
             normals = estimate_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
-        if on_floor and viewpoint is not None:
+        if few and viewpoint is not None:
             cloud: Cloud = self._upright.make_cloud(points, viewpoint, None, person.field)
         else:
             cloud = self._fitter.prepare_cloud(points, normals, viewpoint, person.field)
         pull = self._no_joints if targets is None else targets
-        return _Prepared(cloud, stamp, occluded, oriented, person.floor if on_floor else None, pull, places)
+        return _Prepared(cloud, stamp, occluded, oriented, few, floor, pull, places)
 
-    def _track(self, prepared: _Prepared) -> tuple[BodyFit | None, bool]:
+    def _track(self, prepared: _Prepared, start: BodyState | None = None) -> tuple[BodyFit | None, bool]:
         """Return the last body after a few steps on the new cloud, and whether it is lost.
 
         The little that is seen of an occluded person would bend the body: it moves on in the pose that it has.
@@ -279,12 +297,14 @@ class BodyTracker:
             return self._fitter.assess(translate(self._state.before, last, prepared.stamp), cloud), False
         if last is None:
             return None, True
-        fit = self._step(self._predict(last, cloud.points.mean(axis=0), prepared.stamp), prepared)
+        if start is None:
+            start = self._predict(last, cloud.points.mean(axis=0), prepared.stamp)
+        fit = self._step(start, prepared)
         return fit, self._is_lost(fit)
 
     def _record(self, fit: BodyFit, lost: bool, prepared: _Prepared) -> BodyFit:
         state = self._state
-        if prepared.floor is not None:
+        if prepared.few:
             fit = keep_place_only(self._fitter.model, fit, len(prepared.cloud.points))
         seen = BodyObservation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
         best = state.best if lost or prepared.occluded else min(state.best, fit.two_way_distance)
@@ -314,7 +334,7 @@ class BodyTracker:
         """Return the full fit, unless the tracked body is closer to the cloud; its distance is the new best."""
         self.counters["searched"] += 1
         cloud = prepared.cloud
-        if prepared.floor is not None and isinstance(cloud, SingleViewCloud):
+        if prepared.few and prepared.floor is not None and isinstance(cloud, SingleViewCloud):
             fit = self._upright.fit(cloud, prepared.floor).fit
             return self._keep_closer(tracked, fit)
         # Normals that were turned by a body that is lost would mislead the search.
@@ -364,10 +384,15 @@ class BodyTracker:
         weights = RefineWeights(sigma_start=widths[0], sigma_end=widths[1], iterations=steps, alternate=ALTERNATE)
         terms: list[SurfaceTerm] = []
         if floor is not None:
-            weights = replace(FEW_POINTS, sigma_start=widths[0], iterations=steps)
+            weights = FEW_POINTS if prepared.few else replace(MANY_POINTS, sigma_end=widths[1], alternate=ALTERNATE)
+            weights = replace(weights, sigma_start=widths[0], iterations=steps)
             terms.append(lambda vertices, _: floor_term(vertices, floor))
         learned = SHAPE_WEIGHT_PER_FRAME * min(self._state.frames, MAX_SHAPE_FRAMES)
-        weights = replace(weights, shape=weights.shape + learned, shape_center=start.shape.mean(axis=0))
+        center, weight = start.shape.mean(axis=0), weights.shape + learned
+        if floor is not None:
+            # Without a pull to the mean the shape drifts where the points say little, until it is no person's.
+            center = center * (1 - MANY_POINTS.shape / weight)
+        weights = replace(weights, shape=weight, shape_center=center)
         # What faces the sensor is taken to be seen: a limb that lags behind its place in the cloud is not hidden. Where
         # joints say where it is, it does not lag, and one that is hidden is not drawn to what hides it.
         facing = Cloud(cloud.points, cloud.normals, cloud.nearest, cloud.viewpoint, cloud.field)

@@ -2,8 +2,9 @@
 """Track several people through a stream of clouds: each keeps an id while seen and a while beyond.
 
 A full fit takes seconds, a tracked step a fraction of one. So in a live stream new people, and people who were lost,
-queue for a full fit, one at a time, while everybody else is tracked on. A recording waits: all new people have their
-full fit in the cloud that shows them first.
+queue for a full fit, one at a time, while everybody else is tracked on; who is seen from all sides and stands as
+people mostly do has a body at once. A recording waits: all new people have their full fit in the cloud that shows them
+first.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerS
 from flowing_puppet_ros.body.track.person_belief import PersonBelief
 from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
-from flowing_puppet_ros.body.upright.person_finder import JudgedFit
+from flowing_puppet_ros.body.upright.found_body import JudgedFit
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
@@ -40,7 +41,10 @@ VELOCITY_GAIN = 0.5  # fraction of a new velocity that is taken
 MAX_VELOCITY_GAP_NS = 1_000_000_000  # between clouds that give a velocity
 REFIT_INTERVAL_NS = 5_000_000_000  # from one full fit of an unreliable body to the next
 TURN_INTERVAL_NS = 1_000_000_000  # between attempts to turn a body round that walks backwards
+MAX_OTHER_WAY_RATIO = 0.8
+"""Two-way distance of a full fit that faces the other way, relative to the tracked body's, up to which it is taken."""
 BODY_STRIDE = 8  # every so many vertices stand for a body
+MAX_FITS_AT_ONCE = 4  # new people in one cloud of a live stream who have a body in it
 
 Judge = Callable[[PersonCloud, BodyFit], JudgedFit]
 """What a scan says about a body, or about a better one that it has instead."""
@@ -58,8 +62,8 @@ class _BodyTrack:
     """One person.
 
     The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, its `motion`, the number
-    of full fits and the stamp of the last, that of the last attempt to turn it round, whether it is `proven` to be a
-    person, and what scans said about that.
+    of full fits and the stamp of the last, that of the last attempt to turn it round, whether a body at once was tried,
+    whether it is `proven` to be a person, and what scans said about that.
     """
 
     id: str
@@ -72,8 +76,14 @@ class _BodyTrack:
     fits: int = 0
     fitted: int = 0
     turned: int = -TURN_INTERVAL_NS
+    tried: bool = False
     proven: bool = True
     belief: PersonBelief | None = None
+
+    @property
+    def shows_reliable(self) -> bool:
+        """Whether the last body is reliable."""
+        return self.tracker.last is not None and self.tracker.last.reliable
 
     def predict_middle(self, stamp: int) -> F64:
         """Return where the middle should be at a later time in nanoseconds."""
@@ -222,6 +232,9 @@ class MultiBodyTracker:
                 waiting.append((track, cloud))
         self._report.counters["tracked people"] += len(bodies)
         self._drop_lost(stamp)
+        if executor is not None:
+            bodies += self._fit_at_once(waiting)
+            waiting = [pair for pair in waiting if pair[0].tracker.lost or not pair[0].shows_reliable]
         bodies += self._start_fit(waiting, executor)
         return sorted(bodies, key=lambda body: (len(body.id), body.id))
 
@@ -239,6 +252,26 @@ class MultiBodyTracker:
         named = [(track.id, person) for track, person in self._associate(people, stamp)]
         self._drop_lost(stamp)
         return named
+
+    def _fit_at_once(self, waiting: list[tuple[_BodyTrack, SeededCloud]]) -> list[TrackedBody]:
+        """Return the bodies of new people who are seen from all sides and to whom one comes close in no time."""
+        new = [pair for pair in waiting if pair[0].tracker.last is None and not pair[0].tried]
+        new = [pair for pair in new if pair[1].person.viewpoint is None and pair[1].person.field is None]
+        new = new[:MAX_FITS_AT_ONCE]
+        bodies = []
+        for (track, cloud), fit in zip(new, parallel_map(self._try_at_once, new, self._threads), strict=True):
+            track.tried = True
+            if fit is not None:
+                track.tracker.start(cloud.person, fit)
+                track.fitted = cloud.person.stamp if fit.reliable else cloud.person.stamp - REFIT_INTERVAL_NS
+                bodies += [track.show(fit)] if track.prove(cloud.person, fit) else []
+        return bodies
+
+    def _try_at_once(self, pair: tuple[_BodyTrack, SeededCloud]) -> BodyFit | None:
+        try:
+            return self._fitter.fit_at_once(pair[1].person.points, pair[1].person.normals)
+        except InputError:
+            return None
 
     def _start_fit(self, waiting: list[tuple[_BodyTrack, SeededCloud]], executor: Executor | None) -> list[TrackedBody]:
         """Start a full fit of the person who needs it most; in line finish it, or those of all who are new."""
@@ -269,8 +302,7 @@ class MultiBodyTracker:
         number, tracker = finished
         for track in self._tracks:
             if track.number == number and tracker.last is not None:
-                own = track.tracker.last
-                if own is None or tracker.last.two_way_distance < own.two_way_distance:
+                if _is_better(tracker.last, track.tracker.last):
                     track.tracker = tracker
                 else:
                     track.tracker.accept()
@@ -327,6 +359,14 @@ def _track(pair: tuple[_BodyTrack, PersonCloud]) -> BodyFit | InputError | None:
         return track.tracker.track(person)
     except InputError as error:
         return error
+
+
+def _is_better(full: BodyFit, own: BodyFit | None) -> bool:
+    """Return whether a full fit is closer than the tracked body, and much closer where it faces the other way."""
+    if own is None:
+        return True
+    same = own.state.rotation[0, :2, 0] @ full.state.rotation[0, :2, 0] > 0
+    return full.two_way_distance < (1.0 if same else MAX_OTHER_WAY_RATIO) * own.two_way_distance
 
 
 def _person_seed(seed: int, number: int) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, I64
+from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.track.rig_agreement import find_seen_through
@@ -52,6 +52,12 @@ class RigScene(SceneCloud):
     def distance(self) -> F64:
         """Distance (N,) m of each point from the sensor that saw it."""
         return np.concatenate([part.distance for part in self.parts])
+
+    def take(self, rows: Bools) -> RigScene:
+        """Return the part of the scene whose points are `rows` (N,)."""
+        ends = np.cumsum([len(part.points) for part in self.parts])[:-1]
+        parts = tuple(part.take(own) for part, own in zip(self.parts, np.split(rows, ends), strict=True))
+        return replace(self, points=self.points[rows], parts=parts)
 
     def with_fields(self, people: Sequence[PersonCloud]) -> list[PersonCloud]:
         """Return people with the sensors around them and what each can know of each person.

@@ -22,13 +22,9 @@ from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.seen_free import SeenFree
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
-from flowing_puppet_ros.body.upright.person_finder import (
-    FoundBody,
-    JudgedFit,
-    PersonFinder,
-    PersonFinderSettings,
-    RejectedCandidate,
-)
+from flowing_puppet_ros.body.upright.found_body import FoundBody, JudgedFit
+from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
+from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.reporting import Report
@@ -42,6 +38,7 @@ MAX_MISSES = 8
 MAX_LIVE_FITS = 4
 """Candidates to which bodies are fitted in a scan of a live stream, so that the first body does not wait for others,
 which come with the next."""
+SEARCH_EVERY = 3  # scans of a live stream in which somebody is tracked: the others are not searched for new people
 MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
 _UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
 MAX_REJECTED = 50  # candidates that are told of
@@ -86,6 +83,7 @@ class SceneTracker:
         self._seen_free = SeenFree()
         self._searched = np.empty(0, dtype=np.int64)
         self._was_searched = False
+        self._since_search = 0
         self._report = report or Report()
 
     def warm_up(self) -> None:
@@ -234,6 +232,10 @@ class SceneTracker:
             if looks_upside_down(points):
                 self._report.warn(_UPSIDE_DOWN)
         normals = None if cloud.normals is None else cloud.normals[rows]
+        # Who is tracked needs no search, and who comes can wait for a few scans.
+        only_known = live and any(len(body) for body in known) and self._since_search + 1 < SEARCH_EVERY
+        self._since_search = self._since_search + 1 if only_known else 0
+        come = self._seen_free.add(points, cloud.viewpoint) if remember and not only_known else None
         found = self._finder.find(
             points,
             normals,
@@ -243,7 +245,8 @@ class SceneTracker:
             MAX_LIVE_FITS if live else None,
             MAX_MISSES if remember else None,
             remember,
-            self._seen_free.add(points, cloud.viewpoint) if remember else None,
+            come,
+            only_known,
         )
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
@@ -260,8 +263,10 @@ class SceneTracker:
         """Return the body, or that of a full fit where many points are there and it is closer to them."""
         if fit is None or (not fit.reliable and len(person.points) >= MIN_MANY_POINTS):
             full = self._fit(person, seed, progress)
-            if fit is None or full.two_way_distance < fit.two_way_distance:
-                return full if fit is None else replace(full, confidence=fit.confidence)
+            if fit is None:
+                return full
+            if full.two_way_distance < fit.two_way_distance:
+                return replace(self._finder.choose_facing(person, fit, full), confidence=fit.confidence)
         return fit
 
     def _segment(

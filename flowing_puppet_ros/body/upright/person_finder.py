@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -16,25 +15,38 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights, find_candidates
 from flowing_puppet_ros.body.segmentation.people import person_score
 from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
+from flowing_puppet_ros.body.upright.found_body import (
+    SAME_PERSON_M,
+    FitBudget,
+    FoundBody,
+    JudgedFit,
+    ScanView,
+    is_same_candidate,
+    take_apart,
+)
 from flowing_puppet_ros.body.upright.person_model import PersonModel
-from flowing_puppet_ros.body.upright.rejected_places import RejectedPlaces
+from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate, RejectedPlaces
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS, UprightFit, UprightFitter
 from flowing_puppet_ros.body.upright.verification import weigh_fit
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.threads import one_blas_thread
 
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
 """Points, probability by shape, and score of what a full search is made for though no upright body explains it."""
-MIN_WORTHWHILE = 0.15
-"""Probability by the bank's best body from which on its other bodies are refined too."""
+MIN_WORTHWHILE, MIN_SHAPELY = 0.15, 0.5
+"""Probability by the bank's best body from which on its other bodies are refined too, and probability by shape from
+which on they are whatever the best says: somebody who leans is often nearer to another one."""
 MIN_TRACKED = 0.5
 """Probability of a tracked body below which a new one is tried where few points show the person."""
-MIN_COME_SHARE, COME_ODDS, COME_FILTER = 0.15, 1.5, 0.3
-"""Share of the points, where the sensor once saw through, from which on something has come there; the log odds by which
-that makes it a person; and the share of the filter's limit that is asked of it. Cars and doors move too."""
-SAME_PERSON_M = 0.35  # between the middles of two bodies that are one person
+COME_ODDS, COME_FILTER = 1.5, 0.3
+"""Log odds by which something that stands where the sensor once saw through is a person, and the share of the filter's
+limit that is asked of it. Cars and doors move too."""
+BESIDE_M, CONTEXT_M, OWN_M = 1.0, 1.0, 0.10
+"""Distance from a person within which others are looked for in what that person leaves, of their surroundings beyond,
+and from a body, up to which points are its own."""
 
 
 @dataclass(frozen=True)
@@ -57,37 +69,6 @@ class PersonFinderSettings(Settings):
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FoundBody:
-    """A person and the first body; without one, a person who is known already."""
-
-    person: PersonCloud
-    fit: BodyFit | None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class JudgedFit:
-    """A body: the `probability` that it is a person, and the `confidence` that it is one and close."""
-
-    probability: float
-    confidence: float
-    fit: BodyFit
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RejectedCandidate:
-    """What is no person: its place (3,) m, its probability to be one, and why it was rejected."""
-
-    place: np.ndarray
-    probability: float
-    reason: str
-
-    def describe(self, rotation: np.ndarray, translation: np.ndarray) -> dict[str, Any]:
-        """Return it for JSON, in a frame to which `rotation` (3, 3) and then `translation` (3,) m lead."""
-        place = np.round(rotation @ self.place + translation, 3).tolist()
-        return {"place": place, "probability": round(self.probability, 3), "reason": self.reason}
-
-
 class PersonFinder:
     """Finds the people in the scans of one sensor, and remembers what was none."""
 
@@ -98,8 +79,8 @@ class PersonFinder:
         self.upright = UprightFitter(fitter)
         self._rejected = RejectedPlaces(settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
-        self._scan: tuple[SceneHeights, ScanRays] | None = None
-        self._come: np.ndarray | None = None
+        self._view: ScanView | None = None
+        self._owned = np.empty(0, dtype=bool)
 
     def warm_up(self) -> None:
         """Do beforehand what the first scan would wait for."""
@@ -109,7 +90,7 @@ class PersonFinder:
     def reset(self) -> None:
         """Forget what was no person."""
         self._rejected.clear()
-        self._scan = None
+        self._view = None
 
     @one_blas_thread()
     def find(
@@ -123,6 +104,7 @@ class PersonFinder:
         max_misses: int | None = None,
         remember: bool = True,
         come: np.ndarray | None = None,
+        only_known: bool = False,
     ) -> list[FoundBody]:
         """Find the people in a scan; the same scans give the same answer.
 
@@ -136,85 +118,139 @@ class PersonFinder:
             max_misses: so many fits in a row of which none is a person end it; None: none does.
             remember: whether what is no person is remembered, and what was none is left out.
             come: which (N,) points lie where the scans before saw through; None where nothing is known.
+            only_known: nobody else is looked for, unless one of those who are expected is not there.
         """
         self.last_rejected = []
-        self._scan, self._come = None, come
+        self._view = None
         if len(points) < self._settings.min_points:
             return []
         scene = SceneHeights.of(points)
-        candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
+        candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known)
+        if only_known and len(owned) < sum(len(body) > 0 for body in known):
+            candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
         make = partial(_make_person, points, normals, scene, viewpoint, stamp)
         people = [
             FoundBody(make(rows, owner=owner), None)
             for owner, rows in owned.items()
             if len(rows) >= self._settings.min_points
         ]
-        probability = PersonModel.load().trees.predict(describe_candidates(candidates, scene, viewpoint))
-        chosen = self._choose(candidates, probability, stamp, remember)
-        self._scan = scene, ScanRays.of(points, viewpoint)
-        rays = self._scan[1]
+        view = self._view = ScanView(scene, ScanRays.of(points, viewpoint), stamp, remember, come)
         seen = {body.person.owner for body in people}
         middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
         unseen = {owner: middle for owner, middle in enumerate(middles) if owner not in seen}
         taken = [middle for owner, middle in enumerate(middles) if owner in seen]
-        found: list[tuple[JudgedFit, Candidate]] = []
-        bent: list[Candidate] = []
-        limit, misses = self._settings.max_fits if max_fits is None else max_fits, 0
-        for number in chosen[:limit]:
-            if misses == max_misses:
-                break
-            candidate = candidates[number]
-            judged = self._judge(candidate, float(probability[number]), scene, rays)
-            misses += 1
-            if judged is None:
-                continue
-            if judged.probability >= self._settings.min_probability:
-                found.append((judged, candidate))
-                misses = 0
-                continue
-            self._reject(candidate, judged.probability, "no upright body explains it", stamp, remember)
-            if self._may_be_bent(candidate, scene, float(probability[number])):
-                bent.append(candidate)
-        for judged, candidate in sorted(found, key=lambda each: -each[0].probability):
-            middle = judged.fit.vertices[:, :2].mean(axis=0)
-            if all(np.hypot(*(middle - other)) > SAME_PERSON_M for other in taken):
-                taken.append(middle)
-                # Who stands at a wall may have no points by the prediction: the candidate there is that person.
-                owner = _pop_nearest(unseen, middle)
-                person = make(candidate.rows, score=judged.probability, owner=owner)
-                people.append(FoundBody(person, replace(judged.fit, confidence=judged.confidence)))
+        budget = FitBudget(self._settings.max_fits if max_fits is None else max_fits, max_misses)
+        offered = self._choose(candidates, view)
+        found, bent = self._fit_offered(offered, view, budget)
+        accepted = take_apart(found, taken)
+        if accepted:
+            accepted += take_apart(self._look_beside(accepted, offered, view, budget), taken)
+        for judged, candidate in accepted:
+            # Who stands at a wall may have no points by the prediction: the candidate there is that person.
+            owner = _pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
+            person = make(candidate.rows, score=judged.probability, owner=owner)
+            people.append(FoundBody(person, replace(judged.fit, confidence=judged.confidence)))
         for candidate in bent:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
                 taken.append(candidate.middle)
                 people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
+        self._owned = np.zeros(len(points), dtype=bool)
+        for body in people:
+            self._owned[body.person.rows] = True
         return people
+
+    def _fit_offered(
+        self, offered: Sequence[tuple[Candidate, float]], view: ScanView, budget: FitBudget
+    ) -> tuple[list[tuple[JudgedFit, Candidate]], list[Candidate]]:
+        """Fit candidates with their probabilities by shape, and return who is a person, and who may be a bent one."""
+        found, bent = [], []
+        for candidate, probability in offered:
+            if not budget.spend():
+                break
+            judged = self._judge(candidate, probability, view)
+            if judged is None:
+                continue
+            if judged.probability >= self._settings.min_probability:
+                found.append((judged, candidate))
+                budget.misses = 0
+                continue
+            self.last_rejected.append(
+                RejectedCandidate.of(candidate, judged.probability, "no upright body explains it")
+            )
+            if view.remember:
+                self._rejected.add(candidate, view.stamp)
+            if self._may_be_bent(candidate, view.scene, probability):
+                bent.append(candidate)
+        return found, bent
+
+    def _look_beside(
+        self,
+        accepted: Sequence[tuple[JudgedFit, Candidate]],
+        offered: Sequence[tuple[Candidate, float]],
+        view: ScanView,
+        budget: FitBudget,
+    ) -> list[tuple[JudgedFit, Candidate]]:
+        """Return the people close beside others: without the points of these, what is left looks like a person.
+
+        What was `offered` before is not fitted again.
+        """
+        scene = view.scene
+        bodies = [judged.fit.vertices for judged, _ in accepted]
+        middles = [vertices[:, :2].mean(axis=0) for vertices in bodies]
+        near = [scene.index.find_near(scene.points, middle, BESIDE_M + CONTEXT_M)[0] for middle in middles]
+        rows = np.unique(np.concatenate(near))
+        own = np.zeros(len(rows), dtype=bool)
+        for vertices in bodies:
+            own |= NearestPoints(vertices).query(scene.points[rows])[0] < OWN_M
+        rows = rows[~own]
+        if len(rows) < self._settings.min_points:
+            return []
+        left = view.take(rows)
+        candidates, _ = find_candidates(left.scene, view.rays.viewpoint, self._settings.min_points)
+        fresh = [
+            candidate
+            for candidate in candidates
+            if any(np.hypot(*(candidate.middle - middle)) < BESIDE_M for middle in middles)
+            and not any(is_same_candidate(candidate, other) for other, _ in offered)
+        ]
+        found, _ = self._fit_offered(self._choose(fresh, left), left, budget)
+        return [(judged, replace(candidate, rows=rows[candidate.rows])) for judged, candidate in found]
 
     @one_blas_thread()
     def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
 
-        Where it explains few points badly, a new upright body may be better, and is returned instead. What is rejected
+        Points of other people count neither for nor against it. Where it explains few points badly, a new upright body
+        may be better, and is returned instead. What is rejected
         is remembered as by `find`.
         """
-        if self._scan is None or not len(rows):
+        if self._view is None or not len(rows):
             return JudgedFit(0.0, 0.0, fit)
-        scene, rays = self._scan
-        candidate = Candidate.of(scene, rows)
+        view, rows = self._view.leave_to(rows, self._owned)
+        rays, candidate = view.rays, Candidate.of(view.scene, rows)
         window = rays.find_window(person.points)
-        shape = describe_candidates([candidate], scene, rays.viewpoint)
+        shape = describe_candidates([candidate], view.scene, rays.viewpoint)
         probability = float(PersonModel.load().trees.predict(shape)[0])
         try:
             cloud = self.upright.make_cloud(person.points, rays.viewpoint, rays.find_unknown(person.points, window))
         except InputError:  # the sensor stands in it
             return JudgedFit(0.0, 0.0, fit)
-        judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, scene, rays, window)
+        judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, view, window)
         if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
             other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0])
-            again = self._weigh(other, cloud, candidate, probability, scene, rays, window)
+            again = self._weigh(other, cloud, candidate, probability, view, window)
             judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
             self._rejected.add(candidate, person.stamp)
         return judged
+
+    @one_blas_thread()
+    def choose_facing(self, person: PersonCloud, first: BodyFit, full: BodyFit) -> BodyFit:
+        """Return the body of a full fit to a person, or one that faces as the `first` one where that is likelier."""
+        if person.viewpoint is None or person.floor is None:
+            return full
+        cloud = self.upright.make_cloud(person.points, person.viewpoint, None, person.field)
+        return self.upright.choose_facing(first, full, cloud, person.floor)
 
     def _weigh(
         self,
@@ -222,19 +258,14 @@ class PersonFinder:
         cloud: SingleViewCloud,
         candidate: Candidate,
         probability: float,
-        scene: SceneHeights,
-        rays: ScanRays,
+        view: ScanView,
         window: np.ndarray,
     ) -> JudgedFit:
-        evidence = weigh_fit(found, cloud, candidate.rows, scene, rays, window, self._fitter.model)
+        evidence = weigh_fit(found, cloud, candidate.rows, view.scene, view.rays, window, self._fitter.model)
         model = PersonModel.load()
-        odds = COME_ODDS if self._has_come(candidate) else 0.0
+        odds = COME_ODDS if view.has_come(candidate) else 0.0
         likely = 0.0 if evidence.between_others else model.combine(probability, evidence, odds)
         return JudgedFit(likely, model.rate(likely, evidence), found.fit)
-
-    def _has_come(self, candidate: Candidate) -> bool:
-        """Return whether a candidate stands where the sensor once saw through."""
-        return self._come is not None and bool(self._come[candidate.rows].mean() > MIN_COME_SHARE)
 
     def _may_be_bent(self, candidate: Candidate, scene: SceneHeights, probability: float) -> bool:
         """Return whether a candidate may be a person who sits, bends or lifts the arms, for a full search to show."""
@@ -242,25 +273,25 @@ class PersonFinder:
             return False
         return person_score(scene.points[candidate.rows], None) >= MIN_BENT_SCORE
 
-    def _choose(self, candidates: list[Candidate], probability: np.ndarray, stamp: int, remember: bool) -> list[int]:
-        """Return the candidates that are worth a fit, the likeliest first."""
+    def _choose(self, candidates: list[Candidate], view: ScanView) -> list[tuple[Candidate, float]]:
+        """Return the candidates that are worth a fit with their probabilities by shape, the likeliest first."""
+        shape = describe_candidates(candidates, view.scene, view.rays.viewpoint)
+        probability = PersonModel.load().trees.predict(shape)
         chosen = []
         for number in np.argsort(-probability, kind="stable"):
-            candidate = candidates[number]
-            come = self._has_come(candidate)
-            if probability[number] < self._settings.min_filter * (COME_FILTER if come else 1.0):
-                self.last_rejected.append(
-                    _describe_rejected(candidate, probability[number], "its shape is no person's")
-                )
-            elif remember and not come and self._rejected.contains(candidate, stamp):
-                self.last_rejected.append(_describe_rejected(candidate, probability[number], "rejected before"))
+            candidate, likely = candidates[number], float(probability[number])
+            come = view.has_come(candidate)
+            if likely < self._settings.min_filter * (COME_FILTER if come else 1.0):
+                self.last_rejected.append(RejectedCandidate.of(candidate, likely, "its shape is no person's"))
+            elif view.remember and not come and self._rejected.contains(candidate, view.stamp):
+                self.last_rejected.append(RejectedCandidate.of(candidate, likely, "rejected before"))
             else:
-                chosen.append(int(number))
+                chosen.append((candidate, likely))
         return chosen
 
-    def _judge(self, candidate: Candidate, probability: float, scene: SceneHeights, rays: ScanRays) -> JudgedFit | None:
+    def _judge(self, candidate: Candidate, probability: float, view: ScanView) -> JudgedFit | None:
         """Return the body and how likely it is a person; None where no body can be fitted."""
-        points = scene.points[candidate.rows]
+        rays, points = view.rays, view.scene.points[candidate.rows]
         window = rays.find_window(points)
         try:
             cloud = self.upright.make_cloud(points, rays.viewpoint, rays.find_unknown(points, window))
@@ -268,21 +299,17 @@ class PersonFinder:
             return None
 
         def weigh(found: UprightFit) -> JudgedFit:
-            return self._weigh(found, cloud, candidate, probability, scene, rays, window)
+            return self._weigh(found, cloud, candidate, probability, view, window)
 
         starts = self.upright.find_rough(cloud, candidate.floor)
         first = self.upright.refine(starts[:1], cloud, candidate.floor)
         judged = weigh(first)
-        if judged.probability >= MIN_WORTHWHILE and len(starts) > 1:
+        worthwhile = judged.probability >= MIN_WORTHWHILE or probability >= MIN_SHAPELY
+        if worthwhile and len(starts) > 1:
             others = self.upright.refine(starts[1:], cloud, candidate.floor)
             if others.score < first.score:
                 judged = weigh(others)
         return judged
-
-    def _reject(self, candidate: Candidate, probability: float, reason: str, stamp: int, remember: bool) -> None:
-        self.last_rejected.append(_describe_rejected(candidate, probability, reason))
-        if remember:
-            self._rejected.add(candidate, stamp)
 
 
 def _pop_nearest(middles: dict[int, np.ndarray], place: np.ndarray) -> int | None:
@@ -315,8 +342,3 @@ def _make_person(
         owner,
         scene.floor.locate(*np.median(points[rows, :2], axis=0)),
     )
-
-
-def _describe_rejected(candidate: Candidate, probability: float, reason: str) -> RejectedCandidate:
-    place = np.array([*candidate.middle, candidate.floor])
-    return RejectedCandidate(place, float(probability), reason)

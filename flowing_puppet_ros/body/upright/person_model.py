@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numba import njit
 
-from flowing_puppet_ros.body.upright.decision_trees import DecisionTrees
 from flowing_puppet_ros.body.upright.verification import EVIDENCE_NAMES, FitEvidence
 from flowing_puppet_ros.model import weights
 
@@ -21,6 +21,47 @@ MIN_ODDS, MAX_ODDS = 0.02, 0.98  # of each forest
 ACCURACY_NAMES = ("cost", "distance", "supported", "explained", "hidden", "log_points", "confidence", "stature")
 """Evidence that tells how close the joints are."""
 _ACCURACY_COLUMNS = [EVIDENCE_NAMES.index(name) for name in ACCURACY_NAMES]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DecisionTrees:
+    """Trees one after the other; a leaf has no feature (-1).
+
+    Attributes:
+        roots: (T,) node of each root.
+        feature: (N,) int, that a node compares.
+        threshold: (N,) up to which its left branch is taken.
+        left, right: (N,) nodes.
+        value: (N,) probability at a leaf.
+    """
+
+    roots: np.ndarray
+    feature: np.ndarray
+    threshold: np.ndarray
+    left: np.ndarray
+    right: np.ndarray
+    value: np.ndarray
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray], forest: str) -> DecisionTrees:
+        """Take the arrays of a `forest`, which are named as the attributes."""
+        return cls(*(np.ascontiguousarray(arrays[f"{forest}_{name}"]) for name in cls.__slots__))
+
+    def to_arrays(self, forest: str) -> dict[str, np.ndarray]:
+        """Return what `from_arrays` takes."""
+        return {f"{forest}_{name}": getattr(self, name) for name in self.__slots__}
+
+    def predict(self, features: np.ndarray) -> np.ndarray:
+        """Return the mean probability (C,) of the trees for features (C, F)."""
+        return _predict(
+            np.ascontiguousarray(features, dtype=np.float64),
+            self.roots,
+            self.feature,
+            self.threshold,
+            self.left,
+            self.right,
+            self.value,
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,3 +129,15 @@ def select_accuracy(evidence: np.ndarray) -> np.ndarray:
 
 def _logistic(odds: np.ndarray | float) -> np.ndarray:
     return np.asarray(1 / (1 + np.exp(-odds)))
+
+
+@njit(cache=True, nogil=True)
+def _predict(features, roots, feature, threshold, left, right, value):  # type: ignore[no-untyped-def]
+    result = np.zeros(len(features))
+    for row in range(len(features)):
+        for root in roots:
+            node = root
+            while feature[node] >= 0:
+                node = left[node] if features[row, feature[node]] <= threshold[node] else right[node]
+            result[row] += value[node]
+    return result / len(roots)

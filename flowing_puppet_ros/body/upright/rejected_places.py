@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
 from flowing_puppet_ros.body.segmentation.candidates import Candidate
@@ -11,6 +14,25 @@ RADIUS_M = 0.3
 MAX_TOP_CHANGE_M, MAX_GROWTH = 0.15, 1.5
 """Change of the height of the top, and of the number of points, from which on something else stands there."""
 MAX_PLACES = 1000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RejectedCandidate:
+    """What is no person: its place (3,) m, its probability to be one, and why it was rejected."""
+
+    place: np.ndarray
+    probability: float
+    reason: str
+
+    @classmethod
+    def of(cls, candidate: Candidate, probability: float, reason: str) -> RejectedCandidate:
+        """Make it of a candidate."""
+        return cls(np.array([*candidate.middle, candidate.floor]), float(probability), reason)
+
+    def describe(self, rotation: np.ndarray, translation: np.ndarray) -> dict[str, Any]:
+        """Return it for JSON, in a frame to which `rotation` (3, 3) and then `translation` (3,) m lead."""
+        place = np.round(rotation @ self.place + translation, 3).tolist()
+        return {"place": place, "probability": round(self.probability, 3), "reason": self.reason}
 
 
 class RejectedPlaces:

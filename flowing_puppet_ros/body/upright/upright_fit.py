@@ -165,6 +165,16 @@ class UprightFitter:
         turned = BodyState(other.center @ back.T + middle, back @ other.rotation, other.pose, other.shape)
         return self.refine([(0.0, turned)], cloud, floor)
 
+    def choose_facing(self, first: BodyFit, full: BodyFit, cloud: SingleViewCloud, floor: float) -> BodyFit:
+        """Return the body of a full fit, turned round if it does not face as the `first` one and that is likelier.
+
+        A full fit is closer to the cloud whichever way it faces, which says little about front and back.
+        """
+        if first.state.rotation[0, :2, 0] @ full.state.rotation[0, :2, 0] > 0:
+            return full
+        turned = self.turn_round(full.state, cloud, floor)
+        return min(self.rate(full, cloud), turned, self.rate(first, cloud), key=lambda each: each.score).fit
+
     def rate(self, fit: BodyFit, cloud: SingleViewCloud) -> UprightFit:
         """Return a body that was fitted otherwise with its cost on a cloud."""
         stature = self._fitter.model.measure_height(fit.state.shape)

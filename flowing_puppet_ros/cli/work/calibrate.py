@@ -82,6 +82,10 @@ def _describe(arguments: argparse.Namespace, refined: RefinedRig, notes: list[st
         "offsets_s": {name: round(offset, 5) for name, offset in refined.offsets.items()},
         "offsets_images": {name: round(offset / refined.period, 2) for name, offset in refined.offsets.items()},
         "person_heights_m": {person: round(height, 3) for person, height in refined.heights.items()},
+        "known_to": {
+            name: {"turn_deg": round(each.turn, 3), "roll_deg": round(each.roll, 3), "place_m": round(each.move, 4)}
+            for name, each in refined.uncertainty.items()
+        },
         "warnings": notes,
         "seconds": round(seconds, 3),
     }
@@ -100,11 +104,14 @@ def _round(agreement: Agreement) -> dict[str, Any]:
 
 def _text(summary: dict[str, Any]) -> str:
     before, after = summary["before_px"], summary["after_px"]
-    lines = ["camera        before px  after px  clock s  (mean reprojection of joints)"]
-    lines += [
-        f"{name:<12} {before['mean_by_camera'].get(name, np.nan):10.1f} {value:9.1f} {summary['offsets_s'][name]:8.4f}"
-        for name, value in after["mean_by_camera"].items()
-    ]
+    lines = ["camera        before px  after px  clock s  known to no better than (mean reprojection of joints)"]
+    for name, value in after["mean_by_camera"].items():
+        known = summary["known_to"][name]
+        lines.append(
+            f"{name:<12} {before['mean_by_camera'].get(name, np.nan):10.1f} {value:9.1f} "
+            f"{summary['offsets_s'][name]:8.4f}  {known['turn_deg']:.2f} deg, roll {known['roll_deg']:.2f} deg, "
+            f"{100 * known['place_m']:.1f} cm"
+        )
     lines.append(
         f"all: mean {before['mean']:.1f} -> {after['mean']:.1f} px, "
         f"median {before['median']:.1f} -> {after['median']:.1f} px"

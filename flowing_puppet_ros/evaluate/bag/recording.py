@@ -207,10 +207,10 @@ def _calibrate_cameras(recording: Recording, frames: FrameTree) -> None:
             )
 
 
-def puppet_joints(person: Any) -> Joints:
-    """Return the known joints {our name: (2,)} px of a Puppet message."""
+def puppet_joints(person: Any, min_confidence: float = 0.0) -> Joints:
+    """Return the known joints {our name: (2,)} px of a Puppet message, those of more than a confidence."""
     points = np.array([(joint.x, joint.y) for joint in person.joints], float).reshape(-1, 2)
-    seen = [k for k, joint in enumerate(person.joints) if joint.confidence > 0]
+    seen = [k for k, joint in enumerate(person.joints) if joint.confidence > min_confidence]
     return name_points([person.joints[k].name for k in seen], points[seen])
 
 

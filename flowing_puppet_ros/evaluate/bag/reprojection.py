@@ -18,6 +18,8 @@ from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 from flowing_puppet_ros.stream.messages.message_types import SILHOUETTES
 
 _AGREE_M = TriangulationSettings().max_ray_distance
+SURE_CONFIDENCE = 0.5
+"""Of a puppet's joint, from which it is rather right than wrong."""
 _MAX_MEDIAN_M = 0.3  # of the distances of a puppet's joints, for it to show a person
 
 type PeopleInSpace = dict[int, dict[str, Joints]]
@@ -31,11 +33,13 @@ class Reprojection:
     Attributes:
         pixels: (N,) of all joints that are known in space and in the image.
         agrees: (N,) whether they are within 6 cm at the joint's depth: the image took part in placing the joint.
+        sure: (N,) whether the puppet is rather sure of them, by the image alone: hidden limbs are guessed.
         people: (N,) whose they are.
     """
 
     pixels: np.ndarray
     agrees: np.ndarray
+    sure: np.ndarray
     people: np.ndarray
 
     @property
@@ -49,7 +53,7 @@ class Reprojection:
         return cls(
             *(
                 np.concatenate([getattr(each, name) for each in parts.values()])
-                for name in ("pixels", "agrees", "people")
+                for name in ("pixels", "agrees", "sure", "people")
             )
         )
 
@@ -71,15 +75,21 @@ def measure_reprojection(recording: Recording, people: PeopleInSpace) -> dict[st
     for record in recording.cameras.values():
         if record.camera is None:
             continue
-        rows: list[tuple[float, bool, str]] = []
+        rows: list[tuple[float, bool, bool, str]] = []
         for stamp, group in people.items():
-            puppets = [puppet_joints(puppet) for puppet in record.puppets.get(stamp, ())]
+            seen = record.puppets.get(stamp, ())
+            puppets = [puppet_joints(puppet) for puppet in seen]
             for identity, index in match_people(record.camera, group, puppets).items():
-                pixels, metres = compare_joints(record.camera, group[identity], puppets[index])
-                rows += [(p, m < _AGREE_M, identity) for p, m in zip(pixels, metres, strict=True)]
+                sure = puppet_joints(seen[index], SURE_CONFIDENCE)
+                for is_sure in (False, True):
+                    chosen = {name: each for name, each in puppets[index].items() if (name in sure) == is_sure}
+                    pixels, metres = compare_joints(record.camera, group[identity], chosen)
+                    rows += [(p, m < _AGREE_M, is_sure, identity) for p, m in zip(pixels, metres, strict=True)]
         if rows:
-            values, agrees, names = zip(*rows, strict=True)
-            found[record.name] = Reprojection(np.array(values), np.array(agrees, bool), np.array(names))
+            values, agrees, sures, names = zip(*rows, strict=True)
+            found[record.name] = Reprojection(
+                np.array(values), np.array(agrees, bool), np.array(sures, bool), np.array(names)
+            )
     return found
 
 
@@ -114,9 +124,12 @@ def summarise_reprojection(found: Mapping[str, Reprojection]) -> dict[str, float
     if not found:
         return {}
     every = Reprojection.join(found)
+    sure = every.pixels[every.sure]
     return {
         "joints in space to puppets, mean px where they agree": every.mean_of_agreeing,
         "joints in space that agree, %": 100 * float(every.agrees.mean()),
+        "joints in space to puppets, mean px where the puppets are sure": float(sure.mean()) if len(sure) else np.nan,
+        "joints of which the puppets are sure, %": 100 * float(every.sure.mean()),
         "joints in space to puppets, median px of all": float(np.median(every.pixels)),
         "joints in space to puppets, mean px of all": float(every.pixels.mean()),
     }

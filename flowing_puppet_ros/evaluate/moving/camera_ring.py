@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64
-from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.track.rig_scene import RigScene
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
@@ -75,12 +75,14 @@ class RingScore:
         joints: (P,) m, mean error of the limbs' joints of each person, NaN without a body.
         vertices: (P,) m, mean error of the vertices.
         ghosts: bodies that are nobody.
+        reliable: bodies that are somebody and say that they are reliable.
         seconds: processor time.
     """
 
     joints: F64
     vertices: F64
     ghosts: int
+    reliable: int
     seconds: float
 
 
@@ -99,12 +101,18 @@ def score_scene(fitter: BodyFitter, scene: SceneCloud, studio: RgbdStudio, bodie
             fits = [body.fit for body in SceneTracker(fitter, SceneSettings()).fit_once(scene, 0)]
         except InputError:  # nobody
             fits = []
-    seconds = time.process_time() - begin
+    return score_fits(fitter, fits, studio, bodies, time.process_time() - begin)
+
+
+def score_fits(
+    fitter: BodyFitter, fits: Sequence[BodyFit], studio: RgbdStudio, bodies: Sequence[TrueBody], seconds: float
+) -> RingScore:
+    """Compare fits in the world with those who are there; each person has the nearest one, the surest first."""
     own = [fitter.model.joint_names.index(name) for name in LIMB_JOINTS]
     limbs = [studio.source.joint_names.index(name) for name in LIMB_JOINTS]
     true = np.stack([body.joints[limbs] for body in bodies])
     joints, vertices = np.full(len(bodies), np.nan), np.full(len(bodies), np.nan)
-    ghosts = 0
+    ghosts, reliable = 0, 0
     for fit in sorted(fits, key=lambda fit: -fit.confidence):
         away = np.linalg.norm(fit.joints[own].mean(axis=0) - true.mean(axis=1), axis=1)
         person = int(away.argmin())
@@ -114,7 +122,8 @@ def score_scene(fitter: BodyFitter, scene: SceneCloud, studio: RgbdStudio, bodie
         joints[person] = np.linalg.norm(fit.joints[own] - true[person], axis=1).mean()
         template = bodies[person].template_vertices(fitter.model.name)
         vertices[person] = np.linalg.norm(fit.vertices - template, axis=1).mean()
-    return RingScore(joints, vertices, ghosts, seconds)
+        reliable += fit.reliable
+    return RingScore(joints, vertices, ghosts, reliable, seconds)
 
 
 def compare_cameras(
@@ -144,5 +153,6 @@ def summarise_ring(cameras: int, scores: Sequence[RingScore]) -> dict[str, Any]:
         "median_cm": 100 * float(np.median(vertices[known])) if known.any() else float("nan"),
         "worst_cm": 100 * float(vertices[known].max()) if known.any() else float("nan"),
         "ghosts": sum(score.ghosts for score in scores),
+        "reliable": sum(score.reliable for score in scores),
         "seconds": float(np.mean([score.seconds for score in scores])),
     }

@@ -34,8 +34,8 @@ class NearestPoints:
         cell = max(cell, float(np.prod((high - low) / MAX_CELLS ** (1 / 3))) ** (1 / 3), 1e-9)
         shape = np.floor((high - low) / cell).astype(np.int64) + 1
         rows, start = sort_by_cell(self.points, low, cell, shape)
-        scaled_normals = self._scaled_normals[rows] if len(self._scaled_normals) else self._scaled_normals
-        self._grid = (low, cell, shape, rows, start, self.points[rows], scaled_normals)
+        sorted_normals = _take_rows(self._scaled_normals, rows) if len(self._scaled_normals) else self._scaled_normals
+        self._grid = (low, cell, shape, rows, start, _take_rows(self.points, rows), sorted_normals)
         self._tree: cKDTree | None = None
 
     def query(
@@ -94,13 +94,27 @@ def sort_by_cell(points: np.ndarray, low: np.ndarray, cell: float, shape: np.nda
 
 
 @njit(cache=True, nogil=True)
+def _take_rows(points: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return `points` (N, 3) in the order of `rows` (N,), in a fifth of NumPy's time."""
+    taken = np.empty((len(rows), 3))
+    for place in range(len(rows)):
+        for axis in range(3):
+            taken[place, axis] = points[rows[place], axis]
+    return taken
+
+
+@njit(cache=True, nogil=True)
 def _nearest(  # type: ignore[no-untyped-def]
     queries, query_normals, guess, unsorted, low, cell, shape, rows, start, points, normals
 ):
-    """Return distance and row of the point nearest to each query; row -1 where the cells around it do not settle it.
+    """Return distance and row of the point nearest to each query; row -1 where no point is in the rings around it.
 
     `points` and `normals` (scaled, or none) are in the order of the cells, as `rows` is; `unsorted` are the same in the
     order of the rows. `guess` are rows, one for each query, or none.
+
+    Rings of cells are searched until a point is nearer than they reach, which a guess mostly is from the beginning;
+    then all cells are that reach into the sphere up to that point. Cells along z follow each other, so that those of a
+    column are searched in one loop.
     """
     count, use_normals = len(queries), len(normals) > 0
     distance, index = np.empty(count), np.empty(count, np.int64)
@@ -110,26 +124,21 @@ def _nearest(  # type: ignore[no-untyped-def]
         x, y, z = queries[query, 0], queries[query, 1], queries[query, 2]
         if use_normals:
             u, v, w = query_normals[query, 0], query_normals[query, 1], query_normals[query, 2]
-        a, b, c = _cell_of(x, low[0], cell, nx), _cell_of(y, low[1], cell, ny), _cell_of(z, low[2], cell, nz)
         best, found = np.inf, -1
         if len(guess):
             row = guess[query]
             best, found = _squared_distance(x, y, z, unsorted[0], row), row
             if use_normals:
                 best += _squared_distance(u, v, w, unsorted[1], row)
-        for ring in range(MAX_RINGS + 1):
-            for i in range(max(a - ring, 0), min(a + ring, nx - 1) + 1):
-                across_x = _outside(x, low[0] + cell * i, cell)
-                if across_x >= best:
-                    continue
-                for j in range(max(b - ring, 0), min(b + ring, ny - 1) + 1):
-                    across = across_x + _outside(y, low[1] + cell * j, cell)
-                    if across >= best:
-                        continue
+        a, b, c = _cell_of(x, low[0], cell, nx), _cell_of(y, low[1], cell, ny), _cell_of(z, low[2], cell, nz)
+        reach = 0
+        while reach <= MAX_RINGS and best > (cell * reach) ** 2:
+            for i in range(max(a - reach, 0), min(a + reach, nx - 1) + 1):
+                for j in range(max(b - reach, 0), min(b + reach, ny - 1) + 1):
                     # On the ring's rim the whole column is new, inside of it only the two ends.
-                    step = 1 if abs(i - a) == ring or abs(j - b) == ring else 2 * ring
-                    for k in range(c - ring, c + ring + 1, step):
-                        if not 0 <= k < nz or across + _outside(z, low[2] + cell * k, cell) >= best:
+                    step = 1 if abs(i - a) == reach or abs(j - b) == reach else 2 * reach
+                    for k in range(c - reach, c + reach + 1, max(step, 1)):
+                        if not 0 <= k < nz:
                             continue
                         flat = (i * ny + j) * nz + k
                         for place in range(start[flat], start[flat + 1]):
@@ -138,14 +147,24 @@ def _nearest(  # type: ignore[no-untyped-def]
                                 squared += _squared_distance(u, v, w, normals, place)
                             if squared < best:
                                 best, found = squared, rows[place]
-            gap = min(
-                gap_beyond_rings(x, low[0], cell, nx, a, ring), gap_beyond_rings(y, low[1], cell, ny, b, ring),
-                gap_beyond_rings(z, low[2], cell, nz, c, ring),
-            )  # fmt: skip
-            if best <= gap * abs(gap):
-                break
-        else:
-            found = -1
+            reach += 1
+        if best > (cell * MAX_RINGS) ** 2:
+            distance[query], index[query] = best, -1
+            continue
+        radius = np.sqrt(best)
+        first, last = _cell_of(z - radius, low[2], cell, nz), _cell_of(z + radius, low[2], cell, nz)
+        for i in range(_cell_of(x - radius, low[0], cell, nx), _cell_of(x + radius, low[0], cell, nx) + 1):
+            across_x = _outside(x, low[0] + cell * i, cell)
+            for j in range(_cell_of(y - radius, low[1], cell, ny), _cell_of(y + radius, low[1], cell, ny) + 1):
+                if across_x + _outside(y, low[1] + cell * j, cell) >= best:
+                    continue
+                column = (i * ny + j) * nz
+                for place in range(start[column + first], start[column + last + 1]):
+                    squared = _squared_distance(x, y, z, points, place)
+                    if use_normals and squared < best:
+                        squared += _squared_distance(u, v, w, normals, place)
+                    if squared < best:
+                        best, found = squared, rows[place]
         distance[query], index[query] = np.sqrt(best), found
     return distance, index
 

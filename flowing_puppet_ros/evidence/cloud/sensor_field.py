@@ -85,6 +85,18 @@ class SensorField:
         """Return which (N,) of the places `points` (N, 3) m the sensor knows nothing about."""
         return _find_unknown(np.ascontiguousarray(points, dtype=np.float64), self.arrays)
 
+    def doubt_blanks(self, points: F64) -> SensorField:
+        """Return the field of a sensor that knows nothing about pixels without depth, unless it is the person's own.
+
+        `points` (N, 3) m are the person's. Black clothes and sunlight leave such pixels as the open air does.
+        """
+        limit = np.where(np.isinf(self.limit), np.float32(0), self.limit)
+        column, row = np.floor(self.projection.project(points)[0] + 0.5).astype(np.int64).T
+        inside = (column >= 0) & (row >= 0) & (column < limit.shape[1]) & (row < limit.shape[0])
+        own = row[inside], column[inside]
+        limit[own] = self.limit[own]
+        return replace(self, limit=limit)
+
     @property
     def arrays(self) -> FieldArrays:
         """What compiled loops need."""

@@ -29,6 +29,14 @@ class SensorRig:
         """Return the same sensors for another cloud, whose points the sensors `owner` (N,) saw."""
         return replace(self, owner=owner)
 
+    def doubt_blanks(self, points: F64) -> SensorRig:
+        """Return the same with `SensorField.doubt_blanks` of each sensor and its own of the `points` (N, 3) m."""
+        fields = [
+            None if field is None else field.doubt_blanks(points[self.owner == number])
+            for number, field in enumerate(self.fields)
+        ]
+        return replace(self, fields=tuple(fields))
+
     def find_unknown(self, points: F64) -> Bools:
         """Return which (N,) of the places `points` (N, 3) m no sensor knows anything about."""
         unknown = np.ones(len(points), dtype=bool)

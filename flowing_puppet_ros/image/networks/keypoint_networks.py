@@ -17,7 +17,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Image
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.formats.skeletons import COCO_17
+from flowing_puppet_ros.image.formats.skeletons import COCO_17, MEDIAPIPE_33
 from flowing_puppet_ros.image.networks.agreement import combine, turn_sides
 from flowing_puppet_ros.image.networks.pose_networks import EXTRA, BlazePose, Landmarks, MoveNet
 from flowing_puppet_ros.image.networks.poses import (
@@ -211,13 +211,20 @@ def _is_small(pose: NetworkPose, image: Image, side: int) -> bool:
 def _place_extremities(
     landmarks: Landmarks, joints: Mapping[str, tuple[F64, float]], crossed: bool
 ) -> dict[str, tuple[F64, float]]:
-    """Return place (2,) px and confidence of hands, heels and toes: no better than that of wrist or ankle."""
+    """Return place (2,) px and confidence of hands, heels and toes: no better than that of wrist or ankle.
+
+    They lie beside wrist and ankle as the landmarks say, wherever the landmarks have those two: the limbs of `joints`,
+    by both networks, are better.
+    """
     found = {}
     for name, row in EXTRA.items():
         side, _, part = name.partition("_")
+        limb = "wrist" if part == "hand" else "ankle"
+        own = landmarks.points[MEDIAPIPE_33.index(f"{side}_{limb}")]
         side = {"left": "right", "right": "left"}[side] if crossed else side
-        nearest = joints[f"{side}_{'wrist' if part == 'hand' else 'ankle'}"][1]
-        found[f"{side}_{part}"] = landmarks.points[row], float(landmarks.visibility[row]) * nearest
+        place, confidence = joints[f"{side}_{limb}"]
+        beside = place + landmarks.points[row] - own
+        found[f"{side}_{part}"] = beside, float(landmarks.visibility[row]) * confidence
     return found
 
 

@@ -20,6 +20,7 @@ MIN_TURN_VOTES = 3.0  # ... and must reach this for the other side to flip the p
 SCALE_GAIN = 0.1  # share of the new scale estimate taken at each detection
 MIN_OVERRIDE_M = 0.06  # `Track.override_joint` ignores smaller moves
 APPEARANCE_GAIN = 0.2  # share of the newly seen colours taken at each detection
+MISSING_SHARE = 0.3  # of a joint's quality that it loses at each detection of its person which does not have it
 OPEN_GATE_AGE = 1_000  # images without a detection after which any detected position passes the gate
 
 
@@ -180,6 +181,8 @@ class Track:
         - farther: an outlier, ignored at first. The joint jumps there once `outliers_to_accept` outliers in a row
           agree, or once `gate` times the images since the last accepted detection has reached it: flow errs in
           proportion to the motion, again and again in one direction, so the gate opens while flow alone propagates.
+        - not in the detection: the flow alone propagates it, and it is less sure. Limbs of which a detector is not sure
+          are mostly hidden, and the flow there is that of what hides them.
 
         Sets `detection_energy`, half the squared distances in standard deviations, of outliers the gate's.
         """
@@ -201,7 +204,8 @@ class Track:
         gain = np.where(jump, 1.0, np.where(good, self.variance / total, 0.0))
         self.mean = self.mean + gain[:, None] * np.where(seen[:, None], joints - self.mean, 0.0)
         self.variance = np.where(jump, noise, (1 - gain) * self.variance)
-        self.quality = self.quality + gain * (confidence - self.quality)
+        quality = self.quality + gain * (confidence - self.quality)
+        self.quality = np.where(seen, quality, (1 - MISSING_SHARE) * self.quality)
         self.age[good | jump] = 0
         self.outlier_count[jump] = 0
         self.outlier_position[jump] = np.nan

@@ -8,8 +8,13 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
-from flowing_puppet_ros.body.upright.decision_trees import DecisionTrees
-from flowing_puppet_ros.body.upright.person_model import PersonModel, log_odds, select_accuracy, weigh_odds
+from flowing_puppet_ros.body.upright.person_model import (
+    DecisionTrees,
+    PersonModel,
+    log_odds,
+    select_accuracy,
+    weigh_odds,
+)
 from flowing_puppet_ros.learn.people.examples import CandidateExamples
 from flowing_puppet_ros.learn.people.unseen import make_forest, predict_unseen
 

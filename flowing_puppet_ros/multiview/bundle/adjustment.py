@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from flowing_puppet_ros.arrays import F64
@@ -19,14 +18,17 @@ from flowing_puppet_ros.multiview.bundle.joint_tracks import PeopleTracks
 from flowing_puppet_ros.multiview.camera import Camera
 
 _MAX_INSTANTS = 60
-_SCALES_PX = (60.0, 30.0, 20.0, 10.0, 6.0, *[5.0] * 8)  # of the robust loss, round by round, at 1000 px focal length
+ROBUST_PX = 5.0  # of the robust loss, at 1000 px focal length
+_SCALES_PX = (60.0, 30.0, 20.0, 10.0, 6.0, *[ROBUST_PX] * 8)  # of the robust loss, round by round
 _TRIANGULATION_STEPS = 4
 _MEDIAN_STEPS = 12
 _MIN_DEPTH_M = 0.1  # of a joint in front of a camera
-_MAX_EVALUATIONS = 3  # of derivatives in a round: new weights help more than many steps
+_STEPS = 3  # of Gauss-Newton in a round: new weights help more than many steps
 # How far a camera is expected to be from where the former calibration has it: this keeps what the joints leave free,
-# and is robust, so that a camera that was pushed is not held back.
-_TURN, _MOVE_M, _CLOCK_PERIODS, _FOCAL, _CENTRE = np.radians(0.3), 0.02, 100.0, 0.003, 0.003
+# and is robust, so that a camera that was pushed is not held back. About its own axis a camera is held hardly at all:
+# people on one spot tell that angle five times worse than the others, and a camera that was rolled would stay so.
+TURN, ROLL, MOVE_M = np.radians(3.0), np.radians(10.0), 0.02
+_CLOCK_PERIODS, _FOCAL, _CENTRE = 100.0, 0.003, 0.003
 _PRIOR_JOINTS = 10.0  # joints that weigh as much as the expectation
 _TURN_AND_MOVE = slice(0, 6)  # among the unknowns of a camera
 _CLOCK_STEP = 0.25  # periods over which the velocity of joints is measured
@@ -158,8 +160,8 @@ def adjust(
     instants = choose_instants(tracks, names)
     start = np.array([offsets.get(name, 0.0) for name in names])
     state, expected = (
-        _State.of([cameras[name] for name in names], start),
-        _State.of([former[name] for name in names], start),
+        CameraState.of([cameras[name] for name in names], start),
+        CameraState.of([former[name] for name in names], start),
     )
     focal = np.array([cameras[name].focal for name in names])
     for scale in _SCALES_PX:
@@ -169,7 +171,7 @@ def adjust(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _State:
+class CameraState:
     """Cameras as arrays: rotation (C, 3, 3), centre (C, 3), offset (C,) s, lens (C, 3): focal factor, centre."""
 
     rotation: F64
@@ -178,7 +180,7 @@ class _State:
     lens: F64
 
     @classmethod
-    def of(cls, cameras: Sequence[Camera], offset: F64) -> _State:
+    def of(cls, cameras: Sequence[Camera], offset: F64) -> CameraState:
         """Return the state of cameras whose lenses are as they are."""
         rotation, centre = np.stack([c.rotation for c in cameras]), np.stack([c.centre for c in cameras])
         return cls(rotation, centre, offset, np.tile([1.0, 0.0, 0.0], (len(cameras), 1)))
@@ -188,14 +190,14 @@ class _State:
         """World to camera (C, 3), m."""
         return -np.einsum("cij,cj->ci", self.rotation, self.centre)
 
-    def move(self, step: F64, period: float) -> _State:
+    def move(self, step: F64, period: float) -> CameraState:
         """Return the state after a step (C, 10): turn of the camera, move of its centre, clock, lens."""
         turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
-        return _State(
+        return CameraState(
             turn @ self.rotation, self.centre + step[:, 3:6], self.offset + step[:, 6] * period, self.lens + step[:, 7:]
         )
 
-    def subtract(self, other: _State, period: float) -> F64:
+    def subtract(self, other: CameraState, period: float) -> F64:
         """Return the step (C, 10) that leads from another state here."""
         turn = Rotation.from_matrix(self.rotation @ np.swapaxes(other.rotation, 1, 2)).as_rotvec()
         clock = (self.offset - other.offset)[:, None] / period
@@ -215,12 +217,12 @@ class _State:
 
 
 def _adjust_round(
-    state: _State, expected: _State, instants: _Instants, focal: F64, scale: float, freedom: Freedom
-) -> _State:
+    state: CameraState, expected: CameraState, instants: _Instants, focal: F64, scale: float, freedom: Freedom
+) -> CameraState:
     """Adjust with the weights of the robust loss at the state, of width `scale` px at 1000 px focal length."""
     cameras, period, width = len(focal), instants.tracks.period, scale / 1000.0
     plane, confidence = instants.observe(state.offset)
-    weight = _reweight(state, state.to_plane(plane), confidence, width)
+    weight = reweight(state, state.to_plane(plane), confidence, width)
     used = (weight > 0).sum(axis=0) >= 2
     plane, weight = plane[:, used], weight[:, used]
     # Joints move with their images' velocity while the clock is adjusted; positive offsets show earlier images.
@@ -230,28 +232,53 @@ def _adjust_round(
     free[:, :6] = True
     free[1:, 6] = freedom.clocks
     free[:, 7:] = freedom.intrinsics
-    sigma = np.array([_TURN] * 3 + [_MOVE_M] * 3 + [_CLOCK_PERIODS, _FOCAL, _CENTRE, _CENTRE])
-    root = np.sqrt(weight)[..., None] * (focal / focal.mean())[:, None, None] / width
-    deviation = state.subtract(expected, period) / sigma
-    trust = _find_trust(deviation)
+    sigma = np.array([TURN] * 2 + [ROLL] + [MOVE_M] * 3 + [_CLOCK_PERIODS, _FOCAL, _CENTRE, _CENTRE])
+    weight = weight * (focal / focal.mean() / width)[:, None] ** 2
+    trust = _find_trust(state.subtract(expected, period) / sigma) / sigma
+    start, known = state.offset, free.ravel()
+    for _ in range(_STEPS):
+        seen = state.to_plane(plane - ((state.offset - start) / period)[:, None, None] * velocity)
+        normal, gradient = eliminate_joints(state, seen, velocity, weight)
+        off = (trust**2 * state.subtract(expected, period)).ravel()
+        normal = normal + np.diag((trust**2).ravel())
+        step = np.zeros(known.shape)
+        step[known] = -np.linalg.solve(normal[np.ix_(known, known)], (gradient + off)[known])
+        state = state.move(step.reshape(free.shape), period)
+    return state
 
-    def unpack(values: F64) -> F64:
-        step = np.zeros((cameras, freedom.per_camera))
-        step[free] = values
-        return step
 
-    def residuals(values: F64) -> F64:
-        step = unpack(values)
-        moved = state.move(step, period)
-        seen = moved.to_plane(plane - step[:, 6, None, None] * velocity)
-        points = triangulate_linear(moved.rotation, moved.translation, seen, weight)
-        error = measure_residuals(moved.rotation, moved.translation, seen, points)
-        off = trust * (deviation + step / sigma)
-        return np.concatenate([(root * error).ravel(), off[free]])
+def eliminate_joints(state: CameraState, seen: F64, velocity: F64, weight: F64) -> tuple[F64, F64]:
+    """Return the normal equations (10C, 10C), (10C,) of the cameras, with the joints eliminated (Schur complement).
 
-    start, units = np.zeros(int(free.sum())), np.broadcast_to(np.minimum(sigma, 1.0), free.shape)[free]
-    found = least_squares(residuals, start, x_scale=units, diff_step=1e-4, max_nfev=_MAX_EVALUATIONS)
-    return state.move(unpack(found.x), period)
+    `seen` (C, N, 2) are the joints on the image planes, which move by `velocity` (C, N, 2) a period, and `weight`
+    (C, N) those of their squared errors.
+    """
+    points = triangulate_linear(state.rotation, state.translation, seen, weight)
+    error = measure_residuals(state.rotation, state.translation, seen, points)
+    local = np.einsum("cij,cnj->cni", state.rotation, points[None] - state.centre[:, None])
+    x, y, z = np.moveaxis(local, 2, 0)
+    depth = np.maximum(z, _MIN_DEPTH_M)
+    one, none, u, v = np.ones_like(x), np.zeros_like(x), x / depth, y / depth
+    by_turn = np.stack([np.stack([-u * v, 1 + u * u, -v], axis=2), np.stack([-1 - v * v, u * v, u], axis=2)], axis=2)
+    image = np.stack([np.stack([one, none, -u], axis=2), np.stack([none, one, -v], axis=2)], axis=2)
+    by_point = (image / depth[..., None, None]) @ state.rotation[:, None]
+    factor = state.lens[:, 0, None, None]
+    by_clock, by_focal = velocity / factor, seen / factor
+    by_centre = np.broadcast_to(np.eye(2) / factor[..., None], (*x.shape, 2, 2))
+    by_camera = np.concatenate([by_turn, -by_point, by_clock[..., None], by_focal[..., None], by_centre], axis=3)
+    cameras, unknowns = len(state.centre), by_camera.shape[3]
+    heavy = by_camera * weight[..., None, None]
+    own = np.einsum("cnip,cniq->cpq", heavy, by_camera)
+    mixed = np.einsum("cnip,cnik->ncpk", heavy, by_point).reshape(len(points), cameras * unknowns, 3)
+    of_points = np.einsum("cn,cnik,cnil->nkl", weight, by_point, by_point) + 1e-12 * np.eye(3)
+    pull = np.einsum("cn,cnik,cni->nk", weight, by_point, error)
+    solved = np.linalg.solve(of_points, np.concatenate([np.swapaxes(mixed, 1, 2), pull[..., None]], axis=2))
+    normal = -np.einsum("npk,nkq->pq", mixed, solved[..., :-1])
+    for k in range(cameras):
+        block = slice(k * unknowns, (k + 1) * unknowns)
+        normal[block, block] += own[k]
+    gradient = np.einsum("cnip,cni->cp", heavy, error).ravel() - np.einsum("npk,nk->p", mixed, solved[..., -1])
+    return normal, gradient
 
 
 def _find_trust(deviation: F64) -> F64:
@@ -265,7 +292,7 @@ def _find_trust(deviation: F64) -> F64:
     return np.sqrt(_PRIOR_JOINTS) * trust
 
 
-def _reweight(state: _State, plane: F64, confidence: F64, width: float) -> F64:
+def reweight(state: CameraState, plane: F64, confidence: F64, width: float) -> F64:
     """Return the weights (C, N) of Geman-McClure at the robust places of the joints."""
     weight = confidence
     for _ in range(8):

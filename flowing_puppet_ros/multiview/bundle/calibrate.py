@@ -24,6 +24,7 @@ from flowing_puppet_ros.multiview.bundle.adjustment import (
 from flowing_puppet_ros.multiview.bundle.clocks import find_coarse_offsets
 from flowing_puppet_ros.multiview.bundle.gauge import match_baselines, place_as_before, scale_to
 from flowing_puppet_ros.multiview.bundle.joint_tracks import CameraFrames, PeopleTracks, associate_tracks
+from flowing_puppet_ros.multiview.bundle.uncertainty import PoseUncertainty, bound_uncertainty
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
 
@@ -58,6 +59,8 @@ class Agreement:
         all_median: likewise.
         agreeing_mean: over the joints within 6 cm of their place in space, at its depth.
         agreeing_share: of all joints, those.
+        agreeing_count: joints in images that agree, each the more the nearer, at all times of the recording: clocks by
+            which two cameras show little at the same time have few.
     """
 
     mean: dict[str, float]
@@ -66,11 +69,15 @@ class Agreement:
     all_median: float
     agreeing_mean: float
     agreeing_share: float
+    agreeing_count: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedRig:
-    """A refined rig: cameras, seconds to add to each camera's stamps, agreement before and after, heights m."""
+    """A refined rig: cameras, seconds to add to each camera's stamps, agreement before and after, heights m.
+
+    `uncertainty` is what the joints cannot tell of each camera.
+    """
 
     cameras: dict[str, Camera]
     offsets: dict[str, float]
@@ -78,6 +85,7 @@ class RefinedRig:
     after: Agreement
     heights: dict[str, float]
     period: float
+    uncertainty: dict[str, PoseUncertainty]
 
 
 def refine_rig(
@@ -96,7 +104,7 @@ def refine_rig(
     starts = [zero]
     if freedom.clocks:
         coarse = find_coarse_offsets(names, cameras, frames, max_offset)
-        # A turned camera may look as if it were late: both are tried, and what agrees better is taken.
+        # A turned camera may look as if it were late: both are tried, and where more joints agree is taken.
         starts += [coarse] if any(coarse.values()) else []
     found: list[tuple[float, Adjusted, PeopleTracks]] = []
     reason: PuppetError | None = None
@@ -110,7 +118,7 @@ def refine_rig(
     if not found:
         assert reason is not None
         raise reason
-    _, refined, tracks = min(found, key=lambda each: each[0])
+    _, refined, tracks = max(found, key=lambda each: each[0])
     factor, heights = _find_scale(tracks, refined, scale)
     return RefinedRig(
         scale_to(refined.cameras, factor),
@@ -119,6 +127,7 @@ def refine_rig(
         measure_agreement(refined.cameras, refined.offsets, tracks),
         {person: height * factor for person, height in heights.items()},
         tracks.period,
+        bound_uncertainty(refined.cameras, refined.offsets, tracks),
     )
 
 
@@ -133,7 +142,7 @@ def _refine_from(
     frames: CameraFrames,
     freedom: Freedom,
 ) -> tuple[float, Adjusted, PeopleTracks]:
-    """Refine from the given `offsets`; return the mean distance px that remains, the cameras, and people's tracks."""
+    """Refine from the given `offsets`; return how many joints agree, the cameras, and people's tracks."""
     current = Adjusted(dict(cameras), dict(offsets))
     for _ in range(_PASSES):
         tracks = associate_tracks(names, current.cameras, frames, current.offsets, _ASSOCIATION, _TRIANGULATION)
@@ -141,7 +150,7 @@ def _refine_from(
         current = adjust(current.cameras, current.offsets, cameras, tracks, freedom)
         factor = match_baselines(current.cameras, cameras)
         current = replace(current, cameras=place_as_before(scale_to(current.cameras, factor), cameras))
-    return measure_agreement(current.cameras, current.offsets, tracks).all_mean, current, tracks
+    return measure_agreement(current.cameras, current.offsets, tracks).agreeing_count, current, tracks
 
 
 def _check_tracks(tracks: PeopleTracks, names: list[str]) -> None:
@@ -199,7 +208,8 @@ def measure_agreement(cameras: Mapping[str, Camera], offsets: Mapping[str, float
     distance = np.linalg.norm(measure_residuals(rotation, translation, plane, points), axis=2)
     depth = np.einsum("ck,nk->cn", rotation[:, 2], points) + translation[:, 2, None]
     used = (weight > 0) & np.isfinite(points).all(axis=1)
-    error, agrees = distance * focal[:, None], used & (np.nan_to_num(distance * depth) < AGREE_M)
+    error, metres = distance * focal[:, None], np.nan_to_num(distance * depth)
+    agrees = used & (metres < AGREE_M)
     by_camera = {name: error[k][used[k]] for k, name in enumerate(cameras) if used[k].any()}
     some = used.any()
     return Agreement(
@@ -209,4 +219,5 @@ def measure_agreement(cameras: Mapping[str, Camera], offsets: Mapping[str, float
         float(np.median(error[used])) if some else float("nan"),
         float(error[agrees].mean()) if agrees.any() else float("nan"),
         float(agrees.sum() / used.sum()) if some else float("nan"),
+        float((1 - (metres[agrees] / AGREE_M) ** 2).sum()),
     )

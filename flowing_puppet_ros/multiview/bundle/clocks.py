@@ -16,6 +16,7 @@ _SAMPLES = 60
 _MAX_DISTANCE_M = 0.3  # of two rays, at which a joint no longer speaks for a shift
 _MIN_GAIN = 0.15  # share by which a shift must lower the distance to be believed
 _MIN_SHARE = 0.4  # of the samples that both cameras must show
+_UNSEEN_DISTANCE_M = 0.1  # of a sample that one camera alone shows: a step later all walkers look as they did before
 
 
 def find_coarse_offsets(
@@ -77,9 +78,14 @@ def _find_offset(
 def _measure_distance(
     one: Camera, plane: F64, weight: F64, other: Camera, their_plane: F64, their_weight: F64
 ) -> float:
-    """Return the mean distance (m, at most _MAX_DISTANCE_M) of the rays of the same joints (M, J); inf if too few."""
+    """Return the mean distance (m, at most _MAX_DISTANCE_M) of the rays of the same joints (M, J); inf if too few.
+
+    The samples that the other camera does not show count as _UNSEEN_DISTANCE_M.
+    """
     both = np.minimum(weight, their_weight)
-    if (both > 0).any(axis=1).mean() < _MIN_SHARE:
+    shown, seen_by_both = (int(np.count_nonzero((each > 0).any(axis=1))) for each in (weight, both))
+    share = seen_by_both / max(shown, 1)
+    if share < _MIN_SHARE:
         return np.inf
     rays = [
         np.concatenate([each, np.ones((*each.shape[:-1], 1))], axis=-1) @ camera.rotation
@@ -88,4 +94,5 @@ def _measure_distance(
     normal = np.cross(rays[0], rays[1])
     length = np.linalg.norm(normal, axis=-1)
     distance = np.abs(normal @ (other.centre - one.centre)) / np.maximum(length, 1e-9)
-    return float((both * np.minimum(distance, _MAX_DISTANCE_M)).sum() / both.sum())
+    mean = float((both * np.minimum(distance, _MAX_DISTANCE_M)).sum() / both.sum())
+    return share * mean + (1 - share) * _UNSEEN_DISTANCE_M

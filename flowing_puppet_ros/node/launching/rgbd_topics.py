@@ -72,6 +72,18 @@ def find_rgbd(camera: str) -> RgbdTopics:
     return choose_rgbd(list_topics(_RGBD), camera)
 
 
+def list_depth_topics(cameras: Sequence[str]) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the remappings and parameters of the body fitter of depth cameras together, by their namespaces.
+
+    None without cameras. InputError as `choose_rgbd`.
+    """
+    names = [name.strip("/") for name in cameras]
+    found = {name: find_rgbd(name) for name in names}
+    inputs = {f"{name}/depth": topics.depth for name, topics in found.items()}
+    inputs |= {f"{name}/camera_info": topics.depth_info for name, topics in found.items()}
+    return inputs, {"rig.cameras": ",".join(names)} if names else {}
+
+
 def _choose(images: set[str], camera: str, names: Sequence[str], what: str) -> str:
     below = f"/{camera.strip('/')}/" if camera.strip("/") else "/"
     for name in names:

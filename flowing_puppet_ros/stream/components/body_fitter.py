@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -44,6 +45,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
 )
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints, make_bodies, make_body
 from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
+from flowing_puppet_ros.stream.rig_silhouettes import RigSilhouettes
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
 from flowing_puppet_ros.stream.stamp_buffer import CloudLine, StampBuffer
 from flowing_puppet_ros.stream.stuck_stamps import CloudClock
@@ -96,8 +98,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     Each fit to a cloud draws its random numbers from the seed and the cloud's stamp, so it does not depend on which
     clouds came before it or were dropped, unless a person is tracked. What comes on `silhouettes` has its joints with
-    it and is fitted at once; nothing in that is random, and the last good body of a person only helps where the joints
-    lead astray.
+    it and is fitted at once, or with what the sensors of `rig.cameras` saw; nothing in that is random.
     """
 
     settings_type = BodyFitterSettings
@@ -132,10 +133,10 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         )
         self._is_fixed = False
         self._rig = DepthRig(settings.rig, self._places, self.report, factory) if settings.rig.cameras else None
-        if self._rig is not None:  # people are found by depth alone, or by their silhouettes
-            shared = ("/tf_static", "/tf", "silhouettes")
-            self.inputs = (*self._rig.ports, *(port for port in type(self).inputs if port.name in shared))
-        self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes)
+        if self._rig is not None:  # people are found by depth and silhouettes
+            self.inputs = self._rig.ports
+        self._silhouettes = SilhouetteBodies(self._model, settings.silhouettes, self.report)
+        self._joined = RigSilhouettes(people, settings, self._frames, self.report)
         self._depth = DepthPairs(self.report)
         self._clock = CloudClock(self.report)
         self._line = CloudLine(lambda item: self.dropped.update([item[0]]))
@@ -154,6 +155,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
     def reset(self) -> None:
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""
         self._silhouettes.reset()
+        self._joined.reset()
         self._scene.reset()
         self._fused.reset()
         self._puppets.reset()
@@ -172,7 +174,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             self._append("depth", *pair)
         for moment in self._rig.flush() if self._rig is not None else ():
             self._append("points", moment)
-        return self._release(final=True) + self._publish_silhouettes()
+        return self._release(final=True) + self._publish_silhouettes(self._silhouettes.collect())
 
     def fit(
         self, cloud: Any, initial: Any | None, seed: int, progress: Progress | None = None
@@ -226,14 +228,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         field = scene.image.make_field(slice(None)) if scene.image is not None and viewpoint is not None else None
         bodies = []
         for number, body in enumerate(initial.bodies, start=1):
+            joints, seen = place.put_joints(decode_body_joints(body)), (scene.points, scene.normals)
             fit = self._fitter.fit(
-                scene.points,
-                scene.normals,
-                initial=place.put_joints(decode_body_joints(body)),
-                viewpoint=viewpoint,
-                field=field,
-                seed=seed,
-                progress=progress,
+                *seen, initial=joints, viewpoint=viewpoint, field=field, seed=seed, progress=progress
             )
             bodies.append(TrackedBody(body.id or self.publish_id(f"b{number}"), fit))
         return sorted(bodies, key=lambda body: id_sort_key(body.id))
@@ -243,13 +240,16 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         return int(np.random.SeedSequence([self.settings.fitter.seed, max(stamp, 0)]).generate_state(1)[0])
 
     def _process(self, port: str, message: Any) -> Output:
-        if port == "silhouettes":
-            return self._fit_silhouettes(message)
+        if port == "silhouettes" and self._rig is None:
+            self.counters["silhouettes"] += 1
+            return self._publish_silhouettes(self._silhouettes.add(message))
         if port in ("depth", "camera_info"):
             for pair in self._depth.add(port, message):
                 self._append("depth", *pair)
         elif port in COLOUR_PORTS:
             self._puppets.add(port, message)
+        elif port == "silhouettes":
+            self._joined.add(message)
         elif port == "points":
             self._append(port, message)
         elif self._rig is not None:
@@ -295,12 +295,14 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         frame, waiting = message.header.frame_id, len(self._line.waiting) - 1 - index
         if "initial" in self._expected and self._initial.get(stamp) is None and waiting < self.settings.wait:
             return False
+        first, last = self._line.first or stamp, self._line.waiting[-1][0]
+        if "silhouettes" in self._expected and self._joined.is_awaited(stamp, first, last):
+            return False
         frames = [frame] if self._rig is None else message.frames
         if waiting < self.settings.transform_wait and any(self._places.is_awaited(each, stamp) for each in frames):
             return False
         # Without a calibration no puppet can be used, however long a cloud waits for it.
         calibrated = self._puppets.is_calibrated or "puppets/camera_info" in self._expected
-        first, last = self._line.first or stamp, self._line.waiting[-1][0]
         puppets = calibrated and "puppets" in self._expected and self._puppets.is_awaited(first, last)
         return not puppets or self._puppets.is_ready(frame, stamp)
 
@@ -322,6 +324,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
                 self._is_fixed = place.is_fixed
                 self._scene.reset()
                 self._fused.reset()
+                self._joined.reset_people()
             if initial is not None and initial.bodies:
                 bodies = self._fit_initial(scene, place, initial, self.seed_of(stamp))
             else:
@@ -345,6 +348,11 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         """
         seed = self.seed_of(stamp)
         step = self._step_scene if is_known else self._step_alone
+        if "silhouettes" in self._expected:
+            bodies, own = self._joined.fit(scene, stamp, header.frame_id, place)
+            others, occluded = ([], []) if own.all() else step(scene.take(~own), seed)
+            others, occluded = self._joined.add_others(others, occluded)
+            return [*bodies, *others], occluded, []
         if "puppets" not in self._expected or not self.settings.scene:
             return *step(scene, seed), []
         try:
@@ -383,18 +391,10 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         """Return the bodies of everybody in a cloud that nothing joins to the others, and nobody's ids."""
         return self._publish_ids(self._scene.step_alone(scene, seed)), []
 
-    def _fit_silhouettes(self, message: Any) -> Output:
-        """Fit one person; bodies go out together when the last one of the same images is there."""
-        self.counters["silhouettes"] += 1
-        outputs = self._publish_silhouettes() if self._silhouettes.is_other_instant(message) else []
-        try:
-            self._silhouettes.add(message)
-        except InputError as error:
-            self.report.count_unusable(error)
-        return outputs + (self._publish_silhouettes() if self._silhouettes.is_complete else [])
-
-    def _publish_silhouettes(self) -> Output:
-        header, bodies = self._silhouettes.collect()
-        self.counters["bodies"] += len(bodies)
-        self.counters["doubtful bodies"] += sum(not body.fit.reliable for body in bodies)
-        return self._outputs.make(header, bodies, subscribed=self._subscribed) if header is not None else []
+    def _publish_silhouettes(self, instants: Iterable[tuple[Any, list[TrackedBody]]]) -> Output:
+        outputs: Output = []
+        for header, bodies in instants:
+            self.counters["bodies"] += len(bodies)
+            self.counters["doubtful bodies"] += sum(not body.fit.reliable for body in bodies)
+            outputs += self._outputs.make(header, bodies, subscribed=self._subscribed)
+        return outputs

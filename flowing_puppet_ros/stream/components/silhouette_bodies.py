@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from flowing_puppet_ros.body.track.scene_tracker import ONLY_ID
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
+from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitter, SilhouetteFitterSettings
+from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.components.body_outputs import id_sort_key
 from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_silhouettes
 from flowing_puppet_ros.stream.messages.geometry import header_ns, stamp_ns
@@ -24,8 +27,9 @@ class SilhouetteBodies:
     The fits of one instant are collected until everybody's set has come, or a set of another instant.
     """
 
-    def __init__(self, model: StitchedPuppet, settings: SilhouetteFitterSettings) -> None:
-        """Prepare to fit `model`."""
+    def __init__(self, model: StitchedPuppet, settings: SilhouetteFitterSettings, report: Report) -> None:
+        """Prepare to fit `model`; `report` is told of sets that cannot be fitted."""
+        self._report = report
         self._fitter = SilhouetteFitter(model, settings)
         self._last: dict[str, tuple[int, BodyState]] = {}
         self._motions: dict[str, TorsoMotion] = {}
@@ -41,29 +45,26 @@ class SilhouetteBodies:
         self._missing.clear()
         self._bodies.clear()
 
-    @property
-    def is_complete(self) -> bool:
-        """Whether sets have come and none of the same instant is to come."""
-        return self._header is not None and not self._missing
-
-    def is_other_instant(self, message: Any) -> bool:
-        """Return whether a set is of another instant than those collected, or of somebody who is among them."""
+    def add(self, message: Any) -> Iterator[tuple[Any, list[TrackedBody]]]:
+        """Fit the person in a SilhouetteSet; yield header and bodies of the instants that are over by that."""
+        stamp, identity = stamp_ns(message), _find_id(message)
+        if self._header is not None and (header_ns(self._header) != stamp or identity not in self._missing):
+            yield from self.collect()
         if self._header is None:
-            return False
-        return header_ns(self._header) != stamp_ns(message) or _find_id(message) not in self._missing
+            self._header, self._missing = message.header, {*message.people, identity}
+        self._missing.discard(identity)
+        try:
+            self._bodies.append(self.fit(message))
+        except InputError as error:
+            self._report.count_unusable(error)
+        if not self._missing:
+            yield from self.collect()
 
-    def add(self, message: Any) -> None:
-        """Fit the person in a SilhouetteSet and collect the body. InputError when it cannot be fitted."""
-        if self._header is None:
-            self._header, self._missing = message.header, {*message.people, _find_id(message)}
-        self._missing.discard(_find_id(message))
-        self._bodies.append(self.fit(message))
-
-    def collect(self) -> tuple[Any, list[TrackedBody]]:
-        """Return the header (None if there is nothing) and the bodies of the sets collected, and begin anew."""
-        header, bodies = self._header, sorted(self._bodies, key=lambda body: id_sort_key(body.id))
+    def collect(self) -> Iterator[tuple[Any, list[TrackedBody]]]:
+        """Yield the header and the bodies of the sets collected, if any, and begin anew."""
+        if self._header is not None:
+            yield self._header, sorted(self._bodies, key=lambda body: id_sort_key(body.id))
         self._header, self._missing, self._bodies = None, set(), []
-        return header, bodies
 
     def fit(self, message: Any) -> TrackedBody:
         """Fit the person in a SilhouetteSet. InputError when it cannot be fitted."""

@@ -2,12 +2,14 @@
 """The joint Gauss-Newton over all parts: what else may draw the surface."""
 
 import numpy as np
+import pytest
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic, two_way_distance
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.refine.gauss_newton import LOOSE_STITCHING, GaussNewton, RefineWeights
 from flowing_puppet_ros.body.refine.joint_rows import JointRows
 from flowing_puppet_ros.body.refine.normal_equations import NormalEquations
+from flowing_puppet_ros.body.refine.tree_solution import TreeSolution
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -80,3 +82,20 @@ def test_derivatives_of_the_joints_are_those_of_small_steps() -> None:
     stepped = [(move(unknown, small) - move(unknown, -small)) / (2 * small) for unknown in range(equations.size)]
     np.testing.assert_allclose(derived, np.stack(stepped, axis=2), atol=1e-8)
     assert (np.abs(derived).max(axis=(0, 1)) > 1e-3).sum() > 30
+
+
+def test_a_system_over_a_tree_is_solved_like_any_other() -> None:
+    rng, parents, first = np.random.default_rng(6), (-1, 0, 0, 1, 3), np.array([0, 4, 7, 12, 14, 19])
+    spans = [np.arange(first[part], first[part + 1]) for part in range(5)]
+    size, shared = 22, np.arange(19, 22)
+    matrix = np.zeros((size, size))
+    for part, parent in enumerate(parents):
+        used = np.concatenate([spans[part], shared, *([spans[parent]] if parent >= 0 else [])])
+        rows = rng.standard_normal((30, len(used)))
+        matrix[np.ix_(used, used)] += rows.T @ rows
+    right = rng.standard_normal(size)
+    lower = np.tril(matrix) + np.triu(rng.standard_normal((size, size)), 1)
+    solved = TreeSolution(parents, first).solve(lower, right)
+    np.testing.assert_allclose(solved, np.linalg.solve(matrix, right), rtol=1e-9, atol=1e-12)
+    with pytest.raises(np.linalg.LinAlgError, match="positive definite"):
+        TreeSolution(parents, first).solve(-np.eye(size), right)

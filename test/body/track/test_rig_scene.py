@@ -56,3 +56,31 @@ def test_a_surface_is_seen_by_the_sensor_that_it_faces() -> None:
     vertices = np.zeros((3, 3))
     normals = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     np.testing.assert_array_equal(rig.find_facing(vertices, normals), [True, True, False])
+
+
+def test_a_part_of_a_scene_keeps_whose_points_are_whose() -> None:
+    merged = RigScene.merge([look_at_wall(np.array([0.0, 2.0, 0.0])), look_at_wall(np.array([0.0, -2.0, 0.0]))], 3)
+    rows = np.arange(len(merged.points)) % 3 == 0
+    part = merged.take(rows)
+    np.testing.assert_array_equal(part.points, merged.points[rows])
+    np.testing.assert_array_equal(part.owner, merged.owner[rows])
+    assert part.stamp == 3 and part.is_merged
+
+
+def test_pixels_without_depth_may_be_doubted_but_for_the_persons_own() -> None:
+    scene = look_at_wall(np.zeros(3))
+    assert scene.image is not None
+    row, column = np.unravel_index(np.arange(WIDTH * HEIGHT), (HEIGHT, WIDTH))
+    dark = (row < 10) & (column < 10)
+    person = np.flatnonzero((row == 30) & (column > 40))
+    kept = np.flatnonzero(~dark)
+    depth = scene.image.depth.copy()
+    depth.reshape(-1)[dark] = np.inf
+    image = RangeImage(scene.image.projection, scene.image.bounds, depth, scene.image.pixel)
+    field = image.make_field(person)
+    doubted = field.doubt_blanks(scene.points[person])
+    before = scene.points * 0.5  # half way to everything
+    assert not field.find_unknown(before).any()
+    np.testing.assert_array_equal(np.flatnonzero(~doubted.find_unknown(before)), kept)
+    behind = scene.points[person] * 1.5
+    assert not doubted.find_unknown(behind).any()  # the person's own pixels hide nothing

@@ -4,7 +4,7 @@
 import numpy as np
 
 from flowing_puppet_ros.body.segmentation.candidates import Candidate
-from flowing_puppet_ros.body.upright.decision_trees import DecisionTrees
+from flowing_puppet_ros.body.upright.person_model import DecisionTrees
 from flowing_puppet_ros.body.upright.rejected_places import RejectedPlaces
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
 from flowing_puppet_ros.evidence.cloud.one_sided import OneSidedView

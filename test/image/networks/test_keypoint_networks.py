@@ -232,6 +232,14 @@ def test_where_the_networks_disagree_a_joint_is_unknown_and_its_hand_too() -> No
     assert at(found, "right_hand")[1] == pytest.approx(0.7)
 
 
+def test_a_hand_lies_beside_the_wrist_of_both_networks() -> None:
+    """Landmarks that have a whole lower arm elsewhere take the hand along as far as they take the wrist."""
+    shifts = {"left_wrist": 12.0, "left_index": 12.0}
+    (found,) = find(Seeing([pose(300)], [], shifts=shifts))
+    expected = place_joints(("left_wrist", "left_index"), 300) + np.array([12 / 1.8, 0])
+    np.testing.assert_allclose([at(found, "left_wrist")[0], at(found, "left_hand")[0]], expected, atol=1e-6)
+
+
 def test_elbows_of_the_landmarks_count_half() -> None:
     (found,) = find(Seeing([pose(300)], [], shifts={"left_elbow": 13.0}))
     place, _ = at(found, "left_elbow")

@@ -39,6 +39,21 @@ def test_confidence_falls_while_unseen_and_returns_with_a_detection() -> None:
     assert confidence[7] > confidence[6]
 
 
+def test_a_joint_that_detections_do_not_have_is_less_sure_and_the_others_are_not() -> None:
+    """The detector looks and does not find one wrist, which is hidden; the flow goes on with what hides it."""
+    follower, wrist = tracker(), NAMES.index("right_wrist")
+    sure = []
+    for time in range(9):
+        joints = pose(time)
+        seen = joints.copy()
+        seen[wrist] = np.nan if 2 <= time < 8 else joints[wrist]
+        puppet = follower.step(draw(joints), time, [detection(seen)]).puppets[0]
+        sure.append((puppet.confidence[wrist], np.delete(puppet.confidence, wrist).min()))
+    hidden, others = np.array(sure).T
+    assert (np.diff(hidden[1:8]) < -0.1 * hidden[1:7]).all() and hidden[7] < 0.3 * hidden[1] < hidden[8]
+    assert np.ptp(others[2:]) < 0.05
+
+
 def test_fusion_is_better_than_noisy_detections() -> None:
     follower, noise, fused, raw = tracker(), np.random.default_rng(3), [], []
     for time in range(14):

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from walkers import NAMES, photograph, ring, walker  # type: ignore[import-not-found]
 
@@ -12,10 +13,11 @@ from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.multiview.association.settings import AssociationSettings
 from flowing_puppet_ros.multiview.association.view import PersonInView
-from flowing_puppet_ros.multiview.bundle.adjustment import Freedom, adjust
+from flowing_puppet_ros.multiview.bundle.adjustment import Freedom, adjust, choose_instants, triangulate_linear
 from flowing_puppet_ros.multiview.bundle.calibrate import RefinedRig, Scale, refine_rig
 from flowing_puppet_ros.multiview.bundle.clocks import find_coarse_offsets
-from flowing_puppet_ros.multiview.bundle.joint_tracks import CameraFrames, associate_tracks
+from flowing_puppet_ros.multiview.bundle.joint_tracks import CameraFrames, JointTrack, PeopleTracks, associate_tracks
+from flowing_puppet_ros.multiview.bundle.uncertainty import bound_uncertainty
 from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.multiview.triangulation import TriangulationSettings
 
@@ -110,12 +112,14 @@ def test_a_camera_that_was_turned_before_somebody_on_one_spot_stays_where_it_sto
             frames[name].append((k / RATE, [replace(p, joints=p.joints + bias[name]) for p in group]))
     tracks = associate_tracks(NAMES, CAMERAS, frames, {}, AssociationSettings(), TriangulationSettings())
     turned = CAMERAS | {"cam2": turn(CAMERAS["cam2"], 2.0, (0.6, 0.8, 0.0))}
+    rolled = CAMERAS | {"cam2": turn(CAMERAS["cam2"], 1.2, (0.0, 0.0, 1.0))}
     start = dict.fromkeys(CAMERAS, 0.0)
     found = {
         case: adjust(former, start, former, tracks, Freedom(clocks=False)).cameras["cam2"]
-        for case, former in (("right", CAMERAS), ("turned", turned))
+        for case, former in (("right", CAMERAS), ("turned", turned), ("rolled", rolled))
     }
-    assert angle(found["turned"], found["right"]) < 0.2
+    assert angle(found["turned"], found["right"]) < 0.1
+    assert angle(found["rolled"], found["right"]) < 0.1
     assert np.linalg.norm(found["turned"].centre - CAMERAS["cam2"].centre) < 0.02
 
 
@@ -130,3 +134,44 @@ def test_a_camera_that_sees_nobody_else_is_one_sentence() -> None:
     frames["cam2"] = [(time, []) for time, _ in frames["cam2"]]
     with pytest.raises(PuppetError, match="cam2 shows nobody whom the other cameras show"):
         refine_rig(NAMES, CAMERAS, frames, Freedom(clocks=False), Scale())
+
+
+def watch(seed: int, bias: float, noise: float) -> PeopleTracks:
+    """Return the tracks of somebody on one spot; errors of `bias` px stay, those of `noise` px change."""
+    random = np.random.default_rng(seed)
+    times = np.arange(40) / RATE
+    people = np.stack([walker((0.1, 0.0), 0.5, 6 * t) for t in times])
+    tracks = {}
+    for name, camera in CAMERAS.items():
+        pixels = camera.project(people.reshape(-1, 3))[0].reshape(len(times), len(NAMES), 2)
+        pixels = pixels + random.normal(0, bias, (len(NAMES), 2)) + random.normal(0, noise, pixels.shape)
+        tracks[name] = JointTrack(times, camera.undistort(pixels), np.full(pixels.shape[:2], 0.9))
+    return PeopleTracks(NAMES, {"ann": tracks}, 1 / RATE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("bias", "noise"), [(0.0, 3.0), (3.0, 1.0)])
+def test_the_bound_of_a_roll_is_the_spread_of_rolls_that_are_found(bias: float, noise: float) -> None:
+    """All other cameras are right: what a plain least squares of the fourth one finds spreads as the bound says."""
+    zero = dict.fromkeys(CAMERAS, 0.0)
+    spread, bounds = [], []
+    for seed in range(12):
+        tracks = watch(seed, bias, noise)
+        instants = choose_instants(tracks, list(CAMERAS))
+        plane, weight = instants.observe(np.zeros(4))
+        # One camera's pose from the joints as the others place them: a plain least squares of its own.
+        others = [CAMERAS[name] for name in ("cam1", "cam3", "cam4")]
+        rotation, translation = np.stack([c.rotation for c in others]), np.stack([c.translation for c in others])
+        truth = triangulate_linear(rotation, translation, plane[[0, 2, 3]], weight[[0, 2, 3]])
+        camera = CAMERAS["cam2"]
+
+        def miss(values: F64, camera: Camera = camera, truth: F64 = truth, seen: F64 = plane[1]) -> F64:
+            turned = Rotation.from_rotvec(values[:3]).as_matrix() @ camera.rotation
+            local = (truth - camera.centre - values[3:]) @ turned.T
+            return np.asarray(camera.focal * (local[:, :2] / local[:, 2:] - seen)).ravel()
+
+        found = least_squares(miss, np.zeros(6)).x
+        spread.append(np.degrees(found[2]))
+        bounds.append(bound_uncertainty(CAMERAS, zero, tracks)["cam2"])
+    rms = np.sqrt(np.mean(np.square(spread)))
+    assert np.mean([each.roll for each in bounds]) == pytest.approx(rms, rel=0.5)

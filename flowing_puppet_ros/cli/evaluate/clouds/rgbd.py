@@ -18,6 +18,8 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.moving.camera_ring import CameraRing, RingScore, compare_cameras, summarise_ring
 from flowing_puppet_ros.evaluate.moving.fitter_run import run_fitter
+from flowing_puppet_ros.evaluate.moving.lost_depth import LOSSES
+from flowing_puppet_ros.evaluate.moving.ring_evidence import compare_evidence
 from flowing_puppet_ros.evaluate.moving.robot_view import SENSINGS, RobotView
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
 from flowing_puppet_ros.evaluate.rgbd.methods import FusionMethod, RgbdMethod, SearchMethod
@@ -73,6 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cameras", type=int, metavar="N", help="compare N depth cameras around the people with each of them alone"
     )
+    parser.add_argument(
+        "--lost-depth", nargs="+", choices=LOSSES, metavar="LOSS", help="compare these cameras' depth, silhouettes and"
+        f" both together where depth is missing: {', '.join(LOSSES)}",
+    )  # fmt: skip
     parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture that the poses are from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for rgbd.csv and rgbd.json")
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
@@ -100,6 +106,8 @@ def run(arguments: argparse.Namespace) -> int:
         motions = _track_motions(arguments, fitter, studio)
         print(format_json({"motions": motions}) if arguments.json else format_table(motions))
         return 0
+    if arguments.lost_depth is not None and arguments.cameras is None:
+        raise InputError("--lost-depth compares what several cameras see; give --cameras")
     if arguments.cameras is not None:
         rings = _look_from_around(arguments, fitter, studio)
         print(format_json({"cameras": rings}) if arguments.json else format_table(rings))
@@ -142,12 +150,27 @@ def _look_from_around(arguments: argparse.Namespace, fitter: BodyFitter, studio:
     """Return the figures of one camera and of all around the people."""
     if not 2 <= arguments.cameras <= 8:
         raise InputError(f"--cameras is {arguments.cameras}; 2 to 8 can be compared with one")
+    if arguments.lost_depth is not None:
+        return _compare_evidence(arguments, fitter, studio)
     ring, scores = CameraRing(studio, arguments.cameras), dict[int, list[RingScore]]()
     for number in tqdm(range(arguments.count), file=sys.stderr, disable=arguments.json):
         rng = np.random.default_rng([arguments.people_seed, 500, number])
         for count, found in compare_cameras(fitter, ring, rng, arguments.people).items():
             scores.setdefault(count, []).extend(found)
     return [summarise_ring(count, found) for count, found in scores.items()]
+
+
+def _compare_evidence(arguments: argparse.Namespace, fitter: BodyFitter, studio: RgbdStudio) -> list[dict[str, Any]]:
+    """Return the figures of depth, silhouettes and both, for every loss of depth."""
+    ring, scores = CameraRing(studio, arguments.cameras), dict[tuple[str, str], list[RingScore]]()
+    for number in tqdm(range(arguments.count), file=sys.stderr, disable=arguments.json):
+        seed = arguments.people_seed, number
+        for kind, score in compare_evidence(fitter, ring, seed, arguments.people, arguments.lost_depth).items():
+            scores.setdefault(kind, []).append(score)
+    return [
+        {"lost": loss, "from": evidence, **summarise_ring(arguments.cameras, found)}
+        for (loss, evidence), found in scores.items()
+    ]
 
 
 def _see_from_robot(arguments: argparse.Namespace) -> list[dict[str, Any]]:

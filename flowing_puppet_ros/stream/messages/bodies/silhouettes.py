@@ -49,21 +49,32 @@ def make_silhouettes(
 def decode_silhouettes(message: Any) -> list[tuple[Camera, U8]]:
     """Return the cameras and masks (h, w) of a SilhouetteSet; InputError names the camera that cannot be used."""
     views = []
-    for silhouette in message.silhouettes:
-        info, position, orientation = silhouette.info, silhouette.pose.position, silhouette.pose.orientation
-        try:
-            rotation = rotation_matrix((orientation.x, orientation.y, orientation.z, orientation.w)).T
-            translation = -rotation @ np.array([position.x, position.y, position.z])
-            camera = Camera.from_info(
-                info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model
-            )
-            mask = decode_labels(silhouette.mask)
-        except InputError as error:
-            raise InputError(f"{silhouette.camera}: {error}") from error
-        if mask.shape[::-1] != camera.size:
-            raise InputError(
-                f"{silhouette.camera}: the mask is {mask.shape[1]} x {mask.shape[0]}, its camera_info says"
-                f" {camera.size[0]} x {camera.size[1]}"
-            )
-        views.append((camera, mask))
+    for view in decode_views(message).values():
+        if isinstance(view, InputError):
+            raise view
+        views.append(view)
     return views
+
+
+def decode_views(message: Any) -> dict[str, tuple[Camera, U8] | InputError]:
+    """Return the cameras and masks (h, w) of a SilhouetteSet by name, or why one cannot be used."""
+    views: dict[str, tuple[Camera, U8] | InputError] = {}
+    for silhouette in message.silhouettes:
+        try:
+            views[silhouette.camera] = _decode_one(silhouette)
+        except InputError as error:
+            views[silhouette.camera] = InputError(f"{silhouette.camera}: {error}")
+    return views
+
+
+def _decode_one(silhouette: Any) -> tuple[Camera, U8]:
+    info, position, orientation = silhouette.info, silhouette.pose.position, silhouette.pose.orientation
+    rotation = rotation_matrix((orientation.x, orientation.y, orientation.z, orientation.w)).T
+    translation = -rotation @ np.array([position.x, position.y, position.z])
+    camera = Camera.from_info(info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model)
+    mask = decode_labels(silhouette.mask)
+    if mask.shape[::-1] != camera.size:
+        raise InputError(
+            f"the mask is {mask.shape[1]} x {mask.shape[0]}, its camera_info says {camera.size[0]} x {camera.size[1]}"
+        )
+    return camera, mask

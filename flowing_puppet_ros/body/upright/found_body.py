@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A person found in a scan with the first body, and the scan in which others are looked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights
+from flowing_puppet_ros.body.upright.scan_rays import ScanRays
+
+MIN_COME_SHARE = 0.15
+"""Share of the points, where the sensor once saw through, from which on something has come there."""
+SAME_PERSON_M = 0.35  # between the middles of two bodies that are one person
+SURROUNDINGS_M = 2.0  # about the middle of a person, of what may speak for or against one
+SAME_MIDDLE_M, SAME_SIZE = 0.08, 1.2
+"""Distance and ratio of the numbers of points up to which a candidate is one that was fitted before."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoundBody:
+    """A person and the first body; without one, a person who is known already."""
+
+    person: PersonCloud
+    fit: BodyFit | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class JudgedFit:
+    """A body: the `probability` that it is a person, and the `confidence` that it is one and close."""
+
+    probability: float
+    confidence: float
+    fit: BodyFit
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanView:
+    """A scan in which candidates are fitted.
+
+    Attributes:
+        scene: what is seen.
+        rays: of the whole scan.
+        stamp: nanoseconds.
+        remember: whether what is no person is remembered.
+        come: which (N,) of the scene's points lie where the sensor once saw through; None where nothing is known.
+    """
+
+    scene: SceneHeights
+    rays: ScanRays
+    stamp: int
+    remember: bool
+    come: np.ndarray | None
+
+    def has_come(self, candidate: Candidate) -> bool:
+        """Return whether a candidate stands where the sensor once saw through."""
+        return self.come is not None and bool(self.come[candidate.rows].mean() > MIN_COME_SHARE)
+
+    def leave_to(self, rows: np.ndarray, owned: np.ndarray) -> tuple[ScanView, np.ndarray]:
+        """Return what is about the points `rows` (N,), ascending, without others that somebody has, and `rows` in it.
+
+        `owned` tells of each point of the scan whether somebody has it.
+        """
+        middle = np.median(self.scene.points[rows, :2], axis=0)
+        near = self.scene.index.find_near(self.scene.points, middle, SURROUNDINGS_M)[0]
+        kept = np.union1d(rows, near[~owned[near]])
+        return self.take(kept), np.searchsorted(kept, rows)
+
+    def take(self, rows: np.ndarray) -> ScanView:
+        """Return the part of the scan whose points are `rows` (K,), K > 0, of which nothing is remembered."""
+        come = None if self.come is None else self.come[rows]
+        return replace(self, scene=self.scene.take(rows), remember=False, come=come)
+
+
+@dataclass(slots=True, eq=False)
+class FitBudget:
+    """How many bodies may still be fitted in a scan, and how many of them in a row may be nobody; None: any number."""
+
+    fits: int
+    max_misses: int | None
+    misses: int = 0
+
+    def spend(self) -> bool:
+        """Return whether there is one more, and take it; it counts as a miss until it is somebody."""
+        if self.fits <= 0 or self.misses == self.max_misses:
+            return False
+        self.fits -= 1
+        self.misses += 1
+        return True
+
+
+def take_apart(
+    found: Sequence[tuple[JudgedFit, Candidate]], taken: list[np.ndarray]
+) -> list[tuple[JudgedFit, Candidate]]:
+    """Return the likeliest bodies that are not where another is, and add their middles (2,) m to those `taken`."""
+    kept = []
+    for judged, candidate in sorted(found, key=lambda each: -each[0].probability):
+        middle = judged.fit.vertices[:, :2].mean(axis=0)
+        if all(np.hypot(*(middle - other)) > SAME_PERSON_M for other in taken):
+            taken.append(middle)
+            kept.append((judged, candidate))
+    return kept
+
+
+def is_same_candidate(candidate: Candidate, other: Candidate) -> bool:
+    """Return whether two candidates are about the same points."""
+    share = len(candidate.rows) / len(other.rows)
+    return bool(np.hypot(*(candidate.middle - other.middle)) < SAME_MIDDLE_M and 1 / SAME_SIZE < share < SAME_SIZE)

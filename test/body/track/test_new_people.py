@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""New people in a live stream of whole clouds: a body at once where one is close, a full fit beside the clouds else."""
+
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.threads import one_blas_thread
+
+TENTH = 100_000_000
+
+
+class _Never:
+    """An executor that keeps its tasks and runs none."""
+
+    def __init__(self) -> None:
+        self.tasks: list[Any] = []
+
+    def submit(self, task: Any) -> None:
+        self.tasks.append(task)
+
+
+def _make_clouds(fitter: BodyFitter, stamp: int) -> tuple[list[PersonCloud], list[np.ndarray]]:
+    """Return the clouds of three people who stand beside each other, and their true vertices."""
+    rng, clouds, truth = np.random.default_rng(4), [], []
+    for number in range(3):
+        body = fitter.model.sample(rng, pose_scale=0.3)
+        vertices = fitter.model.vertices(body) + np.array([0.0, 1.5 * number, 0.0])
+        clouds.append(PersonCloud(vertices + 0.002 * rng.standard_normal(vertices.shape), stamp=stamp))
+        truth.append(vertices)
+    return clouds, truth
+
+
+@pytest.mark.slow
+def test_new_people_have_a_body_in_their_first_cloud_while_no_full_fit_was_made() -> None:
+    fitter = BodyFitter(StitchedPuppet.load("neutral"), FitterSettings(threads=1))
+    tracker, never = MultiBodyTracker(fitter, MultiBodyTrackerSettings(), 0), _Never()
+    clouds, truth = _make_clouds(fitter, TENTH)
+    with one_blas_thread():
+        bodies = tracker.step(clouds, TENTH, 0, cast(Any, never))
+    assert [body.id for body in bodies] == ["b1", "b2", "b3"]
+    for body, vertices in zip(bodies, truth, strict=True):
+        assert np.linalg.norm(body.fit.vertices - vertices, axis=1).mean() < 0.03
+    assert len(never.tasks) <= 1 and all(body.fit.reliable for body in bodies) == (not never.tasks)
+
+
+@pytest.mark.slow
+def test_what_no_body_is_close_to_is_fitted_beside_the_clouds_and_tried_at_once_only_once() -> None:
+    fitter = BodyFitter(StitchedPuppet.load("neutral"), FitterSettings(threads=1))
+    tracker, never = MultiBodyTracker(fitter, MultiBodyTrackerSettings(), 0), _Never()
+    ball = np.random.default_rng(0).standard_normal((1000, 3))
+    ball = 0.6 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
+    tries: list[int] = []
+    at_once = fitter.fit_at_once
+    fitter.fit_at_once = lambda *cloud: tries.append(len(cloud[0])) or at_once(*cloud)  # type: ignore[method-assign, func-returns-value]
+    for number in (1, 2, 3):
+        cloud = PersonCloud(ball, stamp=number * TENTH)
+        assert not tracker.step([cloud], number * TENTH, 0, cast(Any, never))
+    assert tries == [1000] and len(never.tasks) == 1
