@@ -27,7 +27,8 @@ from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles
 from flowing_puppet_ros.body.search.part_points import build_part_points
 from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.schedule import four_stages
-from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
+from flowing_puppet_ros.body.settings import BodyTrackerSettings
+from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.evaluate.body.synthetic_scans import sample_surface
 from flowing_puppet_ros.evaluate.tables import Row
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, look_up

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of fits and of the segmentation before them, apart from what they set: a parser needs no more."""
+"""Settings of fits, tracking and segmentation, apart from what they set: a parser needs no more."""
 
 from __future__ import annotations
 
@@ -77,3 +77,33 @@ class SegmentationSettings(Settings):
     )
     min_points: int = setting(60, "minimum number of points of a person", low=50, high=100000, advanced=True)
     min_score: float = setting(0.5, "minimum score of a cluster to count as a person", low=0.0, high=1.0, advanced=True)
+
+
+@dataclass(frozen=True)
+class BodyTrackerSettings(Settings):
+    """Settings of `BodyTracker`."""
+
+    max_points: int = setting(
+        5000,
+        "points that a tracked cloud from all sides is downsampled to",
+        low=200,
+        high=200000,
+        advanced=True,
+    )
+    gauss_newton_steps: int = setting(5, "Gauss-Newton steps per cloud", low=1, high=100, advanced=True)
+    lost_ratio: float = setting(
+        1.3,
+        "two-way distance, relative to the best since the last search, beyond which the track is lost",
+        low=1.0,
+        high=10.0,
+        advanced=True,
+    )
+    lost_distance: float = setting(0.001, "distance added to that bound", unit="m", low=0.0, high=1.0, advanced=True)
+    max_time_gap: float = setting(
+        0.5,
+        "time between clouds beyond which the motion is not extrapolated",
+        unit="s",
+        low=0.01,
+        high=60.0,
+        advanced=True,
+    )

@@ -21,7 +21,8 @@ from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
-from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
+from flowing_puppet_ros.body.settings import BodyTrackerSettings
+from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage

@@ -35,6 +35,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "body.search": {"body.cloud", "evidence.cloud", "inference", "model"},
     "body.segmentation": {"body", "body.cloud", "body.scans"},
     "body.track": {
+        "body",
         "body.cloud",
         "body.fit",
         "body.refine",
@@ -168,6 +169,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "evaluate.moving": {
         "bag",
+        "body",
         "body.fit",
         "body.track",
         "evaluate.body",
@@ -182,8 +184,8 @@ MAY_IMPORT: dict[str, set[str]] = {
         "stream.messages",
     },
     "evaluate.rgbd": {
+        "body",
         "body.fit",
-        "body.track",
         "evaluate.body",
         "evaluate.scene",
         "evidence.cloud",
@@ -213,6 +215,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "exchange": {"bag", "body.cloud", "body.scans", "model", "stream.messages"},
     "flow": set(),
     "fusion": {
+        "body",
         "body.cloud",
         "body.fit",
         "body.refine",
@@ -226,6 +229,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "multiview",
     },
     "fusion.rig": {
+        "body",
         "body.cloud",
         "body.fit",
         "body.segmentation",

@@ -25,6 +25,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress, ch
 from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.settings import BodyTrackerSettings
 from flowing_puppet_ros.body.track.tracked_body import BodyObservation, align, extrapolate, translate
 from flowing_puppet_ros.body.upright.upright_fit import (
     FEW_POINTS,
@@ -36,7 +37,6 @@ from flowing_puppet_ros.body.upright.upright_fit import (
     keep_place_only,
 )
 from flowing_puppet_ros.model.sp import BodyState
-from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.threads import one_blas_thread
 
 # First and last kernel width in metres: of a usual step, and of a step from which a lost body may come back.
@@ -53,36 +53,6 @@ MAX_TURNED_RATIO = 1.25
 few points hardly tell front from back, and hardly anybody walks backwards."""
 ALIGN_GAP_NS = 100_000_000
 """Time between clouds from which on a body is first moved to the joints that somebody sees."""
-
-
-@dataclass(frozen=True)
-class BodyTrackerSettings(Settings):
-    """Settings of `BodyTracker`."""
-
-    max_points: int = setting(
-        5000,
-        "points that a tracked cloud from all sides is downsampled to",
-        low=200,
-        high=200000,
-        advanced=True,
-    )
-    gauss_newton_steps: int = setting(5, "Gauss-Newton steps per cloud", low=1, high=100, advanced=True)
-    lost_ratio: float = setting(
-        1.3,
-        "two-way distance, relative to the best since the last search, beyond which the track is lost",
-        low=1.0,
-        high=10.0,
-        advanced=True,
-    )
-    lost_distance: float = setting(0.001, "distance added to that bound", unit="m", low=0.0, high=1.0, advanced=True)
-    max_time_gap: float = setting(
-        0.5,
-        "time between clouds beyond which the motion is not extrapolated",
-        unit="s",
-        low=0.01,
-        high=60.0,
-        advanced=True,
-    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

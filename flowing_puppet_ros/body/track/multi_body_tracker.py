@@ -20,8 +20,9 @@ from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.assignment import assign_cheapest
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.body.settings import BodyTrackerSettings
 from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCloud
-from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
+from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.person_belief import PersonBelief
 from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody

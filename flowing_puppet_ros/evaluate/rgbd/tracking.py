@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
-from flowing_puppet_ros.body.track.body_tracker import BodyTrackerSettings
+from flowing_puppet_ros.body.settings import BodyTrackerSettings
 from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS
 from flowing_puppet_ros.evaluate.rgbd.methods import SensedScene, as_puppet
 from flowing_puppet_ros.evaluate.rgbd.scores import MIN_LOST_M

@@ -9,7 +9,8 @@ import pytest
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings, Progress
-from flowing_puppet_ros.body.track.body_tracker import BodyTracker, BodyTrackerSettings
+from flowing_puppet_ros.body.settings import BodyTrackerSettings
+from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, sample_surface, scan_whole
 from flowing_puppet_ros.evidence.cloud.sensor_field import PINHOLE, SensorField, SensorProjection
