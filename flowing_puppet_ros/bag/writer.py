@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import io
 import json
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
 from mcap.writer import CompressionType, Writer
+from ruamel.yaml import YAML
 
 from flowing_puppet_ros.bag.typestore import typestore
 from flowing_puppet_ros.errors import InputError
@@ -18,8 +20,6 @@ from flowing_puppet_ros.errors import InputError
 _METADATA_VERSION = 9  # of the rosbag2 metadata that Jazzy writes
 _CHUNK_BYTES = 1024 * 1024  # of messages per compressed chunk
 _INFINITE_DURATION = {"sec": 9223372036, "nsec": 854775807}  # of rmw
-_PLAIN = re.compile(r"[A-Za-z_/][\w/.~-]*", re.ASCII)
-_WORDS = {"true", "false", "yes", "no", "on", "off", "null", "y", "n"}
 _QUEUE_DEPTH = {"latched": 1, "sensor": 5, "reliable": 10}
 
 
@@ -87,7 +87,7 @@ class BagWriter:
             "cdr",
             self._schemas[type_name],
             {
-                "offered_qos_profiles": to_yaml(profiles) if profiles else "",
+                "offered_qos_profiles": _profiles_to_yaml(json.dumps(profiles)) if profiles else "",
                 "topic_type_hash": digest,
             },
         )
@@ -128,12 +128,12 @@ class BagWriter:
     def close(self) -> None:
         """Write what rosbag2 reads first: the metadata record, the index, and `metadata.yaml` of a folder."""
         metadata = self._metadata()
-        self._writer.add_metadata("rosbag2", {"serialized_metadata": to_yaml(metadata)})
+        self._writer.add_metadata("rosbag2", {"serialized_metadata": _to_yaml(metadata)})
         self._writer.finish()
         self._stream.close()
         self._partial.replace(self._target)
         if self._folder is not None:
-            text = to_yaml({"rosbag2_bagfile_information": metadata})
+            text = _to_yaml({"rosbag2_bagfile_information": metadata})
             (self._folder / "metadata.yaml").write_text(text, "utf8")
 
     def _metadata(self) -> dict[str, Any]:
@@ -171,35 +171,17 @@ class BagWriter:
             self._partial.unlink()
 
 
-def to_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
-    """Return plain values as a block of YAML, as libraries write it that take a second for a bag's metadata."""
-    return "\n".join(_list_lines(value)) + "\n"
+@cache
+def _profiles_to_yaml(profiles: str) -> str:
+    """Return QoS profiles, given as JSON, as YAML: most topics have the same."""
+    return _to_yaml(json.loads(profiles))
 
 
-def _list_lines(value: Mapping[str, Any] | Sequence[Any]) -> Iterator[str]:
-    if isinstance(value, Mapping):
-        for key, item in value.items():
-            if isinstance(item, Mapping | list) and item:
-                yield f"{_quote(key)}:"
-                # Lists are written in the column of their key, mappings two further in.
-                yield from (f"{'' if isinstance(item, list) else '  '}{line}" for line in _list_lines(item))
-            else:
-                yield f"{_quote(key)}: {_write_scalar(item)}"
-        return
-    for item in value:
-        lines = _list_lines(item) if isinstance(item, Mapping | list) and item else iter([_write_scalar(item)])
-        yield f"- {next(lines)}"
-        yield from (f"  {line}" for line in lines)
-
-
-def _write_scalar(value: Any) -> str:
-    if isinstance(value, str):
-        return _quote(value)
-    return json.dumps(value)
-
-
-def _quote(text: str) -> str:
-    """Return a text as it is where YAML takes it for nothing else, otherwise in quotes."""
-    if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
-        return text
-    return "'" + text.replace("'", "''") + "'" if text.isprintable() else json.dumps(text)
+def _to_yaml(value: Any) -> str:
+    yaml = YAML()
+    yaml.default_flow_style = False
+    yaml.representer.ignore_aliases = lambda *_: True
+    yaml.width = 1 << 16
+    stream = io.StringIO()
+    yaml.dump(value, stream)
+    return stream.getvalue()

@@ -185,7 +185,8 @@ class SilhouetteEstimator:
         seed[distance > np.where(known, _FRINGE_M, _UNKNOWN_FRINGE_M) * scale] = cv2.GC_BGD
         # A limb that the puppet has elsewhere is still connected to the body, and is not a shadow.
         stray = other & ~self.background.find_shadows(observation.image) & (distance <= _MAX_LIMB_ERROR_M * scale)
-        stray &= distance_transform(observation.others) > _BARE_DISTANCE_M * scale
+        if observation.others.any():
+            stray &= distance_transform(observation.others) > _BARE_DISTANCE_M * scale
         seed[_keep_connected(stray | puppet, puppet) & stray] = cv2.GC_FGD
         # Where a misplaced part of the puppet shows the bare background, colour decides.
         core = _erode(puppet, _CORE_DEPTH_M * scale)
@@ -222,7 +223,11 @@ def _make_disc(radius: float) -> U8:
 
 
 def _erode(mask: Bools, radius: float) -> Bools:
-    return distance_transform(~mask) > radius
+    """Return the pixels of a mask that are farther than `radius` from its outside, which begins beside its box."""
+    eroded = np.zeros_like(mask)
+    box = _crop(mask, 1)
+    eroded[box] = distance_transform(~mask[box]) > radius
+    return eroded
 
 
 def _crop(puppet: Bools, margin: float) -> tuple[slice, slice]:

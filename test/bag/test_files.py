@@ -2,7 +2,6 @@
 """Bags written here are read by everybody, and broken ones end in one sentence."""
 
 import sqlite3
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as OtherWriter
-from ruamel.yaml import YAML
 
 from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
-from flowing_puppet_ros.bag.writer import BagWriter, qos_profile, to_yaml
+from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header
@@ -195,34 +193,3 @@ def test_an_interrupted_writing_leaves_no_bag(tmp_path: Path) -> None:
         writer.add_topic("/bodies", BODIES)
         raise RuntimeError
     assert not (tmp_path / "a.mcap").exists()
-
-
-def test_metadata_is_the_yaml_that_others_write_and_read() -> None:
-    values = {
-        "version": 9,
-        "files": [{"path": "a.mcap", "size": 3}, {"path": "x", "size": 4}],
-        "topics": [{"name": "/cam/image", "profiles": [qos_profile("sensor"), qos_profile("latched")], "hash": ""}],
-        "odd": [
-            "no",
-            "12",
-            "1e3",
-            "a: b",
-            "it's",
-            "# not a comment",
-            "~",
-            "tab\t",
-            "-",
-            "two\nlines",
-            "\u00fc",
-            True,
-            1.5,
-        ],
-        "empty": [],
-        "nothing": None,
-        "within": {"deep": {"er": [1, 2]}},
-    }
-    text = to_yaml(values)
-    assert YAML(typ="safe").load(text) == values
-    other = StringIO()
-    YAML().dump({name: values[name] for name in ("version", "files", "topics", "within")}, other)
-    assert other.getvalue() == to_yaml({name: values[name] for name in ("version", "files", "topics", "within")})

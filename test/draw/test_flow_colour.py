@@ -6,7 +6,7 @@ import colorsys
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.draw.flow_colour import draw_flow_legend, flow_scale, flow_to_rgb
+from flowing_puppet_ros.draw.flow_colour import _find_turn, draw_flow_legend, flow_scale, flow_to_rgb
 
 
 def colour(u: float, v: float, scale: float = 1.0) -> tuple[int, int, int]:
@@ -62,3 +62,12 @@ def test_legend_shows_the_motion_from_its_centre() -> None:
     legend = draw_flow_legend(101)
     assert (legend[0, 0] == 255).all() and (legend[50, 50] > 245).all()
     assert legend[50, 99, 0] == 255 and legend[50, 99, 1] < 20
+
+
+def test_directions_are_those_of_the_arctangent() -> None:
+    angles = np.linspace(0, 2 * np.pi, 2001)[:-1]
+    for radius in (1e-3, 1.0, 300.0):
+        turns = np.array([_find_turn(radius * np.cos(angle), radius * np.sin(angle)) for angle in angles])
+        apart = np.abs(turns - angles / (2 * np.pi))
+        assert np.minimum(apart, 1 - apart).max() < 2e-5
+    assert _find_turn(0.0, 0.0) == 0.0

@@ -14,7 +14,7 @@ import struct
 import zlib
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import BinaryIO
 
@@ -22,7 +22,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
-from mcap.stream_reader import breakup_chunk
+from mcap.stream_reader import breakup_chunk, get_chunk_data_stream
 
 from flowing_puppet_ros.bag.storage.compression import decompress_prefix
 from flowing_puppet_ros.bag.storage.stored_file import ChunkSpan, StoredTopic, merge_chunks, parse_qos
@@ -38,6 +38,8 @@ _COMPRESSION_OFFSET = _RECORD_HEADER.size + 8 + 8 + 8 + 4
 """Bytes of a chunk record before the name of its compression."""
 _CHUNK_HEAD = struct.Struct("<QQQII")
 """Times of the first and last message, size, checksum, length of the name of the compression."""
+_MESSAGE_HEAD = struct.Struct("<HIQQ")
+"""Channel, sequence number, times at which a message was logged and published."""
 _CHUNK_MARK = re.compile(rb"\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4")
 _SEARCH_BYTES = 1 << 20
 """Bytes that are searched at a time for the next chunk."""
@@ -139,11 +141,11 @@ class McapFile:
         self, stream: BinaryIO, chunk: ChunkSpan, indices: Mapping[int, int]
     ) -> Iterator[tuple[int, int, bytes]]:
         stream.seek(chunk.offset)
-        if chunk.cut:
-            records = _unpack_cut_chunk(stream.read(_RECORD_HEADER.size + chunk.length)[_RECORD_HEADER.size :])
-        else:
-            records = _unpack_chunk(*self._read_record(stream))
-        for message in records:
+        if not chunk.cut:
+            for number, time, data in _unpack_messages(self._read_record(stream)[1], indices):
+                yield indices[number], time, data
+            return
+        for message in _unpack_cut_chunk(stream.read(_RECORD_HEADER.size + chunk.length)[_RECORD_HEADER.size :]):
             if isinstance(message, Message) and message.channel_id in indices:
                 yield indices[message.channel_id], message.log_time, message.data
 
@@ -257,6 +259,23 @@ def _unpack_chunk(code: int, data: bytes) -> list[McapRecord]:
     if chunk.uncompressed_size > MAX_RECORD_BYTES:
         raise McapError(f"a chunk of {chunk.uncompressed_size} bytes is too large")
     return breakup_chunk(chunk, validate_crc=True)
+
+
+def _unpack_messages(data: bytes, channels: Container[int]) -> Iterator[tuple[int, int, bytes]]:
+    """Yield (channel, log time, bytes) of some channels' messages in a chunk that `_unpack_chunk` has once passed.
+
+    Whoever wants a few topics reads all chunks, and most messages are passed over without making a record of each.
+    """
+    stream, length = get_chunk_data_stream(Chunk.read(ReadDataStream(io.BytesIO(data))))
+    unpacked, place = stream.read(length), 0
+    while place < length:
+        code, size = _RECORD_HEADER.unpack_from(unpacked, place)
+        start = place + _RECORD_HEADER.size
+        place = start + size
+        if code == Opcode.MESSAGE:
+            number, _, time, _ = _MESSAGE_HEAD.unpack_from(unpacked, start)
+            if number in channels:
+                yield number, time, unpacked[start + _MESSAGE_HEAD.size : place]
 
 
 def _unpack_cut_chunk(data: bytes) -> list[McapRecord]:

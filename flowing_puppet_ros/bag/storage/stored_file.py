@@ -85,7 +85,7 @@ def parse_qos(text: str) -> tuple[dict[str, Any], ...]:
 
 @lru_cache(maxsize=256)
 def _parse_profiles(text: str) -> tuple[dict[str, Any], ...]:
-    """Parse the text once for all topics that have the same: it takes 10 ms, and a bag has dozens of topics."""
+    """Parse the text once for all topics that have the same: a bag has dozens of topics."""
     try:
         return tuple(dict(item) for item in YAML(typ="safe").load(text) or ())
     except (YAMLError, TypeError, ValueError):
