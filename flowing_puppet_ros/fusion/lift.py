@@ -44,9 +44,9 @@ SURFACE_GAP_M, MIN_SURFACE_SHARE, MAX_SURFACES = 0.08, 0.15, 3
 """Between the depths of two surfaces, share of a surface in the points around a joint, and how many there may be."""
 CHOSEN = {name for chain in CHAINS for name in chain}
 """Joints whose depth is chosen among several."""
-MAX_EXPECTED_GAP_M, MIN_EXPECTED = 0.12, 3
-"""Between a ray and where its joint is expected, beyond which the depth there tells nothing, and joints of the trunk
-that tell its depth."""
+MAX_JUMP_M, MAX_EXPECTED_GAP_M, MIN_EXPECTED = 0.12, 0.3, 3
+"""Between the rays and where their joints are expected: the median of all and that of one, beyond which the depths
+there tell nothing; and joints of the trunk that tell its depth."""
 SAME_PLACE_M, MIN_TRUNK_GAP_M, MIN_OTHER_CONFIDENCE = 0.12, 0.1, 0.3
 """Between the joints of two people of which one was lifted onto the other, by how much it is nearer to the other's
 trunk than to its own along the axis, and what a joint that may be the other's counts at least."""
@@ -158,12 +158,14 @@ def find_lifted_onto_others(people: Sequence[LiftedJoints], axis: F64) -> list[B
 
 
 def _expect_depths(expected: F64 | None, rays: F64, cloud: SeenCloud) -> F64:
-    """Return the depths (J,) m of `expected` joints, NaN where the puppet sees a joint elsewhere."""
+    """Return the depths (J,) m of `expected` joints, NaN where the puppet sees most of them, or this one, elsewhere."""
     if expected is None:
         return np.full(len(rays), np.nan)
     place = expected - cloud.camera.centre
     across = np.linalg.norm(np.cross(place, rays), axis=1)
-    return np.where(across < MAX_EXPECTED_GAP_M, place @ cloud.camera.rotation[2], np.nan)
+    known = across[np.isfinite(across)]
+    jumped = not len(known) or np.median(known) > MAX_JUMP_M
+    return np.where(jumped | ~(across < MAX_EXPECTED_GAP_M), np.nan, place @ cloud.camera.rotation[2])
 
 
 def _find_outside(puppet: PuppetJoints, cloud: SeenCloud) -> Bools:

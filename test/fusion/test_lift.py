@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Joints lifted into clouds of planes and boxes, where the depth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.fusion.lift import lift_joints
+from flowing_puppet_ros.fusion.lift import find_lifted_onto_others, lift_joints
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -127,6 +129,51 @@ def test_of_two_surfaces_at_a_pixel_the_bones_choose(model: StitchedPuppet) -> N
     lifted = lift_joints(model, puppet(model), SeenCloud.of(cloud, camera()), np.full(len(cloud), True))
     row = model.joint_names.index("left_wrist")
     assert lifted.points[row, 2] == pytest.approx(2.5, abs=0.1)
+
+
+def test_of_two_surfaces_at_a_pixel_the_clouds_before_choose(model: StitchedPuppet) -> None:
+    # At the wrist's pixel an edge of two walls, both in reach; a body that jumped aside expects nothing.
+    cloud = np.concatenate([wall(2.5, -1.5, 0.404), wall(2.7, 0.396, 1.5)])
+    row = model.joint_names.index("left_wrist")
+
+    def find(expected: np.ndarray | None) -> float:
+        seen = SeenCloud.of(cloud, camera())
+        lifted = lift_joints(model, puppet(model), seen, np.ones(len(cloud), dtype=bool), expected)
+        return float(lifted.points[row, 2])
+
+    known = lift_joints(model, puppet(model), SeenCloud.of(wall(2.5), camera()), np.full(len(wall(2.5)), True)).points
+    for depth in (2.5, 2.7):
+        expected = known.copy()
+        expected[row] *= (depth + 0.025) / expected[row, 2]
+        assert find(expected) == pytest.approx(depth + 0.025, abs=0.02)
+        assert find(expected + np.array([0.4, 0.0, 0.0])) == find(None)
+
+
+@pytest.mark.parametrize(("confidence", "found"), [(0.8, True), (0.4, False)])
+def test_a_sure_joint_beside_a_thin_limb_is_on_it(model: StitchedPuppet, confidence: float, found: bool) -> None:
+    cloud = np.concatenate([wall(2.5, -1.5, 0.3), wall(2.5, 0.33, 0.355), wall(4.5, 0.62, 2.5)])  # wrist: x = 0.4
+    given, row = puppet(model), model.joint_names.index("left_wrist")
+    given.confidence[row] = confidence
+    lifted = lift_joints(model, given, SeenCloud.of(cloud, camera()), np.full(len(cloud), True))
+    assert lifted.found[row] == found
+    if found:
+        assert lifted.points[row, 2] == pytest.approx(2.525, abs=0.01)
+
+
+def test_an_arm_that_is_on_a_neighbours_is_noticed(model: StitchedPuppet) -> None:
+    """Of two people 0.5 m apart in depth, the farther one's left arm was found on the nearer one's right arm."""
+    seen = SeenCloud.of(wall(2.5), camera())
+    near = lift_joints(model, puppet(model), seen, np.ones(len(seen.points), dtype=bool))
+    names = model.joint_names
+    taken = [names.index(f"left_{name}") for name in ("elbow", "wrist")]
+    points = near.points + np.array([-0.6, 0.0, 0.5])
+    points[taken] = near.points[[names.index(f"right_{name}") for name in ("elbow", "wrist")]] + np.array(
+        [0.02, 0.0, 0.0]
+    )
+    far = replace(near, points=points, depth=near.depth + 0.5)
+    onto = find_lifted_onto_others([near, far], np.array([0.0, 0.0, 1.0]))
+    assert not onto[0].any()
+    assert np.flatnonzero(onto[1]).tolist() == sorted(taken)
 
 
 def test_nothing_is_found_in_no_points(model: StitchedPuppet) -> None:

@@ -17,8 +17,6 @@ MIN_COME_SHARE = 0.15
 """Share of the points, where the sensor once saw through, from which on something has come there."""
 SAME_PERSON_M = 0.35  # between the middles of two bodies that are one person
 SURROUNDINGS_M = 2.0  # about the middle of a person, of what may speak for or against one
-SAME_MIDDLE_M, SAME_SIZE = 0.08, 1.2
-"""Distance and ratio of the numbers of points up to which a candidate is one that was fitted before."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,9 +102,3 @@ def take_apart(
             taken.append(middle)
             kept.append((judged, candidate))
     return kept
-
-
-def is_same_candidate(candidate: Candidate, other: Candidate) -> bool:
-    """Return whether two candidates are about the same points."""
-    share = len(candidate.rows) / len(other.rows)
-    return bool(np.hypot(*(candidate.middle - other.middle)) < SAME_MIDDLE_M and 1 / SAME_SIZE < share < SAME_SIZE)

@@ -21,7 +21,6 @@ from flowing_puppet_ros.body.upright.found_body import (
     FoundBody,
     JudgedFit,
     ScanView,
-    is_same_candidate,
     take_apart,
 )
 from flowing_puppet_ros.body.upright.person_model import PersonModel
@@ -44,6 +43,7 @@ MIN_TRACKED = 0.5
 COME_ODDS, COME_FILTER = 1.5, 0.3
 """Log odds by which something that stands where the sensor once saw through is a person, and the share of the filter's
 limit that is asked of it. Cars and doors move too."""
+COLUMN_FILTER = 0.7  # the same of a column of a larger cluster: who stands close to others has a part of their shape
 BESIDE_M, CONTEXT_M, OWN_M = 1.0, 1.0, 0.10
 """Distance from a person within which others are looked for in what that person leaves, of their surroundings beyond,
 and from a body, up to which points are its own."""
@@ -134,17 +134,22 @@ class PersonFinder:
             for owner, rows in owned.items()
             if len(rows) >= self._settings.min_points
         ]
+        self._owned = np.zeros(len(points), dtype=bool)
+        for body in people:
+            self._owned[body.person.rows] = True
         view = self._view = ScanView(scene, ScanRays.of(points, viewpoint), stamp, remember, come)
         seen = {body.person.owner for body in people}
         middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
         unseen = {owner: middle for owner, middle in enumerate(middles) if owner not in seen}
         taken = [middle for owner, middle in enumerate(middles) if owner in seen]
         budget = FitBudget(self._settings.max_fits if max_fits is None else max_fits, max_misses)
-        offered = self._choose(candidates, view)
-        found, bent = self._fit_offered(offered, view, budget)
-        accepted = take_apart(found, taken)
-        if accepted:
-            accepted += take_apart(self._look_beside(accepted, offered, view, budget), taken)
+        found, bent = self._fit_offered(self._choose(candidates, view), view, budget)
+        accepted: list[tuple[JudgedFit, Candidate]] = []
+        fresh = take_apart(found, taken)
+        while fresh:
+            self._own(points, fresh)
+            accepted += fresh
+            fresh = take_apart(self._look_beside(fresh, view, budget), taken)
         for judged, candidate in accepted:
             # Who stands at a wall may have no points by the prediction: the candidate there is that person.
             owner = _pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
@@ -154,9 +159,6 @@ class PersonFinder:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
                 taken.append(candidate.middle)
                 people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
-        self._owned = np.zeros(len(points), dtype=bool)
-        for body in people:
-            self._owned[body.person.rows] = True
         return people
 
     def _fit_offered(
@@ -183,26 +185,26 @@ class PersonFinder:
                 bent.append(candidate)
         return found, bent
 
+    def _own(self, points: np.ndarray, accepted: Sequence[tuple[JudgedFit, Candidate]]) -> None:
+        """Note that people have the points of the scan (N, 3) m that lie on their bodies."""
+        for judged, _ in accepted:
+            vertices = judged.fit.vertices
+            low, high = vertices.min(axis=0) - OWN_M, vertices.max(axis=0) + OWN_M
+            inside = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
+            self._owned[inside[NearestPoints(vertices).query(points[inside])[0] < OWN_M]] = True
+
     def _look_beside(
         self,
         accepted: Sequence[tuple[JudgedFit, Candidate]],
-        offered: Sequence[tuple[Candidate, float]],
         view: ScanView,
         budget: FitBudget,
     ) -> list[tuple[JudgedFit, Candidate]]:
-        """Return the people close beside others: without the points of these, what is left looks like a person.
-
-        What was `offered` before is not fitted again.
-        """
+        """Return the people close beside others: what these leave may look like a person, and speak for one."""
         scene = view.scene
-        bodies = [judged.fit.vertices for judged, _ in accepted]
-        middles = [vertices[:, :2].mean(axis=0) for vertices in bodies]
+        middles = [judged.fit.vertices[:, :2].mean(axis=0) for judged, _ in accepted]
         near = [scene.index.find_near(scene.points, middle, BESIDE_M + CONTEXT_M)[0] for middle in middles]
         rows = np.unique(np.concatenate(near))
-        own = np.zeros(len(rows), dtype=bool)
-        for vertices in bodies:
-            own |= NearestPoints(vertices).query(scene.points[rows])[0] < OWN_M
-        rows = rows[~own]
+        rows = rows[~self._owned[rows]]
         if len(rows) < self._settings.min_points:
             return []
         left = view.take(rows)
@@ -211,7 +213,6 @@ class PersonFinder:
             candidate
             for candidate in candidates
             if any(np.hypot(*(candidate.middle - middle)) < BESIDE_M for middle in middles)
-            and not any(is_same_candidate(candidate, other) for other, _ in offered)
         ]
         found, _ = self._fit_offered(self._choose(fresh, left), left, budget)
         return [(judged, replace(candidate, rows=rows[candidate.rows])) for judged, candidate in found]
@@ -281,7 +282,8 @@ class PersonFinder:
         for number in np.argsort(-probability, kind="stable"):
             candidate, likely = candidates[number], float(probability[number])
             come = view.has_come(candidate)
-            if likely < self._settings.min_filter * (COME_FILTER if come else 1.0):
+            share = COME_FILTER if come else 1.0 if candidate.whole else COLUMN_FILTER
+            if likely < self._settings.min_filter * share:
                 self.last_rejected.append(RejectedCandidate.of(candidate, likely, "its shape is no person's"))
             elif view.remember and not come and self._rejected.contains(candidate, view.stamp):
                 self.last_rejected.append(RejectedCandidate.of(candidate, likely, "rejected before"))

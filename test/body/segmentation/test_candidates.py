@@ -103,3 +103,43 @@ def test_points_near_a_place_are_those_that_all_distances_give() -> None:
         every = np.hypot(*(points[:, :2] - place).T)
         assert set(rows) == set(np.flatnonzero(every <= 1.3)) and len(set(rows)) == len(rows)
         np.testing.assert_allclose(away, every[rows])
+
+
+def test_who_leans_at_a_wall_is_a_candidate_without_the_wall() -> None:
+    rng = np.random.default_rng(4)
+    wall = np.column_stack([6.15 + rng.normal(0, 0.01, 20_000), rng.uniform(-4, 4, 20_000), rng.uniform(0, 3, 20_000)])
+    behind = np.abs(wall[:, 1]) < 0.3
+    person = figure(6.0, 0.0, -0.12, rng)
+    seen = wall[~behind | (wall[:, 2] > 1.7)]
+    scene = SceneHeights.of(np.concatenate([ground(rng), seen, person]))
+    assert scene.wall[60_000 : 60_000 + len(seen)][seen[:, 2] > 0.3].mean() > 0.9 and not scene.wall[:60_000].all()
+    found = find_candidates(scene, SENSOR, 25)[0]
+    (nearest,) = [each for each in found if np.linalg.norm(each.middle - [6.0, 0.0]) < 0.2]
+    assert (nearest.rows >= 60_000 + len(seen)).mean() > 0.95 and len(nearest.rows) > 200
+
+
+def test_the_pieces_of_somebody_half_hidden_are_one_candidate_and_a_chair_beside_is_not_theirs() -> None:
+    rng = np.random.default_rng(5)
+    person = figure(6.0, 0.0, -0.12, rng, count=500)
+    height = person[:, 2] + 0.12
+    legs, upper = person[(height > 0.15) & (height < 0.35)], person[height > 0.95]
+    chair = rng.uniform([5.66, 2.9, 0.0], [5.72, 3.1, 0.5], (100, 3))
+    whole = figure(6.0, 3.0, -0.12, rng)
+    start = 60_000
+    scene = SceneHeights.of(np.concatenate([ground(rng), legs, upper, whole, chair]))
+    found = find_candidates(scene, SENSOR, 25)[0]
+    (hidden,) = [each for each in found if np.linalg.norm(each.middle - [6.0, 0.0]) < 0.2]
+    assert len(hidden.rows) > 0.9 * (len(legs) + len(upper)) and hidden.rows.min() < start + len(legs)
+    beside = [each for each in found if np.linalg.norm(each.middle - [6.0, 3.0]) < 0.25]
+    assert beside and min((each.rows >= start + len(legs) + len(upper) + 400).sum() for each in beside) < 40
+
+
+def test_near_known_people_alone_nobody_else_is_looked_for() -> None:
+    rng = np.random.default_rng(3)
+    people = [figure(x, y, -0.02 * x, rng) for x, y in ((6.0, 0.0), (6.0, 4.0))]
+    scene = SceneHeights.of(np.concatenate([ground(rng), *people]))
+    everywhere = find_candidates(scene, SENSOR, 25, [people[1]])
+    found, owned = find_candidates(scene, SENSOR, 25, [people[1]], only_known=True)
+    assert len(everywhere[0]) == 1 and not found
+    for rows in (owned[0], everywhere[1][0]):
+        assert (rows >= 60_400).mean() > 0.9 and (rows >= 60_400).sum() > 350

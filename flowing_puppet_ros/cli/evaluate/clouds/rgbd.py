@@ -91,6 +91,8 @@ def run(arguments: argparse.Namespace) -> int:
         ways = _see_from_robot(arguments)
         print(format_json({"robot": ways}) if arguments.json else format_table(ways))
         return 0
+    if arguments.lost_depth is not None and arguments.cameras is None:
+        raise InputError("--lost-depth compares what several cameras see; give --cameras")
     if arguments.mocap is None:
         raise InputError("drawn people stand and walk as motion capture does; give --mocap expmap_20hz.npz")
     if arguments.count < 1 or arguments.people < 1 or arguments.people_seed < 0 or not 0 <= arguments.noise <= 100:
@@ -106,8 +108,6 @@ def run(arguments: argparse.Namespace) -> int:
         motions = _track_motions(arguments, fitter, studio)
         print(format_json({"motions": motions}) if arguments.json else format_table(motions))
         return 0
-    if arguments.lost_depth is not None and arguments.cameras is None:
-        raise InputError("--lost-depth compares what several cameras see; give --cameras")
     if arguments.cameras is not None:
         rings = _look_from_around(arguments, fitter, studio)
         print(format_json({"cameras": rings}) if arguments.json else format_table(rings))
