@@ -20,7 +20,7 @@ from flowing_puppet_ros.bag.typestore import typestore
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.evaluate.tables import Row
-from flowing_puppet_ros.threads import MAX_THREADS, usable_threads
+from flowing_puppet_ros.process.threads import MAX_THREADS, usable_threads
 from flowing_puppet_ros.units import NANOSECONDS
 
 GOLDEN = Path(__file__).resolve().parent.parent / "bags" / "golden"

@@ -34,7 +34,7 @@ from flowing_puppet_ros.evaluate.tables import Row
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, look_up
 from flowing_puppet_ros.inference import diverse
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 NOISE_M = 0.003  # deviation of the clouds' points
 LOOK_UPS = 200_000  # queries of closest points

@@ -31,7 +31,7 @@ from flowing_puppet_ros.evidence.cloud import data_term, one_sided
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.one_sided import OneSidedView
 from flowing_puppet_ros.model.posing import BodyPoints
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 REST = "everything else"
 REFINEMENT: dict[str, list[tuple[Any, str]]] = {

@@ -17,7 +17,7 @@ from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.render import depth_order, render_labels
-from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
+from flowing_puppet_ros.process.threads import one_blas_thread, one_opencv_thread
 
 SIZES = ((320, 240), (640, 480), (1280, 960))  # width and height, px
 PEOPLE = (1, 2, 4, 8)

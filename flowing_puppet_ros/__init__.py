@@ -4,7 +4,7 @@
 import os
 from pathlib import Path
 
-from flowing_puppet_ros.kernel_cache import set_cache_folder
+from flowing_puppet_ros.process.kernel_cache import set_cache_folder
 
 __version__ = "0.1.0"
 

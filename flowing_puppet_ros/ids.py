@@ -40,3 +40,8 @@ def make_public_id(node: str, own: str) -> str:
         rest, digit = divmod(rest, 26)
         text += chr(ord("a") + digit)
     return text
+
+
+def id_sort_key(identity: str) -> tuple[int, str]:
+    """Return the key that sorts b2 before b10."""
+    return len(identity), identity

@@ -30,10 +30,9 @@ ROS_PACKAGES = {
     "std_srvs",
 }
 FOUNDATION = {
-    "arrays", "assignment", "errors", "extras", "ids", "images", "kernel_cache", "memory", "reporting", "settings",
-    "threads", "units",
+    "arrays", "assignment", "errors", "extras", "ids", "images", "process", "reporting", "settings", "units",
 }  # fmt: skip
-"""Modules beside the rooms, which everything may import."""
+"""Modules beside the rooms, and a room, which everything may import."""
 OPTIONAL_PACKAGES = {
     "ai_edge_litert", "anny", "av", "body_models", "dask", "distributed", "flask", "matplotlib", "open3d", "rerun",
     "waitress", "werkzeug",

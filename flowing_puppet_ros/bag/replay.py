@@ -26,6 +26,7 @@ from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.unused import count_used, explain_unused
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.process.threads import MAX_THREADS, one_blas_thread, one_opencv_thread, usable_threads
 from flowing_puppet_ros.stream.component import COMPRESSED
 from flowing_puppet_ros.stream.components.registry import COMPONENTS
 from flowing_puppet_ros.stream.messages.detections import name_body
@@ -38,9 +39,8 @@ from flowing_puppet_ros.stream.messages.message_types import (
     PUPPETS,
     TRANSFORMS,
 )
+from flowing_puppet_ros.stream.pairing.stuck_stamps import StuckStamps
 from flowing_puppet_ros.stream.pipeline import Pipeline
-from flowing_puppet_ros.stream.stuck_stamps import StuckStamps
-from flowing_puppet_ros.threads import MAX_THREADS, one_blas_thread, one_opencv_thread, usable_threads
 
 STATIC_TRANSFORMS = "/tf_static"
 METADATA_NAME = "flowing_puppet_ros"

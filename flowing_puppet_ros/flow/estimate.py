@@ -16,7 +16,7 @@ from flowing_puppet_ros.arrays import U8, Flow
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.images import as_image, reduce_image
-from flowing_puppet_ros.threads import one_opencv_thread
+from flowing_puppet_ros.process.threads import one_opencv_thread
 
 type FlowPair = tuple[Flow, Flow]
 

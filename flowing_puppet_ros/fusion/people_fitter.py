@@ -23,8 +23,8 @@ from flowing_puppet_ros.fusion.ownership import assign_points
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, trunk_rows
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import BodyState
+from flowing_puppet_ros.process.threads import one_blas_thread, parallel_map, usable_threads
 from flowing_puppet_ros.settings import Settings, setting
-from flowing_puppet_ros.threads import one_blas_thread, parallel_map, usable_threads
 
 MAX_LIMB_M = 0.6
 """Length of a limb that takes points by itself."""

@@ -30,8 +30,8 @@ from flowing_puppet_ros.fusion.people_fitter import Claim, PeopleFitter, make_pe
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import BodyState
+from flowing_puppet_ros.process.threads import one_blas_thread, parallel_map
 from flowing_puppet_ros.reporting import Report
-from flowing_puppet_ros.threads import one_blas_thread, parallel_map
 
 REFIT_INTERVAL_NS, LIMB_INTERVAL_NS = 1_000_000_000, 250_000_000
 """From one fit of an unreliable body from its joints to the next, and from one search for a lost limb to the next."""

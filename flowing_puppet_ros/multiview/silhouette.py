@@ -19,8 +19,8 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.images import reduce_image
 from flowing_puppet_ros.multiview.background import Background, BackgroundSettings
 from flowing_puppet_ros.multiview.distance_transform import distance_transform
+from flowing_puppet_ros.process.threads import one_opencv_thread
 from flowing_puppet_ros.settings import Settings, nested, setting
-from flowing_puppet_ros.threads import one_opencv_thread
 
 # Lengths on the body, tuned on real recordings.
 _CORE_DEPTH_M = 0.03  # pixels farther inside the puppet are body

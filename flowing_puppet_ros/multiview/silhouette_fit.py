@@ -31,8 +31,8 @@ from flowing_puppet_ros.multiview.silhouette_overlap import (
     silhouette_iou,
 )
 from flowing_puppet_ros.multiview.visual_hull import MIN_VIEWS
+from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.settings import Settings, setting
-from flowing_puppet_ros.threads import one_blas_thread
 
 # Overlap of a view in overlaps of the median view; below it another person is seen, or a mask or camera is wrong.
 _MIN_OVERLAP_RATIO = 0.7

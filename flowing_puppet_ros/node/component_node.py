@@ -18,11 +18,11 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from flowing_puppet_ros.errors import InputError, PuppetError
-from flowing_puppet_ros.memory import return_start_memory
 from flowing_puppet_ros.node.diagnostics import Diagnostics, NodeStatus
 from flowing_puppet_ros.node.factory import RosMessageFactory
 from flowing_puppet_ros.node.parameters import apply_changes, convert_to_floats, declare
 from flowing_puppet_ros.node.session import Session
+from flowing_puppet_ros.process.memory import return_start_memory
 from flowing_puppet_ros.stream.component import Component
 from flowing_puppet_ros.stream.components.registry import COMPONENTS, FIXED_SETTINGS, node_settings
 

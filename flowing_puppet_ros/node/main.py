@@ -13,9 +13,9 @@ from importlib import import_module
 from typing import Any
 
 from flowing_puppet_ros.errors import PuppetError
-from flowing_puppet_ros.memory import limit_arenas
+from flowing_puppet_ros.process.memory import limit_arenas
+from flowing_puppet_ros.process.threads import one_blas_thread, one_opencv_thread
 from flowing_puppet_ros.stream.pipeline import SWITCH_INTERVAL_S
-from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
 _COMPONENT_NODE = "flowing_puppet_ros.node.component_node"
 

@@ -37,7 +37,7 @@ from flowing_puppet_ros.stream.component import Component, Output, Port
 from flowing_puppet_ros.stream.messages.detections import BodySkeleton
 from flowing_puppet_ros.stream.messages.geometry import header_ns
 from flowing_puppet_ros.stream.messages.message_types import COMPRESSED_IMAGE, TRANSFORMS
-from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
+from flowing_puppet_ros.stream.pairing.time_synchronizer import BACKWARD_JUMP_NS
 from flowing_puppet_ros.units import NANOSECONDS
 
 LOG_INTERVAL_S = 5.0

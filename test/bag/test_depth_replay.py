@@ -17,13 +17,13 @@ from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.bag.recording import read_recording, to_cloud
+from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.report.data import gather_data
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud, make_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import BODIES, CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, POINT_CLOUD
-from flowing_puppet_ros.threads import one_blas_thread
 
 pytestmark = pytest.mark.slow
 

@@ -13,7 +13,7 @@ from flowing_puppet_ros.stream.components.body_fitter import MAX_WAITING, BodyFi
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, PUPPETS
-from flowing_puppet_ros.stream.stamp_buffer import CloudLine
+from flowing_puppet_ros.stream.pairing.stamp_buffer import CloudLine
 
 FACTORY = BagMessageFactory()
 PERIOD_NS = 33_000_000

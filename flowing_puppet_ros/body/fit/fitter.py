@@ -30,7 +30,7 @@ from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid, ExactCloud
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 __all__ = ["BodyFit", "BodyFitter", "FitterSettings", "Progress", "check_cloud"]
 

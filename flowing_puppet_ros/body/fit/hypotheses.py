@@ -32,7 +32,7 @@ from flowing_puppet_ros.body.search.schedule import four_stages, local_stages
 from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.threads import parallel_map, usable_threads
+from flowing_puppet_ros.process.threads import parallel_map, usable_threads
 
 Progress = Callable[[float], None]
 # Gauss-Newton steps of a hypothesis.

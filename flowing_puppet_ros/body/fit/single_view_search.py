@@ -26,7 +26,7 @@ from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
 from flowing_puppet_ros.body.search.proposals import Proposer
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.threads import parallel_map
+from flowing_puppet_ros.process.threads import parallel_map
 
 STARTS, KEPT_STARTS = 16, 12  # bodies of the bank that are refined, and those of them that are refined further
 KEPT, SPARSE_KEPT = (6, 4, 3), (8, 6, 4)  # bodies whose limbs are sampled again in each round, and of sparse clouds

@@ -18,7 +18,7 @@ from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.inference.diverse import select_diverse
 from flowing_puppet_ros.inference.max_product import MaxProduct, max_product, message_foundation
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.threads import parallel_map
+from flowing_puppet_ros.process.threads import parallel_map
 
 EXCLUDED_COST = 1e6  # of a particle that must not be used
 NO_GRIDS: Mapping[int, CloudGrid] = {}  # every part is compared with the whole cloud

@@ -37,7 +37,7 @@ from flowing_puppet_ros.body.upright.upright_fit import (
     keep_place_only,
 )
 from flowing_puppet_ros.model.sp import BodyState
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 # First and last kernel width in metres: of a usual step, and of a step from which a lost body may come back.
 NARROW_WIDTHS_M, WIDE_WIDTHS_M = (0.10, 0.03), (0.25, 0.03)

@@ -30,9 +30,9 @@ from flowing_puppet_ros.body.upright.found_body import JudgedFit
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
+from flowing_puppet_ros.process.threads import parallel_map, usable_threads
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import setting
-from flowing_puppet_ros.threads import parallel_map, usable_threads
 
 MATCH_DISTANCE_M = 0.6  # between the middle of a person's cloud and where it is expected
 MATCH_SPEED_M_PER_S, MAX_MATCH_DISTANCE_M = 2.0, 2.5  # by which that grows while unseen, and up to which

@@ -30,8 +30,8 @@ from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS, Upright
 from flowing_puppet_ros.body.upright.verification import weigh_fit
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
+from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.settings import Settings, setting
-from flowing_puppet_ros.threads import one_blas_thread
 
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
 """Points, probability by shape, and score of what a full search is made for though no upright body explains it."""

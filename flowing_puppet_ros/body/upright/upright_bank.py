@@ -18,7 +18,7 @@ from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.evidence.cloud.one_sided import distances
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 POSES, YAWS, SHAPE_SCALE = 120, 16, 0.7
 MIN_STRAIGHT_KNEE_RAD, MIN_OTHER_KNEE_RAD = np.radians(140.0), np.radians(95.0)

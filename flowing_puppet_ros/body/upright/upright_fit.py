@@ -27,7 +27,7 @@ from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.threads import parallel_map, usable_threads
+from flowing_puppet_ros.process.threads import parallel_map, usable_threads
 
 STARTS = 8  # bodies of the bank that are refined
 FEW_POINTS = RefineWeights(pose=1e-5, shape=3e-5, pairwise=5e-7, sigma_start=0.12, sigma_end=0.05, iterations=8)

@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 
 from flowing_puppet_ros.cli.batch.task import BatchTask, TaskResult, execute
-from flowing_puppet_ros.threads import MAX_THREADS, usable_threads
+from flowing_puppet_ros.process.threads import MAX_THREADS, usable_threads
 
 # Environment variables that set the libraries' numbers of threads; read when the libraries are imported.
 THREAD_VARIABLES = (

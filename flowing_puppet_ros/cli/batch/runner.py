@@ -23,8 +23,8 @@ from tqdm import tqdm
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.cli.batch.task import BatchTask, Summary, TaskResult, execute
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.process.threads import usable_threads
 from flowing_puppet_ros.settings import make_out_folder
-from flowing_puppet_ros.threads import usable_threads
 
 
 @dataclass(frozen=True, slots=True)

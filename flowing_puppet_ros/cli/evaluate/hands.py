@@ -13,7 +13,7 @@ from flowing_puppet_ros.evidence.image.hands import HandDetectors
 from flowing_puppet_ros.image.formats.annotations import Annotations
 from flowing_puppet_ros.learn.likelihood.samples import pose_people
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

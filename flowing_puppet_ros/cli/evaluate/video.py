@@ -52,9 +52,9 @@ from flowing_puppet_ros.evaluate.video.truth import PeopleByFrame, find_clips, r
 from flowing_puppet_ros.image.formats.tracks_json import write_tracks
 from flowing_puppet_ros.image.formats.video_reader import open_frames
 from flowing_puppet_ros.image.video.settings import ClipSettings
+from flowing_puppet_ros.process.threads import one_blas_thread, one_opencv_thread
 from flowing_puppet_ros.report.page import build_page, paragraph, table
 from flowing_puppet_ros.settings import make_out_folder
-from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
 
 MAX_FRAMES = 2000
 BASES = {"": "detector", INIT: f"{INIT}detector"}

@@ -22,7 +22,7 @@ from flowing_puppet_ros.multiview.bundle.adjustment import Freedom
 from flowing_puppet_ros.multiview.bundle.calibrate import AGREE_M, Agreement, RefinedRig, Scale, refine_rig
 from flowing_puppet_ros.multiview.rig.files import write_rig
 from flowing_puppet_ros.multiview.rig.rig import CameraRig
-from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
+from flowing_puppet_ros.process.threads import one_blas_thread, one_opencv_thread
 
 
 @one_opencv_thread()

@@ -32,7 +32,7 @@ from flowing_puppet_ros.image.settings import DetectorSettings
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.tree import PartTree
-from flowing_puppet_ros.threads import one_opencv_thread
+from flowing_puppet_ros.process.threads import one_opencv_thread
 
 
 @one_opencv_thread()

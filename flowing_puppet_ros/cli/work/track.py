@@ -29,7 +29,7 @@ from flowing_puppet_ros.image.video.clip import Clip, DetectedFrame, TrackedFram
 from flowing_puppet_ros.image.video.settings import ClipSettings
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread
+from flowing_puppet_ros.process.threads import one_blas_thread, one_opencv_thread
 
 
 # Held for the whole run: OpenCV makes its threads anew each time that their number changes, here at every frame.

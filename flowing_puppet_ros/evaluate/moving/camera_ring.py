@@ -23,7 +23,7 @@ from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS
 from flowing_puppet_ros.evaluate.rgbd.methods import SensedScene
 from flowing_puppet_ros.evaluate.rgbd.views import RgbdFrame, RgbdStudio, look_along
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import draw_upright
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 DISTANCE_M, EYE_HEIGHT_M = (2.4, 3.4), (0.9, 1.8)  # of the cameras, from the middle
 JITTER_RAD = 0.2  # of their places on the ring

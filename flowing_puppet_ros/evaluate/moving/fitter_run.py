@@ -14,12 +14,12 @@ from flowing_puppet_ros.evaluate.moving.robot_view import RobotMoment, RobotView
 from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS, SeenKeypoints
 from flowing_puppet_ros.fusion.puppet_joints import ANKLE_DROP
 from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.messages.geometry import make_camera_info, make_header, make_transform, stamp_ns
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import PUPPETS, TRANSFORMS
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
-from flowing_puppet_ros.threads import one_blas_thread
 
 BEGIN_NS = 1_000_000_000
 TRANSFORM_RATE_HZ = 50.0

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.arrays import F32, U8, Array
 from flowing_puppet_ros.images import as_rgb
-from flowing_puppet_ros.threads import one_opencv_thread
+from flowing_puppet_ros.process.threads import one_opencv_thread
 
 ORDERS = 4  # of the Fourier series of a descriptor
 CHANNELS = 2 * ORDERS + 1

@@ -34,8 +34,8 @@ from flowing_puppet_ros.fusion.rig.joined_fit import JoinedFitter, can_stand_alo
 from flowing_puppet_ros.fusion.rig.silhouette_person import SilhouettePerson
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
+from flowing_puppet_ros.process.threads import one_blas_thread, parallel_map
 from flowing_puppet_ros.reporting import Report
-from flowing_puppet_ros.threads import one_blas_thread, parallel_map
 
 MAX_AGE_NS = 1_000_000_000
 """Age of a person's last body up to which it helps the next fit."""

@@ -16,7 +16,7 @@ from flowing_puppet_ros.image.pose.evidence import LikelihoodLike, PersonWindow
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 ARM_JOINTS = ("elbow", "wrist")
 

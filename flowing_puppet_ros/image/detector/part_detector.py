@@ -38,7 +38,7 @@ from flowing_puppet_ros.image.detector.skin_features import skin_features
 from flowing_puppet_ros.image.settings import DetectorSettings
 from flowing_puppet_ros.images import as_image
 from flowing_puppet_ros.model import weights
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 WEIGHTS = "upper"
 MIN_SIDE_PX = 24  # nothing is found in a smaller image

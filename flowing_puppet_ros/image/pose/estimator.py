@@ -28,7 +28,7 @@ from flowing_puppet_ros.images import as_image, as_rgb
 from flowing_puppet_ros.model.ds.multiview import VIEW_HEADINGS, VIEW_NAMES, MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 VIEW_CONFIDENCE_FACTOR = 0.3
 """Factor on the confidence of detected joints when the view is estimated: detectors err more than the model."""

@@ -27,7 +27,7 @@ from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet, TrackResult
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View
-from flowing_puppet_ros.threads import one_blas_thread
+from flowing_puppet_ros.process.threads import one_blas_thread
 
 MAX_SEGMENT_IMAGES = 100
 """Maximum number of images of one person searched together; the evidence of an image takes about 5 MB."""

@@ -39,7 +39,7 @@ from flowing_puppet_ros.image.video.settings import (
 from flowing_puppet_ros.image.video.tracklets import Tracklet, TrackletLinker
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-from flowing_puppet_ros.threads import one_opencv_thread
+from flowing_puppet_ros.process.threads import one_opencv_thread
 
 type Method = Literal["smoothed", "thesis"]
 type DetectedFrame = tuple[VideoFrame, Sequence[Keypoints] | None]

@@ -20,7 +20,7 @@ from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import TrackedPuppet
 from flowing_puppet_ros.image.video.known_people import KnownPeople
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
-from flowing_puppet_ros.threads import one_opencv_thread
+from flowing_puppet_ros.process.threads import one_opencv_thread
 
 type ArmJoints = dict[int, tuple[F64, float]]
 """Elbows and wrists by their index in the model: the place (2,) px, and the probability that it is right."""

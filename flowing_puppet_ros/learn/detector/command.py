@@ -21,8 +21,8 @@ from flowing_puppet_ros.learn.detector.training import (
     LearnedDetector,
     learn_detector,
 )
+from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.settings import make_out_folder
-from flowing_puppet_ros.threads import one_blas_thread
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

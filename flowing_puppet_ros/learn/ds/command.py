@@ -16,8 +16,8 @@ from flowing_puppet_ros.learn.ds.multiview import fit_views
 from flowing_puppet_ros.learn.ds.samples import BodySampler, make_training_set, make_view_sets
 from flowing_puppet_ros.model.ds.joints import JOINT_NAMES
 from flowing_puppet_ros.model.ds.multiview import VIEW_NAMES
+from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.settings import make_out_folder
-from flowing_puppet_ros.threads import one_blas_thread
 
 POSES = 3000  # of the front view
 POSES_PER_VIEW = 600  # of each of the nine views

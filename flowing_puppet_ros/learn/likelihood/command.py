@@ -16,8 +16,8 @@ from flowing_puppet_ros.learn.annotations import add_annotation_arguments, load_
 from flowing_puppet_ros.learn.likelihood.samples import pose_people
 from flowing_puppet_ros.learn.likelihood.training import LearnedLikelihood, LikelihoodSettings, learn_likelihood
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.settings import make_out_folder
-from flowing_puppet_ros.threads import one_blas_thread
 
 PARTS = 10
 

@@ -13,8 +13,8 @@ from flowing_puppet_ros.learn.anny.body import GENDERS
 from flowing_puppet_ros.learn.sp.pose_spaces import TREE
 from flowing_puppet_ros.learn.sp.training import LearnedPuppet, LearnSettings, learn_puppet
 from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.settings import make_out_folder
-from flowing_puppet_ros.threads import one_blas_thread
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

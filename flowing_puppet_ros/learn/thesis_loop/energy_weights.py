@@ -30,8 +30,8 @@ from flowing_puppet_ros.image.tracking.propagation import ImageScale
 from flowing_puppet_ros.learn.likelihood.samples import PosedPerson
 from flowing_puppet_ros.learn.thesis_loop.hand_samples import MIN_CONFIDENCE
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
+from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.settings import Settings, setting
-from flowing_puppet_ros.threads import one_blas_thread
 
 SEARCHED_TERMS = ("prior", "colour", "hand")
 """Terms whose weights are searched; the weight of contours is 1, since only ratios matter."""

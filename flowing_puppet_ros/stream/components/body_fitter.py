@@ -12,24 +12,20 @@ import numpy as np
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings, Progress
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES
 from flowing_puppet_ros.body.track.scene_cloud import RegionSettings, SceneCloud, crop_to_region
-from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
+from flowing_puppet_ros.body.track.scene_tracker import SceneSettings
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
-from flowing_puppet_ros.fusion.coarse_place import CoarsePerson, place_others
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
-from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
-from flowing_puppet_ros.fusion.tracker import FusedTracker
+from flowing_puppet_ros.ids import id_sort_key
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.settings import nested, setting
 from flowing_puppet_ros.stream.component import COMPRESSED_DEPTH, Component, Output, Port
 from flowing_puppet_ros.stream.components import warm_up
-from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyOutputSettings, id_sort_key
+from flowing_puppet_ros.stream.components.body_outputs import BodyOutputs, BodyOutputSettings
+from flowing_puppet_ros.stream.components.cloud_people import CloudPeople, FoundPeople
 from flowing_puppet_ros.stream.components.ros4hri import Ros4HriSettings
-from flowing_puppet_ros.stream.components.silhouette_bodies import SilhouetteBodies
-from flowing_puppet_ros.stream.depth_pairs import DepthPairs
-from flowing_puppet_ros.stream.depth_rig import DepthRig, DepthRigSettings
 from flowing_puppet_ros.stream.messages.clouds import decode_pixels
 from flowing_puppet_ros.stream.messages.depth import make_depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
@@ -44,17 +40,18 @@ from flowing_puppet_ros.stream.messages.message_types import (
     MessageFactory,
 )
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints, make_bodies, make_body
-from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
-from flowing_puppet_ros.stream.rig_silhouettes import RigSilhouettes
+from flowing_puppet_ros.stream.pairing.depth_pairs import DepthPairs
+from flowing_puppet_ros.stream.pairing.depth_rig import DepthRig, DepthRigSettings
+from flowing_puppet_ros.stream.pairing.puppet_pairs import PuppetPairs
+from flowing_puppet_ros.stream.pairing.rig_silhouettes import RigSilhouettes
+from flowing_puppet_ros.stream.pairing.silhouette_bodies import SilhouetteBodies
+from flowing_puppet_ros.stream.pairing.stamp_buffer import CloudLine, StampBuffer
+from flowing_puppet_ros.stream.pairing.stuck_stamps import CloudClock
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
-from flowing_puppet_ros.stream.stamp_buffer import CloudLine, StampBuffer
-from flowing_puppet_ros.stream.stuck_stamps import CloudClock
 
 COLOUR_PORTS = ("puppets", "puppets/camera_info", "/tf_static", "/tf")
 MAX_WAITING = 12
 """Clouds that wait at most in a live node."""
-MIN_OUTSIDE_SHARE = 0.1
-"""Of a cloud's points, outside of the camera's view, from which on people are found there without puppets."""
 
 
 @dataclass(frozen=True)
@@ -122,10 +119,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         super().__init__(settings, factory)
         self._model = StitchedPuppet.load(settings.model)
         self._fitter = BodyFitter(self._model, settings.fitter)
-        self._scene = SceneTracker(self._fitter, settings, self.report)
         self._looked_at: tuple[int, SensorPlace] | None = None
-        people, hold = PeopleFitter(self._fitter, settings.fusion), settings.tracker.hold
-        self._fused = FusedTracker(people, settings.tracker, hold, self.report, self.publish_id)
+        people = PeopleFitter(self._fitter, settings.fusion)
+        self._people = CloudPeople(people, settings, settings.fusion, self.report, self.publish_id)
         self._frames = FrameTree()
         self._puppets = PuppetPairs(self._model, settings.fusion, self._frames)
         self._places = SensorPlaces(
@@ -146,7 +142,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
 
     def warm_up(self) -> None:
         """Do beforehand what the first clouds of a live stream would wait for: fit somebody made up, too."""
-        self._scene.warm_up()
+        self._people.scene.warm_up()
         self._outputs.warm_up()
         alone = replace(self.settings, up="auto", fixed_frame="", sensor_frame="", rig=DepthRigSettings())
         other = type(self)(alone, self.factory)
@@ -156,8 +152,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""
         self._silhouettes.reset()
         self._joined.reset()
-        self._scene.reset()
-        self._fused.reset()
+        self._people.reset()
         self._puppets.reset()
         self._depth.reset()
         if self._rig is not None:
@@ -188,18 +183,10 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         if initial is not None and initial.bodies:
             bodies = self._fit_initial(scene, place, initial, seed, progress)
         else:
-            bodies = self._publish_ids(self._scene.fit_once(scene, seed, progress))
+            bodies = self._people.fit_once(scene, seed, progress)
         bodies = [body.move(*place.back) for body in bodies]
         messages = [make_body(self.factory, self._model, body) for body in bodies]
         return make_bodies(self.factory, cloud.header, messages), bodies
-
-    def _step_scene(self, scene: SceneCloud, seed: int) -> tuple[list[TrackedBody], list[str]]:
-        """Return the bodies of everybody in a cloud alone, and the ids of those out of sight."""
-        bodies, occluded = self._scene.step(scene, seed, self.background)
-        return self._publish_ids(bodies), [self.publish_id(own) for own in occluded]
-
-    def _publish_ids(self, bodies: list[TrackedBody]) -> list[TrackedBody]:
-        return [replace(body, id=self.publish_id(body.id)) for body in bodies]
 
     def _decode(self, cloud: Any, of_depth: bool) -> tuple[SceneCloud, SensorPlace, bool]:
         """Return the points of a cloud message in the region of interest, z up, their place, and whether it is known.
@@ -311,85 +298,51 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         if self._looked_at is None:
             return None
         stamp, place = self._looked_at
-        return {"stamp_ns": stamp, "candidates": [one.describe(*place.back) for one in self._scene.rejected]}
+        return {"stamp_ns": stamp, "candidates": [one.describe(*place.back) for one in self._people.scene.rejected]}
 
     def _fit_one(self, stamp: int, cloud: Any, of_depth: bool, initial: Any | None) -> Output:
         self.counters["clouds"] += 1
-        bodies, occluded, coarse = list[TrackedBody](), list[str](), list[CoarsePerson]()
+        found = FoundPeople()
         try:
             rig, decode = self._rig, self._decode
             scene, place, is_known = decode(cloud, of_depth) if rig is None else rig.merge(cloud, decode)
             scene = replace(scene, stamp=self._clock.advance(stamp))
             if is_known and place.is_fixed != self._is_fixed:
                 self._is_fixed = place.is_fixed
-                self._scene.reset()
-                self._fused.reset()
+                self._people.reset()
                 self._joined.reset_people()
             if initial is not None and initial.bodies:
-                bodies = self._fit_initial(scene, place, initial, self.seed_of(stamp))
+                found = FoundPeople(self._fit_initial(scene, place, initial, self.seed_of(stamp)))
             else:
-                bodies, occluded, coarse = self._fit_scene(scene, cloud.header, stamp, place, is_known)
-            bodies = [body.move(*place.back) for body in bodies]
-            coarse = [person.move(*place.back) for person in coarse]
+                found = self._find_people(scene, cloud.header, stamp, place, is_known)
+            found = found.move_back(place)
             self._looked_at = stamp, place
         except InputError as error:
             self.report.count_unusable(error)
-        self.counters["bodies"] += len(bodies)
-        self.counters["people in colour only"] += len(coarse)
-        return self._outputs.make(cloud.header, bodies, occluded, self._subscribed, coarse)
+        self.counters["bodies"] += len(found.bodies)
+        self.counters["people in colour only"] += len(found.coarse)
+        return self._outputs.make(cloud.header, found.bodies, found.occluded, self._subscribed, found.coarse)
 
-    def _fit_scene(
+    def _find_people(
         self, scene: SceneCloud, header: Any, stamp: int, place: SensorPlace, is_known: bool
-    ) -> tuple[list[TrackedBody], list[str], list[CoarsePerson]]:
-        """Return the bodies of everybody, the ids of those out of sight, and who is seen in colour only.
-
-        Where the camera looks, only who has a puppet has a body. Elsewhere people are found in the cloud alone. A cloud
-        whose place is not known is fitted by itself.
-        """
-        seed = self.seed_of(stamp)
-        step = self._step_scene if is_known else self._step_alone
+    ) -> FoundPeople:
+        """Return everybody in a cloud, by the silhouettes or puppets that belong to it, else by itself."""
+        alone = self.seed_of(stamp), is_known, self.background
         if "silhouettes" in self._expected:
             bodies, own = self._joined.fit(scene, stamp, header.frame_id, place)
-            others, occluded = ([], []) if own.all() else step(scene.take(~own), seed)
-            others, occluded = self._joined.add_others(others, occluded)
-            return [*bodies, *others], occluded, []
+            left = FoundPeople() if own.all() else self._people.find_alone(scene.take(~own), *alone)
+            others, occluded = self._joined.add_others(left.bodies, left.occluded)
+            return FoundPeople([*bodies, *others], occluded)
         if "puppets" not in self._expected or not self.settings.scene:
-            return *step(scene, seed), []
+            return self._people.find_alone(scene, *alone)
         try:
             paired = self._puppets.find(header, stamp, *place.back)
         except InputError as error:
             self.report.warn(str(error))
             self.counters["clouds without puppets"] += 1
-            return *step(scene, seed), []
+            return self._people.find_alone(scene, *alone)
         self._puppets.drop_until(stamp)
-        seen = SeenCloud.of(scene.points, paired.camera, scene.viewpoint)
-        puppets = paired.puppets if self.settings.fusion.colour_only else []
-        try:
-            self._scene.check(scene)
-        except InputError as error:
-            self.report.count_unusable(error)
-            return [], [], place_others(self._model, puppets, seen)
-        if is_known:
-            bodies, own = self._fused.step(seen, scene.draw_image(), paired.puppets, scene.stamp)
-        else:
-            bodies, own = self._fused.step_alone(seen, scene.draw_image(), paired.puppets)
-        occluded = self._fused.occluded_ids
-        with_body = {body.id for body in bodies}
-        coarse = place_others(self._model, [each for each in puppets if each.id not in with_body], seen)
-        if paired.puppets and not own.any():
-            self.report.warn(
-                f"none of the {len(paired.puppets)} puppets lies on the cloud: nobody is near enough to the sensor, or "
-                "camera and cloud do not belong together"
-            )
-        outside = ~seen.in_view & ~own
-        if outside.mean() > MIN_OUTSIDE_SHARE:
-            others, hidden = step(scene.take(outside), seed)
-            bodies, occluded = [*bodies, *others], [*occluded, *hidden]
-        return bodies, occluded, coarse
-
-    def _step_alone(self, scene: SceneCloud, seed: int) -> tuple[list[TrackedBody], list[str]]:
-        """Return the bodies of everybody in a cloud that nothing joins to the others, and nobody's ids."""
-        return self._publish_ids(self._scene.step_alone(scene, seed)), []
+        return self._people.find_with_puppets(scene, paired, *alone)
 
     def _publish_silhouettes(self, instants: Iterable[tuple[Any, list[TrackedBody]]]) -> Output:
         outputs: Output = []

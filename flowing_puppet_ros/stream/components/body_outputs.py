@@ -16,6 +16,7 @@ from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.body.measurements.measure import measure_fit
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody, TrackStatus
 from flowing_puppet_ros.fusion.coarse_place import CoarsePerson
+from flowing_puppet_ros.ids import id_sort_key
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import Output, Port
@@ -284,8 +285,3 @@ class BodyMeasuring:
         """Return whether a person is new, was not measured for a while, or the stamps began anew."""
         last = self._last.get(identity)
         return last is None or not 0 <= stamp - last < MEASURING_INTERVAL_NS
-
-
-def id_sort_key(identity: str) -> tuple[int, str]:
-    """Return the key that sorts b2 before b10."""
-    return len(identity), identity

@@ -38,8 +38,8 @@ from flowing_puppet_ros.stream.messages.image_annotations import make_annotation
 from flowing_puppet_ros.stream.messages.images import decode_flow, decode_image, make_image
 from flowing_puppet_ros.stream.messages.message_types import ANNOTATIONS, DETECTIONS_2D, IMAGE, PUPPETS, MessageFactory
 from flowing_puppet_ros.stream.messages.puppets import make_puppets
-from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
-from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
+from flowing_puppet_ros.stream.pairing.stamp_buffer import PendingQueue, StampBuffer
+from flowing_puppet_ros.stream.pairing.time_synchronizer import BACKWARD_JUMP_NS
 
 _OF_A_NEW_TRACKER = {"model", "parts", "flow.max_side", "tracker.seed", "ros4hri.publish", "ros4hri.namespace"}
 

@@ -41,7 +41,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
     MessageFactory,
 )
 from flowing_puppet_ros.stream.messages.puppets import make_bodies, make_joints
-from flowing_puppet_ros.stream.time_synchronizer import TimeSynchronizer
+from flowing_puppet_ros.stream.pairing.time_synchronizer import TimeSynchronizer
 
 _CAMERA_TOPICS = ("image", "part_labels", "puppets")  # synchronised for each camera, the first leads
 

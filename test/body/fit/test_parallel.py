@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from flowing_puppet_ros.body.fit import hypotheses
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
 from flowing_puppet_ros.model.sp import StitchedPuppet
-from flowing_puppet_ros.threads import parallel_map, usable_threads
+from flowing_puppet_ros.process.threads import parallel_map, usable_threads
 
 
 def test_results_keep_the_order_of_the_items() -> None:

@@ -102,7 +102,7 @@ def drive(walkers: Walkers, roll: float = 0.0, **settings: Any) -> Drive:
                 hips = np.mean([joints[name][:3] for name in HIPS], axis=0)
                 velocity = np.array([body.velocity.x, body.velocity.y, body.velocity.z])
                 result.found.append((frame, body.id, turn @ hips + place, turn @ velocity))
-        reasons = [each.reason for each in component._scene._finder.last_rejected]
+        reasons = [each.reason for each in component._people.scene._finder.last_rejected]
         result.remembered += reasons.count("rejected before")
     told = component.describe_rejected()
     assert told is not None and told["stamp_ns"] == stamp

@@ -11,12 +11,12 @@ from hypothesis import strategies as st
 
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.stream.depth_pairs import DepthPairs
 from flowing_puppet_ros.stream.messages.clouds import decode_cloud
 from flowing_puppet_ros.stream.messages.depth import MAX_POINTS, back_project, make_depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header
 from flowing_puppet_ros.stream.messages.images import decode_depth, make_image
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, IMAGE
+from flowing_puppet_ros.stream.pairing.depth_pairs import DepthPairs
 
 FACTORY = BagMessageFactory()
 

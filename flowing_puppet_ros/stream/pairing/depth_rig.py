@@ -18,7 +18,6 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings, setting
 from flowing_puppet_ros.stream.component import COMPRESSED_DEPTH, Port
-from flowing_puppet_ros.stream.depth_pairs import DepthPairs
 from flowing_puppet_ros.stream.messages.depth import make_depth_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header, stamp_ns
 from flowing_puppet_ros.stream.messages.message_types import (
@@ -29,8 +28,9 @@ from flowing_puppet_ros.stream.messages.message_types import (
     TRANSFORMS,
     MessageFactory,
 )
+from flowing_puppet_ros.stream.pairing.depth_pairs import DepthPairs
+from flowing_puppet_ros.stream.pairing.time_synchronizer import TimeSynchronizer
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
-from flowing_puppet_ros.stream.time_synchronizer import TimeSynchronizer
 
 MAX_SILENCE_NS = 500_000_000
 """From the last cloud of a sensor, within which what it misses is left out: without it bodies would jump."""

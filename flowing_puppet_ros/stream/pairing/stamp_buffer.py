@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
+from flowing_puppet_ros.stream.pairing.time_synchronizer import BACKWARD_JUMP_NS
 
 
 class StampBuffer:

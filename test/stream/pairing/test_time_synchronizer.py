@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS, TimeSynchronizer
+from flowing_puppet_ros.stream.pairing.time_synchronizer import BACKWARD_JUMP_NS, TimeSynchronizer
 
 SLOP = 5
 stamps = st.lists(st.integers(0, 200), unique=True, max_size=25).map(sorted)

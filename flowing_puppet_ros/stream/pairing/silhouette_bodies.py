@@ -9,10 +9,10 @@ from typing import Any
 from flowing_puppet_ros.body.track.scene_tracker import ONLY_ID
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.ids import id_sort_key
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitter, SilhouetteFitterSettings
 from flowing_puppet_ros.reporting import Report
-from flowing_puppet_ros.stream.components.body_outputs import id_sort_key
 from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_silhouettes
 from flowing_puppet_ros.stream.messages.geometry import header_ns, stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints

@@ -12,7 +12,7 @@ from flowing_puppet_ros.fusion.people_fitter import FusionSettings
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, PUPPETS, TRANSFORMS
-from flowing_puppet_ros.stream.puppet_pairs import PuppetPairs
+from flowing_puppet_ros.stream.pairing.puppet_pairs import PuppetPairs
 
 FACTORY = BagMessageFactory()
 SECOND = 1_000_000_000

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from flowing_puppet_ros.kernel_cache import VARIABLE, set_cache_folder
+from flowing_puppet_ros.process.kernel_cache import VARIABLE, set_cache_folder
 
 READ_ONLY = Path("/proc/self")
 

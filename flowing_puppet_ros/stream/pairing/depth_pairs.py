@@ -7,7 +7,7 @@ from typing import Any
 
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
-from flowing_puppet_ros.stream.stamp_buffer import PendingQueue, StampBuffer
+from flowing_puppet_ros.stream.pairing.stamp_buffer import PendingQueue, StampBuffer
 
 
 class DepthPairs:

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from flowing_puppet_ros import threads
 from flowing_puppet_ros.evidence.image.features import ImageFeatures
 from flowing_puppet_ros.flow.estimate import OpticalFlow
 from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.multiview.silhouette import _Colours, _grab_cut
-from flowing_puppet_ros.threads import one_blas_thread, one_opencv_thread, parallel_map
+from flowing_puppet_ros.process import threads
+from flowing_puppet_ros.process.threads import one_blas_thread, one_opencv_thread, parallel_map
 
 COUNT = 3
 IMAGE = np.random.default_rng(0).integers(0, 256, (120, 160, 3)).astype(np.uint8)

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from flowing_puppet_ros.memory import find_unchanged
+from flowing_puppet_ros.process.memory import find_unchanged
 
 ENTRY = """{start}-{end} {mode} 00000000 fe:00 247260 {path}
 Size:               8192 kB
@@ -50,7 +50,7 @@ def test_what_others_may_have_changed_stays(entry: str) -> None:
 def test_a_process_is_smaller_and_its_compiled_code_still_runs() -> None:
     program = """
 import numpy as np
-from flowing_puppet_ros.memory import limit_arenas, return_start_memory
+from flowing_puppet_ros.process.memory import limit_arenas, return_start_memory
 limit_arenas()
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 index = NearestPoints(np.random.default_rng(0).random((500, 3)))

@@ -18,7 +18,7 @@ from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.stream.messages.camera_info import describe_images
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_puppet_joints
-from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
+from flowing_puppet_ros.stream.pairing.time_synchronizer import BACKWARD_JUMP_NS
 
 MAX_KEPT = 120  # messages of puppets
 MAX_OUTSIDE, MIN_OUTSIDE_CONFIDENCE = 0.1, 0.5

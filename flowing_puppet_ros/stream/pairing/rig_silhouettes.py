@@ -19,12 +19,12 @@ from flowing_puppet_ros.fusion.rig.rig_people import RigPeople
 from flowing_puppet_ros.fusion.rig.silhouette_person import SilhouettePerson
 from flowing_puppet_ros.multiview.silhouette_fit import SilhouetteFitterSettings
 from flowing_puppet_ros.reporting import Report
-from flowing_puppet_ros.stream.depth_rig import DepthRigSettings
 from flowing_puppet_ros.stream.messages.bodies.silhouettes import decode_views
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
+from flowing_puppet_ros.stream.pairing.depth_rig import DepthRigSettings
+from flowing_puppet_ros.stream.pairing.time_synchronizer import BACKWARD_JUMP_NS
 from flowing_puppet_ros.stream.sensor_places import SensorPlace
-from flowing_puppet_ros.stream.time_synchronizer import BACKWARD_JUMP_NS
 from flowing_puppet_ros.units import NANOSECONDS
 
 MAX_INSTANTS = 60

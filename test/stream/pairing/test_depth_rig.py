@@ -25,9 +25,9 @@ from capsule_man import cloud_of  # type: ignore[import-not-found]
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
-from flowing_puppet_ros.stream.depth_rig import MAX_MISSED, DepthRig, DepthRigSettings
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_body_joints
+from flowing_puppet_ros.stream.pairing.depth_rig import MAX_MISSED, DepthRig, DepthRigSettings
 from flowing_puppet_ros.stream.sensor_places import SensorPlaces
 
 
@@ -105,7 +105,7 @@ def test_a_rig_is_warmed_up_by_the_images_of_one_camera(monkeypatch: pytest.Monk
     component = BodyFitterComponent(BodyFitterSettings.from_mapping({"rig.cameras": "cam0,cam1"}), FACTORY)
     warmed: list[Any] = []
     monkeypatch.setattr("flowing_puppet_ros.stream.components.warm_up.run", lambda made, _: warmed.append(made))
-    monkeypatch.setattr(component._scene, "warm_up", lambda: None)
+    monkeypatch.setattr(component._people.scene, "warm_up", lambda: None)
     monkeypatch.setattr(component._outputs, "warm_up", lambda: None)
     component.warm_up()
     assert {"depth", "puppets"} <= {port.name for port in warmed[0].inputs}
@@ -135,7 +135,7 @@ def measure(angles: tuple[float, ...], frames: Any = None) -> tuple[list[float],
 def test_a_camera_that_is_not_where_it_is_said_to_be_is_told_of_and_one_that_is_is_not(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("flowing_puppet_ros.stream.depth_rig.COMPARED_MOMENTS", 2)
+    monkeypatch.setattr("flowing_puppet_ros.stream.pairing.depth_rig.COMPARED_MOMENTS", 2)
     points = cloud_of(MAN, 60_000)[0]
     for shift, expected in ((0.0, 0), (0.15, 1)):
         angles = (0.0, 1.2)
