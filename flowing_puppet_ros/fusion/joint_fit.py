@@ -33,11 +33,9 @@ from flowing_puppet_ros.fusion.limb_search import LimbSearcher, find_on_surface
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-PULLED = RefineWeights(
-    pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=14, alternate=2
-)
+PULLED = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=14)
 """With joints, from far away."""
-EXCHANGED = replace(PULLED, iterations=8)
+EXCHANGED = replace(PULLED, iterations=8, alternate=2)
 """The same with left and right exchanged, enough to see whether it is worth more."""
 FREE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.06, sigma_end=0.03, iterations=8)
 """Without joints, at the end."""

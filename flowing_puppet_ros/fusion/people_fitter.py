@@ -203,7 +203,8 @@ class PeopleFitter:
         sure = {name for name in found if joints.confidence[numbers[name]] >= MIN_LIMB_CONFIDENCE}
         limbs = list_capsules(found, sure)
         limbs = limbs[np.linalg.norm(limbs[:, :3] - limbs[:, 3:6], axis=1) < MAX_LIMB_M]
-        ends = np.array([[*found[name], *found[name], JOINT_RADIUS_M, JOINT_RADIUS_M] for name in sure if "_" in name])
+        seen = [found[name] for name in found if name in sure and "_" in name and not joints.hidden[numbers[name]]]
+        ends = np.array([[*place, *place, JOINT_RADIUS_M, JOINT_RADIUS_M] for place in seen])
         return np.concatenate([self._list_body(claim.start), limbs, ends.reshape(-1, 8)])
 
     def _list_body(self, body: BodyState) -> F64:

@@ -264,7 +264,7 @@ class MultiBodyTracker:
             track.tried = True
             if fit is not None:
                 track.tracker.start(cloud.person, fit)
-                track.fitted = cloud.person.stamp if fit.reliable else cloud.person.stamp - REFIT_INTERVAL_NS
+                track.fitted = cloud.person.stamp
                 bodies += [track.show(fit)] if track.prove(cloud.person, fit) else []
         return bodies
 

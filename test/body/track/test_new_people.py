@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""New people in a live stream of whole clouds: a body at once where one is close, a full fit beside the clouds else."""
+"""New people in a live stream of whole clouds: a reliable body at once, or a full fit beside the clouds."""
 
 from typing import Any, cast
 
@@ -37,16 +37,17 @@ def _make_clouds(fitter: BodyFitter, stamp: int) -> tuple[list[PersonCloud], lis
 
 
 @pytest.mark.slow
-def test_new_people_have_a_body_in_their_first_cloud_while_no_full_fit_was_made() -> None:
+def test_new_people_have_a_body_in_their_first_cloud_where_it_is_reliable() -> None:
     fitter = BodyFitter(StitchedPuppet.load("neutral"), FitterSettings(threads=1))
     tracker, never = MultiBodyTracker(fitter, MultiBodyTrackerSettings(), 0), _Never()
     clouds, truth = _make_clouds(fitter, TENTH)
     with one_blas_thread():
         bodies = tracker.step(clouds, TENTH, 0, cast(Any, never))
-    assert [body.id for body in bodies] == ["b1", "b2", "b3"]
-    for body, vertices in zip(bodies, truth, strict=True):
-        assert np.linalg.norm(body.fit.vertices - vertices, axis=1).mean() < 0.03
-    assert len(never.tasks) <= 1 and all(body.fit.reliable for body in bodies) == (not never.tasks)
+    assert len(bodies) >= 2, "several at once"
+    for body in bodies:
+        vertices = truth[int(body.id.removeprefix("b")) - 1]
+        assert body.fit.reliable and np.linalg.norm(body.fit.vertices - vertices, axis=1).mean() < 0.03
+    assert len(never.tasks) == (len(bodies) < 3), "one of the others has a full fit beside the clouds"
 
 
 @pytest.mark.slow
