@@ -184,11 +184,12 @@ def _list_clusters(
 
 
 class _Pieces(NamedTuple):
-    """The `voxels` (P,) of what is too small or too low to be a person, and their places (P, 3) with an `index`."""
+    """The `voxels` (P,) of what is too small or too low to be a person, and their places (P, 3) with an index
+    of their `columns`."""
 
     voxels: np.ndarray
     places: np.ndarray
-    index: ColumnIndex | None
+    columns: ColumnIndex | None
 
     @classmethod
     def of(cls, thin: np.ndarray, order: np.ndarray, starts: np.ndarray, chosen: np.ndarray) -> _Pieces:
@@ -204,9 +205,9 @@ class _Pieces(NamedTuple):
 
     def add(self, thin: np.ndarray, group: np.ndarray) -> np.ndarray:
         """Return a group (G,) of the voxels (M, 3) with the pieces just above it, and all below it."""
-        if self.index is None:
+        if self.columns is None:
             return group
-        near, _ = self.index.find_near(self.places, np.median(thin[group, :2], axis=0), PIECE_RADIUS_M)
+        near, _ = self.columns.find_near(self.places, np.median(thin[group, :2], axis=0), PIECE_RADIUS_M)
         height, low, top = self.places[near, 2], thin[group, 2].min(), thin[group, 2].max()
         return np.append(group, self.voxels[near[(height < low) | ((height > top) & (height < top + PIECE_GAP_M))]])
 
