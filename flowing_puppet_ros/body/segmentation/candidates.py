@@ -184,8 +184,7 @@ def _list_clusters(
 
 
 class _Pieces(NamedTuple):
-    """The `voxels` (P,) of what is too small or too low to be a person, and their places (P, 3) with an index
-    of their `columns`."""
+    """The `voxels` (P,) of what is too small or too low for a person, their `places` (P, 3), and an index of these."""
 
     voxels: np.ndarray
     places: np.ndarray
