@@ -184,7 +184,7 @@ def _list_clusters(
 
 
 class _Pieces(NamedTuple):
-    """The `voxels` (P,) of what is too small or too low to be a person, their places (P, 3), and these in `columns`."""
+    """The `voxels` (P,) of what is too small or too low for a person, their `places` (P, 3), and an index of these."""
 
     voxels: np.ndarray
     places: np.ndarray

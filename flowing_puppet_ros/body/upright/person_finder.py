@@ -35,7 +35,7 @@ from flowing_puppet_ros.settings import Settings, setting
 
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
 """Points, probability by shape, and score of what a full search is made for though no upright body explains it."""
-MIN_WORTHWHILE, MIN_SHAPELY = 0.15, 0.5
+MIN_WORTHWHILE, MIN_SHAPELY = 0.15, 0.6
 """Probability by the bank's best body from which on its other bodies are refined too, and probability by shape from
 which on they are whatever the best says: somebody who leans is often nearer to another one."""
 MIN_TRACKED = 0.5

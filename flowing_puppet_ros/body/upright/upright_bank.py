@@ -22,10 +22,10 @@ from flowing_puppet_ros.process.threads import one_blas_thread
 
 POSES, YAWS, SHAPE_SCALE = 120, 16, 0.7
 MIN_STRAIGHT_KNEE_RAD, MIN_OTHER_KNEE_RAD = np.radians(140.0), np.radians(95.0)
-MAX_TRUNK_TILT_RAD, MAX_STRIDE_M, MAX_BALANCE_M = np.radians(30.0), 0.65, 0.3
+MAX_TRUNK_TILT_RAD, MAX_STRIDE_M, MAX_BALANCE_M = np.radians(25.0), 0.6, 0.25
 """What makes a drawn body upright: knees, tilt of the trunk, distance of the ankles before each other and of the middle
 between them from below the hips; hands below the neck."""
-LEAN_RAD, LEAN_DEVIATION_RAD = np.radians(3.0), np.radians(8.5)
+LEAN_RAD, LEAN_DEVIATION_RAD = np.radians(2.0), np.radians(7.0)
 """Lean of the trunk ahead, and its deviation ahead and to the sides, of people in motion capture who stand or walk; the
 model draws all trunks upright."""
 MEAN_STATURE_M, STATURE_DEVIATION_M, STATURE_COST_M = 1.72, 0.1, 0.002
