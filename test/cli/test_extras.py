@@ -51,7 +51,7 @@ def folder(tmp_path: Path) -> Path:
     [
         ("annotate", "annotate needs waitress", ["annotate", "."]),
         ("cluster", "--scheduler needs distributed", ["fit", "cloud.npy", "--out", "o", "--scheduler", "tcp://localhost:9"]),
-        ("learn", "learn needs sklearn", ["learn", "ds"]),
+        ("learn", "learn needs sklearn", ["learn", "detector", ".", "--out", "o"]),
         ("learn", "the Anny body needs body_models", ["evaluate", "bodies", "--kind", "whole", "--count", "1"]),
         ("rerun", "--rerun needs rerun", ["replay", str(GOLDEN), "--out", "o.mcap", "--rerun", "o.rrd"]),
     ],
