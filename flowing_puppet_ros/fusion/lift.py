@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.fusion.limb_depths import (
     CHAINS,
+    HALF_SEEN_CONFIDENCE,
     LIMB_REACH_M,
     TRUNK_REACH_M,
     DepthChoices,
@@ -37,6 +38,9 @@ BEHIND_SURFACE_M = {
 RADIUS_M, MIN_RADIUS_PX = 0.04, 2.5
 """Around a joint, within which the person's points give its depth."""
 MIN_POINTS = 3
+MISSED_FACTOR = 2.0
+"""Of the radius around a sure joint of somebody known, where none of the person's points are: its pixel is beside a
+thin limb. Of somebody new it takes too much for a limb."""
 SURFACE_GAP_M, MIN_SURFACE_SHARE, MAX_SURFACES = 0.08, 0.15, 3
 """Between the depths of two surfaces, share of a surface in the points around a joint, and how many there may be."""
 CHOSEN = {name for chain in CHAINS for name in chain}
@@ -93,11 +97,14 @@ def lift_joints(
     """
     offsets = np.array([BEHIND_SURFACE_M.get(_kind(name), 0.0) for name in model.joint_names])
     rays, axis = cloud.camera.cast_rays(puppet.pixels), cloud.camera.rotation[2]
-    samples, beyond = _collect_samples(puppet, cloud, usable)
+    samples, beyond = _collect_samples(puppet, cloud, usable, np.flatnonzero(puppet.known))
     outside = _find_outside(puppet, cloud)
     trunk = trunk_rows(model)
     should = _expect_depths(expected, rays, cloud)
     depth = _find_trunk_depth(puppet, samples, trunk, should[trunk])
+    if expected is not None:
+        missed = _find_missed(puppet, samples, depth)
+        samples.update(_collect_samples(puppet, cloud, usable, missed, MISSED_FACTOR)[0])
     points = np.full((len(offsets), 3), np.nan)
     hidden = puppet.hidden.copy()
     choices: dict[int, DepthChoices] = {}
@@ -203,12 +210,29 @@ def _find_surfaces(depth: F64) -> F64:
     return found
 
 
-def _collect_samples(puppet: PuppetJoints, cloud: SeenCloud, usable: Bools) -> tuple[dict[int, F64], dict[int, F64]]:
-    """Return for the known joints the depths, in metres, of the `usable` (N,) points around each, and of the others."""
-    known = np.flatnonzero(puppet.known)
+def _find_missed(puppet: PuppetJoints, samples: Mapping[int, F64], depth: float) -> I64:
+    """Return the sure joints that have too few points around them near the trunk's `depth`."""
+    return np.array(
+        [
+            joint
+            for joint, values in samples.items()
+            if puppet.confidence[joint] >= HALF_SEEN_CONFIDENCE
+            and np.count_nonzero(np.abs(values - depth) < MAX_LIMB_DEPTH_M) < MIN_POINTS
+        ],
+        dtype=np.int64,
+    )
+
+
+def _collect_samples(
+    puppet: PuppetJoints, cloud: SeenCloud, usable: Bools, known: I64, factor: float = 1.0
+) -> tuple[dict[int, F64], dict[int, F64]]:
+    """Return for the `known` joints the depths, in metres, of the `usable` (N,) points around each, and of the others.
+
+    They are within `factor` of the usual radius.
+    """
     if not len(known):
         return {}, {}
-    joint, row = _find_around(puppet.pixels[known], cloud.pixels, cloud.depth, cloud.camera.focal)
+    joint, row = _find_around(puppet.pixels[known], cloud.pixels, cloud.depth, factor * cloud.camera.focal)
     own, depth = usable[row], cloud.depth[row]
     return (
         {int(number): depth[(joint == k) & own] for k, number in enumerate(known)},

@@ -149,6 +149,23 @@ def test_of_two_surfaces_at_a_pixel_the_clouds_before_choose(model: StitchedPupp
         assert find(expected + np.array([0.4, 0.0, 0.0])) == find(None)
 
 
+@pytest.mark.parametrize(("confidence", "known", "found"), [(0.8, True, True), (0.8, False, False), (0.4, True, False)])
+def test_a_sure_joint_beside_a_thin_limb_of_somebody_known_is_on_it(
+    model: StitchedPuppet, confidence: float, known: bool, found: bool
+) -> None:
+    cloud = np.concatenate([wall(2.5, -1.5, 0.3), wall(2.5, 0.33, 0.355), wall(4.5, 0.62, 2.5)])  # wrist: x = 0.4
+    seen, usable = SeenCloud.of(cloud, camera()), np.full(len(cloud), True)
+    expected = lift_joints(
+        model, puppet(model), SeenCloud.of(wall(2.5), camera()), np.full(len(wall(2.5)), True)
+    ).points
+    given, row = puppet(model), model.joint_names.index("left_wrist")
+    given.confidence[row] = confidence
+    lifted = lift_joints(model, given, seen, usable, expected if known else None)
+    assert lifted.found[row] == found
+    if found:
+        assert lifted.points[row, 2] == pytest.approx(2.525, abs=0.01)
+
+
 def test_an_arm_that_is_on_a_neighbours_is_noticed(model: StitchedPuppet) -> None:
     """Of two people 0.5 m apart in depth, the farther one's left arm was found on the nearer one's right arm."""
     seen = SeenCloud.of(wall(2.5), camera())
