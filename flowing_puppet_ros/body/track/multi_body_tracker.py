@@ -45,6 +45,7 @@ TURN_INTERVAL_NS = 1_000_000_000  # between attempts to turn a body round that w
 MAX_OTHER_WAY_RATIO = 0.8
 """Two-way distance of a full fit that faces the other way, relative to the tracked body's, up to which it is taken."""
 BODY_STRIDE = 8  # every so many vertices stand for a body
+AT_ONCE_INTERVAL_NS = 1_000_000_000  # between attempts at one: people soon stand otherwise
 MAX_FITS_AT_ONCE = 4  # new people in one cloud of a live stream who have a body in it
 
 Judge = Callable[[PersonCloud, BodyFit], JudgedFit]
@@ -63,8 +64,8 @@ class _BodyTrack:
     """One person.
 
     The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, its `motion`, the number
-    of full fits and the stamp of the last, that of the last attempt to turn it round, whether a body at once was tried,
-    whether it is `proven` to be a person, and what scans said about that.
+    of full fits and the stamp of the last, those of the last attempts to turn it round and at a body at once, whether
+    it is `proven` to be a person, and what scans said about that.
     """
 
     id: str
@@ -77,7 +78,7 @@ class _BodyTrack:
     fits: int = 0
     fitted: int = 0
     turned: int = -TURN_INTERVAL_NS
-    tried: bool = False
+    tried: int = -AT_ONCE_INTERVAL_NS
     proven: bool = True
     belief: PersonBelief | None = None
 
@@ -216,6 +217,7 @@ class MultiBodyTracker:
         tracked = iter(parallel_map(_track, followed, self._threads))
         fitted = [started[track.number] if track.number in started else next(tracked) for track, _ in matched]
         bodies: list[TrackedBody] = []
+        new: list[tuple[_BodyTrack, SeededCloud]] = []
         waiting: list[tuple[_BodyTrack, SeededCloud]] = []
         for (track, person), fit in zip(matched, fitted, strict=True):
             if isinstance(fit, InputError):
@@ -229,12 +231,14 @@ class MultiBodyTracker:
             unreliable = fit is not None and not fit.reliable and not track.tracker.hidden
             unreliable = unreliable and stamp - track.fitted >= REFIT_INTERVAL_NS
             cloud = SeededCloud(person, _person_seed(seed, track.number))
+            if fit is None:
+                new.append((track, cloud))
             if not self._background_fit.add(track.number, cloud) and (track.tracker.lost or unreliable):
                 waiting.append((track, cloud))
         self._report.counters["tracked people"] += len(bodies)
         self._drop_lost(stamp)
         if executor is not None:
-            bodies += self._fit_at_once(waiting)
+            bodies += self._fit_at_once(new)
             waiting = [pair for pair in waiting if pair[0].tracker.lost or not pair[0].shows_reliable]
         bodies += self._start_fit(waiting, executor)
         return sorted(bodies, key=lambda body: (len(body.id), body.id))
@@ -254,14 +258,17 @@ class MultiBodyTracker:
         self._drop_lost(stamp)
         return named
 
-    def _fit_at_once(self, waiting: list[tuple[_BodyTrack, SeededCloud]]) -> list[TrackedBody]:
-        """Return the bodies of new people who are seen from all sides and to whom one comes close in no time."""
-        new = [pair for pair in waiting if pair[0].tracker.last is None and not pair[0].tried]
+    def _fit_at_once(self, new: list[tuple[_BodyTrack, SeededCloud]]) -> list[TrackedBody]:
+        """Return the bodies of new people who are seen from all sides and to whom one comes close in no time.
+
+        Whose full fit runs beside the clouds is tried too: it takes seconds while clouds come fast.
+        """
+        new = [pair for pair in new if pair[1].person.stamp - pair[0].tried >= AT_ONCE_INTERVAL_NS]
         new = [pair for pair in new if pair[1].person.viewpoint is None and pair[1].person.field is None]
         new = new[:MAX_FITS_AT_ONCE]
         bodies = []
         for (track, cloud), fit in zip(new, parallel_map(self._try_at_once, new, self._threads), strict=True):
-            track.tried = True
+            track.tried = cloud.person.stamp
             if fit is not None:
                 track.tracker.start(cloud.person, fit)
                 track.fitted = cloud.person.stamp
