@@ -147,23 +147,24 @@ class PeopleFitter:
             The claims of the puppets that have enough points, and the points (N,) of the others.
         """
         bodies = list(known) or [None] * len(puppets)
+        expected = [None if body is None else self.find_joints(body) for body in bodies]
         puppets, own = list(puppets), [clear] * len(puppets)
         claims: list[Claim | None] = []
-        extra = [self._list_body(body) for body in others]
+        extra = [self.list_body(self.find_joints(body)) for body in others]
         for _round in range(CLAIM_ROUNDS if any(body is None for body in bodies) else 1):
-            claims = [
-                self._start(cloud, puppet, points, body)
-                for puppet, points, body in zip(puppets, own, bodies, strict=True)
-            ]
+            claims = [self._start(cloud, *each) for each in zip(puppets, own, bodies, expected, strict=True)]
             for number in self._hide_others(puppets, claims, cloud):
-                claims[number] = self._start(cloud, puppets[number], own[number], bodies[number])
-            limbs = [np.empty((0, 8)) if claim is None else self._list_capsules(claim) for claim in claims]
+                claims[number] = self._start(cloud, puppets[number], own[number], bodies[number], expected[number])
+            limbs = [
+                np.empty((0, 8)) if claim is None else self._list_capsules(claim, joints)
+                for claim, joints in zip(claims, expected, strict=True)
+            ]
             owner = np.full(len(cloud.points), -1, dtype=np.int32)
             owner[clear] = assign_points(cloud.points[clear], [*limbs, *extra])
             own = [owner == number for number in range(len(puppets))]
         found = [
-            replace(claim, joints=self._lift(claim.puppet, cloud, points, body), own=points)
-            for claim, points, body in zip(claims, own, bodies, strict=True)
+            replace(claim, joints=lift_joints(self.model, claim.puppet, cloud, points, joints), own=points)
+            for claim, points, joints in zip(claims, own, expected, strict=True)
             if claim is not None and np.count_nonzero(points) >= self.min_points
         ]
         return found, [owner == len(puppets) + number for number in range(len(others))] if claims or others else []
@@ -180,24 +181,29 @@ class PeopleFitter:
                 changed.append(number)
         return changed
 
-    def _start(self, cloud: SeenCloud, puppet: PuppetJoints, usable: Bools, body: BodyState | None) -> Claim | None:
+    def _start(
+        self, cloud: SeenCloud, puppet: PuppetJoints, usable: Bools, body: BodyState | None, expected: F64 | None
+    ) -> Claim | None:
         """Return a puppet's joints on the `usable` (N,) points and the body that they describe, None without one.
 
-        Where the body should be is known better from the clouds before: then it is `body`.
+        Where the body should be is known better from the clouds before: then it is `body`, and `expected` (J, 3) m are
+        its joints.
         """
-        joints = self._lift(puppet, cloud, usable, body)
+        joints = lift_joints(self.model, puppet, cloud, usable, expected)
         try:
             return Claim(puppet, joints, self.joint_fitter.start(joints, FEW_STEPS) if body is None else body, usable)
         except InputError:
             return None
 
-    def _lift(self, puppet: PuppetJoints, cloud: SeenCloud, usable: Bools, body: BodyState | None) -> LiftedJoints:
-        """Lift a puppet's joints onto the `usable` (N,) points, those of somebody known to where `body` has them."""
-        expected = None if body is None else self.model.joints(self.model.vertices(body))
-        return lift_joints(self.model, puppet, cloud, usable, expected)
+    def find_joints(self, body: BodyState) -> F64:
+        """Return a body's joints (J, 3), metres."""
+        return np.asarray(self.model.joints(self.model.vertices(body)))
 
-    def _list_capsules(self, claim: Claim) -> F64:
-        """Return the capsules (C, 8) of a body, and of limbs that end in sure joints, should the body miss them."""
+    def _list_capsules(self, claim: Claim, expected: F64 | None) -> F64:
+        """Return the capsules (C, 8) of a body, and of limbs that end in sure joints, should the body miss them.
+
+        `expected` are the body's joints (J, 3) m if they are known already.
+        """
         joints, numbers = claim.joints, {name: number for number, name in enumerate(self.model.joint_names)}
         found = {name: joints.points[number] for name, number in numbers.items() if joints.found[number]}
         sure = {name for name in found if joints.confidence[numbers[name]] >= MIN_LIMB_CONFIDENCE}
@@ -205,12 +211,12 @@ class PeopleFitter:
         limbs = limbs[np.linalg.norm(limbs[:, :3] - limbs[:, 3:6], axis=1) < MAX_LIMB_M]
         seen = [found[name] for name in found if name in sure and "_" in name and not joints.hidden[numbers[name]]]
         ends = np.array([[*place, *place, JOINT_RADIUS_M, JOINT_RADIUS_M] for place in seen])
-        return np.concatenate([self._list_body(claim.start), limbs, ends.reshape(-1, 8)])
+        body = self.find_joints(claim.start) if expected is None else expected
+        return np.concatenate([self.list_body(body), limbs, ends.reshape(-1, 8)])
 
-    def _list_body(self, body: BodyState) -> F64:
-        return list_capsules(
-            dict(zip(self.model.joint_names, self.model.joints(self.model.vertices(body)), strict=True))
-        )
+    def list_body(self, joints: F64) -> F64:
+        """Return the capsules (C, 8) of a body with `joints` (J, 3), metres."""
+        return list_capsules(dict(zip(self.model.joint_names, joints, strict=True)))
 
     def fit_claim(self, claim: Claim, person: PersonCloud, known: Cloud | None = None) -> BodyFit | None:
         """Return the body of a puppet's own points, from its joints; None where there is none.
@@ -226,7 +232,7 @@ class PeopleFitter:
     def complete_targets(self, claim: Claim, targets: JointTargets, body: BodyState) -> JointTargets:
         """Return targets with the joints that have no depth, each on its ray where the body's joint is nearest."""
         rays, puppet = np.nan_to_num(claim.joints.rays), claim.puppet
-        joints = self.model.joints(self.model.vertices(body))
+        joints = self.find_joints(body)
         missing = puppet.known & ~claim.joints.found
         along = ((joints - claim.joints.centre) * rays).sum(axis=1, keepdims=True)
         weight = self._settings.joint_strength * HIDDEN_SHARE * puppet.confidence**2
@@ -251,7 +257,7 @@ class PeopleFitter:
 
     def find_trunk(self, body: BodyState) -> F64:
         """Return the middle (3,) of a body's trunk, metres."""
-        return np.asarray(self.model.joints(self.model.vertices(body))[self._trunk].mean(axis=0))
+        return np.asarray(self.find_joints(body)[self._trunk].mean(axis=0))
 
     def find_trunk_pixel(self, puppet: PuppetJoints) -> F64:
         """Return the middle (2,) of a puppet's trunk, pixels; NaN where it has none."""

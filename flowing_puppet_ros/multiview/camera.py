@@ -142,6 +142,11 @@ class Camera:
         direction = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1) @ self.rotation
         return direction / np.linalg.norm(direction, axis=-1, keepdims=True)
 
+    def move(self, rotation: F64, translation: F64) -> Camera:
+        """Return the camera in a world to which `rotation` (3, 3) and then `translation` (3,) m lead."""
+        turn = self.rotation @ rotation.T
+        return replace(self, rotation=turn, translation=self.translation - turn @ translation)
+
     def scale(self, factor: float) -> Camera:
         """Return the camera for the image resized by `factor`: the size in whole pixels, and K to match it exactly."""
         width, height = (max(1, round(side * factor)) for side in self.size)

@@ -29,7 +29,7 @@ from flowing_puppet_ros.body.upright.scan_rays import ScanRays
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS, UprightFit, UprightFitter
 from flowing_puppet_ros.body.upright.verification import weigh_fit
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
+from flowing_puppet_ros.evidence.cloud.nearest import find_beside
 from flowing_puppet_ros.process.threads import one_blas_thread
 from flowing_puppet_ros.settings import Settings, setting
 
@@ -188,10 +188,7 @@ class PersonFinder:
     def _own(self, points: np.ndarray, accepted: Sequence[tuple[JudgedFit, Candidate]]) -> None:
         """Note that people have the points of the scan (N, 3) m that lie on their bodies."""
         for judged, _ in accepted:
-            vertices = judged.fit.vertices
-            low, high = vertices.min(axis=0) - OWN_M, vertices.max(axis=0) + OWN_M
-            inside = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
-            self._owned[inside[NearestPoints(vertices).query(points[inside])[0] < OWN_M]] = True
+            self._owned |= find_beside(points, judged.fit.vertices, OWN_M)
 
     def _look_beside(
         self,

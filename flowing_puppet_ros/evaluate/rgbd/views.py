@@ -59,12 +59,7 @@ class RgbdPair:
 
     def place(self, turn: F64, eye: F64) -> RgbdPair:
         """Return the cameras with the depth camera at `eye` (3,) m, its axes the columns of `turn` (3, 3)."""
-
-        def put(camera: Camera) -> Camera:
-            to_camera = camera.rotation @ turn.T
-            return replace(camera, rotation=to_camera, translation=camera.translation - to_camera @ eye)
-
-        return RgbdPair(put(self.depth), put(self.colour))
+        return RgbdPair(self.depth.move(turn, eye), self.colour.move(turn, eye))
 
 
 def make_camera(size: tuple[int, int] = (640, 480), focal: float = 525.0, lens: Sequence[float] = ()) -> Camera:

@@ -58,6 +58,14 @@ class NearestPoints:
         return distance, index
 
 
+def find_beside(points: np.ndarray, others: np.ndarray, max_distance: float) -> np.ndarray:
+    """Return which of `points` (N, 3) m are nearer than `max_distance` to any of `others` (M, 3), M > 0."""
+    low, high = others.min(axis=0) - max_distance, others.max(axis=0) + max_distance
+    beside = ((points > low) & (points < high)).all(axis=1)
+    beside[beside] = NearestPoints(others).query(points[beside])[0] < max_distance
+    return beside
+
+
 def _stack_normals(points: np.ndarray, scaled_normals: np.ndarray) -> np.ndarray:
     return np.hstack([points, scaled_normals]) if len(scaled_normals) else points
 

@@ -16,7 +16,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, I32, Bools
-from flowing_puppet_ros.body.cloud.limb_crop import list_capsules
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.initialisation import body_from_joints, make_joint_targets
@@ -26,7 +25,7 @@ from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
+from flowing_puppet_ros.evidence.cloud.nearest import find_beside
 from flowing_puppet_ros.fusion.joint_fit import FEW_STEPS
 from flowing_puppet_ros.fusion.ownership import assign_points
 from flowing_puppet_ros.fusion.people_fitter import PeopleFitter
@@ -127,7 +126,7 @@ class RigPeople:
             if stamp - track.stamp > self._hold_ns:
                 del self._tracks[identity]
         for body in found:
-            own |= _find_beside(scene.points, body.fit.vertices)
+            own |= find_beside(scene.points, body.fit.vertices, MAX_BESIDE_M)
         return found, own
 
     def _share_out(
@@ -169,10 +168,7 @@ class RigPeople:
         return body_from_joints(self._model, self._people.fitter.gauss_newton, targets, FEW_STEPS)
 
     def _list_capsules(self, body: BodyState | None) -> F64:
-        if body is None:
-            return np.empty((0, 8))
-        joints = self._model.joints(self._model.vertices(body))
-        return list_capsules(dict(zip(self._model.joint_names, joints, strict=True)))
+        return np.empty((0, 8)) if body is None else self._people.list_body(self._people.find_joints(body))
 
     def _start_track(self, identity: str, stamp: int) -> _RigTrack:
         return _RigTrack(identity, BodyTracker(self._people.fitter, self._settings), stamp)
@@ -215,12 +211,3 @@ class RigPeople:
             return error
         track.tracker.start(cloud or PersonCloud(fit.vertices, None, stamp), fit)
         return fit
-
-
-def _find_beside(points: F64, vertices: F64) -> Bools:
-    """Return which points (N, 3) m lie at a body with `vertices` (V, 3) m."""
-    low, high = vertices.min(axis=0) - MAX_BESIDE_M, vertices.max(axis=0) + MAX_BESIDE_M
-    beside = ((points > low) & (points < high)).all(axis=1)
-    near = NearestPoints(vertices).query(np.ascontiguousarray(points[beside]))[0] < MAX_BESIDE_M
-    beside[beside] = near
-    return beside

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,15 +36,10 @@ class SilhouettePerson:
 
     def move(self, rotation: F64, translation: F64) -> SilhouettePerson:
         """Return the same in a world to which `rotation` (3, 3) and then `translation` (3,) m lead."""
-
-        def put(camera: Camera) -> Camera:
-            turn = camera.rotation @ rotation.T
-            return replace(camera, rotation=turn, translation=camera.translation - turn @ translation)
-
         placed = {name: rotation @ np.array(joint[:3]) + translation for name, joint in self.joints.items()}
         return SilhouettePerson(
             self.id,
-            {name: (put(camera), mask) for name, (camera, mask) in self.views.items()},
+            {name: (camera.move(rotation, translation), mask) for name, (camera, mask) in self.views.items()},
             {name: (float(p[0]), float(p[1]), float(p[2]), self.joints[name][3]) for name, p in placed.items()},
         )
 

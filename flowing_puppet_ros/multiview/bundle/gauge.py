@@ -59,9 +59,4 @@ def place_as_before(cameras: Mapping[str, Camera], former: Mapping[str, Camera])
             best = found
     assert best is not None
     world, moved = Rotation.from_rotvec(best.x[:3]).as_matrix(), best.x[3:]
-    return {
-        name: replace(
-            each, rotation=each.rotation @ world.T, translation=each.translation - each.rotation @ world.T @ moved
-        )
-        for name, each in cameras.items()
-    }
+    return {name: each.move(world, moved) for name, each in cameras.items()}
