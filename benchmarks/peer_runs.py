@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.evaluate.body.bodies import draw_scans, score_fit
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
@@ -29,7 +30,7 @@ from flowing_puppet_ros.evaluate.video.errors import ClipErrors, TrackedPerson, 
 from flowing_puppet_ros.evaluate.video.methods import ClipRun, run_method
 from flowing_puppet_ros.evaluate.video.truth import find_clips, read_people
 from flowing_puppet_ros.image.formats.video_reader import open_frames
-from flowing_puppet_ros.image.video.clip import ClipSettings
+from flowing_puppet_ros.image.video.settings import ClipSettings
 from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.model.sp import StitchedPuppet

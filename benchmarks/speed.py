@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 
 from benchmarks import plain_search, replays, scenes, stages, streams
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.initialisation import sample_bodies
 from flowing_puppet_ros.body.search import energy, levenberg
 from flowing_puppet_ros.body.search.dpmp import BodyParticleSearch, SearchWeights
@@ -27,7 +27,7 @@ from flowing_puppet_ros.body.search.energy import JointTargets, ScoredParticles
 from flowing_puppet_ros.body.search.part_points import build_part_points
 from flowing_puppet_ros.body.search.particles import Particles, states_to_particles
 from flowing_puppet_ros.body.search.schedule import four_stages
-from flowing_puppet_ros.body.settings import BodyTrackerSettings
+from flowing_puppet_ros.body.settings import BodyTrackerSettings, FitterSettings
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.evaluate.body.synthetic_scans import sample_surface
 from flowing_puppet_ros.evaluate.tables import Row

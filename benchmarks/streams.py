@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from flowing_puppet_ros.evaluate.tables import Row
-from flowing_puppet_ros.flow.estimate import FlowSettings
+from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures

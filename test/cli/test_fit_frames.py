@@ -12,10 +12,10 @@ import pytest
 from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 from fit_verb import FAST, fitted  # type: ignore[import-not-found]
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.scans.scan import Scan
 from flowing_puppet_ros.body.scans.scan_frame import parse_axis, rotation_to_z_up
-from flowing_puppet_ros.body.segmentation.people import SegmentationSettings
+from flowing_puppet_ros.body.settings import FitterSettings, SegmentationSettings
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions, find_people
 from flowing_puppet_ros.model.sp import StitchedPuppet

@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.flow.estimate import FlowSettings, OpticalFlow, resize_flow, working_size
+from flowing_puppet_ros.flow.estimate import OpticalFlow, resize_flow, working_size
+from flowing_puppet_ros.flow.settings import FlowSettings
 
 
 def texture(height: int, width: int) -> NDArray[np.uint8]:

@@ -4,7 +4,8 @@
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.fusion.joint_fit import JointFitter
 from flowing_puppet_ros.fusion.lift import LiftedJoints
 from flowing_puppet_ros.fusion.limb_search import measure_joint_cost

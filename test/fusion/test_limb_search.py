@@ -8,7 +8,8 @@ import pytest
 from capsule_man import joints_of  # type: ignore[import-not-found]
 from watched_people import find_puppet, make_colour_camera, stand_at, watch  # type: ignore[import-not-found]
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter, make_person
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import StitchedPuppet

@@ -12,7 +12,8 @@ from watched_people import (  # type: ignore[import-not-found]
     watch,
 )
 
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
 from flowing_puppet_ros.model.sp import StitchedPuppet
 

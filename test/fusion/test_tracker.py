@@ -16,7 +16,8 @@ from watched_people import (  # type: ignore[import-not-found]
 )
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody

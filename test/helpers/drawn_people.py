@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
-from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackerSettings, TrackResult
+from flowing_puppet_ros.image.tracking.settings import TrackerSettings
+from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
 from flowing_puppet_ros.model.ds.shape import PuppetShape, View
 from flowing_puppet_ros.model.tree import DS10_PARENTS, PartTree
 

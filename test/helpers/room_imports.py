@@ -274,7 +274,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "learn.detector": {"evidence.image", "image.detector", "image.formats", "learn", "model", "model.ds"},
     "learn.ds": {"learn.anny", "model", "model.ds"},
     "learn.likelihood": {"evidence.image", "image.formats", "learn", "model", "model.ds"},
-    "learn.people": {"body.fit", "body.scans", "body.segmentation", "body.upright", "model"},
+    "learn.people": {"body", "body.fit", "body.scans", "body.segmentation", "body.upright", "model"},
     "learn.sp": {"learn.anny", "model"},
     "learn.thesis_loop": {
         "evidence.image",
@@ -300,6 +300,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "report.pictures": {"bag", "draw", "evaluate.bag", "flow", "model", "model.ds", "multiview", "stream.messages"},
     "stream": {"body.scans", "stream.messages"},
     "stream.components": {
+        "body",
         "body.fit",
         "body.measurements",
         "body.scans",

@@ -32,7 +32,7 @@ from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.process.threads import one_blas_thread
 
-__all__ = ["BodyFit", "BodyFitter", "FitterSettings", "Progress", "check_cloud"]
+__all__ = ["BodyFit", "BodyFitter", "Progress", "check_cloud"]
 
 MIN_CLOUD_POINTS = 50  # finite and distinct
 WARM_UP_VIEWPOINT_M = np.array([3.0, 0.0, 0.0])  # relative to the body

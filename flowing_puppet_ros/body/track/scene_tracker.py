@@ -15,8 +15,9 @@ from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
 from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
-from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
+from flowing_puppet_ros.body.segmentation.people import segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
+from flowing_puppet_ros.body.settings import SegmentationSettings
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud

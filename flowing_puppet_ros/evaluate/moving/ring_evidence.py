@@ -30,28 +30,33 @@ def compare_evidence(
     drawing, losing, masking = (np.random.default_rng([seed[0], kind, seed[1]]) for kind in (500, 600, 700))
     frames = ring.look(drawing, people)
     bodies, shown = frames[0].bodies, draw_people(frames, masking)
+    begin = time.process_time()
+    fits = _fit_silhouettes(fitter, shown)
+    alone = score_fits(fitter, fits, ring.studio, bodies, time.process_time() - begin)
     found: dict[tuple[str, str], RingScore] = {}
     for loss, own in zip(losses, losing.spawn(len(losses)), strict=True):
         left = lose_depth(frames, loss, own, fitter.model)
         scene = RigScene.merge([make_scene(frame) for frame in left if np.isfinite(frame.depth).any()], 1)
         found[loss, "depth"] = score_scene(fitter, scene, ring.studio, bodies)
-        for name, rig in (("silhouettes", None), ("both", scene)):
-            begin = time.process_time()
-            fits = _fit(fitter, shown, rig)
-            found[loss, name] = score_fits(fitter, fits, ring.studio, bodies, time.process_time() - begin)
+        begin = time.process_time()
+        fits = _fit_both(fitter, shown, scene)
+        found[loss, "silhouettes"] = alone
+        found[loss, "both"] = score_fits(fitter, fits, ring.studio, bodies, time.process_time() - begin)
     return found
 
 
-def _fit(fitter: BodyFitter, shown: Sequence[SilhouettePerson], scene: RigScene | None) -> list[BodyFit]:
-    """Return the bodies of whom silhouettes show, fitted to these alone, or to a scene too."""
-    if scene is not None:
-        people = PeopleFitter(fitter, FusionSettings())
-        tracked = RigPeople(people, SETTINGS, BodyTrackerSettings(), 0.0)
-        return [body.fit for body in tracked.step(scene, shown, 1)[0]]
-    fits = []
+def _fit_both(fitter: BodyFitter, shown: Sequence[SilhouettePerson], scene: RigScene) -> list[BodyFit]:
+    """Return the bodies of whom silhouettes show, fitted to these and to a scene."""
+    tracked = RigPeople(PeopleFitter(fitter, FusionSettings()), SETTINGS, BodyTrackerSettings(), 0.0)
+    return [body.fit for body in tracked.step(scene, shown, 1)[0]]
+
+
+def _fit_silhouettes(fitter: BodyFitter, shown: Sequence[SilhouettePerson]) -> list[BodyFit]:
+    """Return the bodies of whom silhouettes show, fitted to these alone."""
+    silhouettes, fits = SilhouetteFitter(fitter.model, SETTINGS), []
     for person in shown:
         try:
-            fits.append(SilhouetteFitter(fitter.model, SETTINGS).fit(list(person.views.values()), person.joints))
+            fits.append(silhouettes.fit(list(person.views.values()), person.joints))
         except InputError:  # joints or silhouettes place no body
             continue
     return fits

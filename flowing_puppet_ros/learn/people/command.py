@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES, parse_axis, rotation_to_z_up
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.upright.person_model import MODEL, PersonModel
 from flowing_puppet_ros.learn.people.examples import CandidateExamples, collect_examples, read_scenes
 from flowing_puppet_ros.learn.people.forest import learn_model

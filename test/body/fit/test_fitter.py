@@ -12,8 +12,9 @@ import pytest
 from capsule_man import Joints, cloud_of, dog, joints_of  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.body.cloud.normals import estimate_normals
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings, check_cloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, check_cloud
 from flowing_puppet_ros.body.scans.scan import write_ply
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.cli import main
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet

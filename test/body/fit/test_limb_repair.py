@@ -10,9 +10,10 @@ from capsule_man import Joints, cloud_of, joints_of  # type: ignore[import-not-f
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
-from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses, FitterSettings
+from flowing_puppet_ros.body.fit.hypotheses import BodyCandidate, BodyHypotheses
 from flowing_puppet_ros.body.fit.quality import assess_fit
 from flowing_puppet_ros.body.search.limb_search import limb_groups
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.evidence.cloud.data_term import CloudGrid
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 

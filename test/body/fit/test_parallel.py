@@ -10,7 +10,8 @@ from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 from threadpoolctl import threadpool_limits
 
 from flowing_puppet_ros.body.fit import hypotheses
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.process.threads import parallel_map, usable_threads
 

@@ -8,13 +8,14 @@ from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 from flowing_puppet_ros.body.cloud.correspondence import TwoWayCorrespondence, two_way_distance
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.partial_view import measure_unknown_share, strengthen_priors
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud, PoseBank
 from flowing_puppet_ros.body.fit.quality import assess_fit
 from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.part_points import build_part_points
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.evidence.cloud.sensor_field import PINHOLE, SensorField, SensorProjection
 from flowing_puppet_ros.model.sp import StitchedPuppet
 

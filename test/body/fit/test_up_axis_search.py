@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from capsule_man import Joints, cloud_of, joints_of  # type: ignore[import-not-found]
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.up_axis_search import choose_up_axis, explain_roughly, measure_stature
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES, parse_axis, propose_up_axes, rotation_to_z_up
 from flowing_puppet_ros.body.scans.unit import ScanUnit
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 METRE = ScanUnit.named("m")

@@ -11,7 +11,7 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.measurements.measure import (
     CHEST_SHARES,
     DEFINITIONS,
@@ -22,6 +22,7 @@ from flowing_puppet_ros.body.measurements.measure import (
 )
 from flowing_puppet_ros.body.measurements.sections import Sections, girth, signed_volume
 from flowing_puppet_ros.body.measurements.standard_pose import to_standard_pose
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, scan_whole
 from flowing_puppet_ros.learn.anny.body import AnnyBody
 from flowing_puppet_ros.model import rotation, weights

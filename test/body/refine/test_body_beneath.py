@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.refine.body_beneath import BodyBeneath, measure_gaps, measure_part_gaps
 from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.evaluate.body.garments import Tailor
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
 from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, scan_whole

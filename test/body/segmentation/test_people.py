@@ -4,8 +4,9 @@
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.segmentation.people import SegmentationSettings, segment_people
+from flowing_puppet_ros.body.segmentation.people import segment_people
 from flowing_puppet_ros.body.segmentation.planes import find_floor, find_wall
+from flowing_puppet_ros.body.settings import SegmentationSettings
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 

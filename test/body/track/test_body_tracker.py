@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings, Progress
-from flowing_puppet_ros.body.settings import BodyTrackerSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
+from flowing_puppet_ros.body.settings import BodyTrackerSettings, FitterSettings
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_scans import RaycastScene, sample_surface, scan_whole

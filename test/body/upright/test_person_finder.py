@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
-from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import MAX_LIVE_FITS, SceneSettings, SceneTracker
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings

@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.fit.fitter import BodyFitter, FitterSettings
+from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.visibility import Visibility
+from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.upright.upright_fit import UprightFitter, keep_place_only
 from flowing_puppet_ros.model.sp import StitchedPuppet
 

@@ -10,11 +10,11 @@ import pytest
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.video import methods
 from flowing_puppet_ros.evaluate.video.methods import ClipRun, all_names, check_names, run_method
-from flowing_puppet_ros.flow.estimate import FlowSettings
+from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame
 from flowing_puppet_ros.image.networks.keypoint_networks import FoundPerson
-from flowing_puppet_ros.image.video.clip import ClipSettings
+from flowing_puppet_ros.image.video.settings import ClipSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 NAMES = ("neck", "belly", "face", "right_shoulder", "left_shoulder", "right_hip", "left_hip")

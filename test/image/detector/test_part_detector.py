@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.image.region import RegionMap
 from flowing_puppet_ros.image.detector.detection import JOINTS, PersonCandidate, PersonDetection
-from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
+from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.detector.part_filters import (
     COLUMNS,
     DIMENSIONS,
@@ -37,6 +37,7 @@ from flowing_puppet_ros.image.detector.root_filters import (
 )
 from flowing_puppet_ros.image.detector.skin_features import skin_features
 from flowing_puppet_ros.image.formats.keypoints import joints_from_keypoints
+from flowing_puppet_ros.image.settings import DetectorSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 
 ANYBODY = DetectorSettings(min_confidence=0.0)

@@ -9,7 +9,8 @@ import pytest
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.association import associate
-from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
+from flowing_puppet_ros.image.tracking.settings import TrackerSettings
+from flowing_puppet_ros.image.tracking.track import Track
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 

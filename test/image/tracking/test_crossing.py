@@ -11,7 +11,8 @@ from drawn_people import NAMES, CapsuleModel, detection, draw, pose, tracker  # 
 
 from flowing_puppet_ros.image.tracking.appearance import torso_appearances
 from flowing_puppet_ros.image.tracking.association import associate
-from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
+from flowing_puppet_ros.image.tracking.settings import TrackerSettings
+from flowing_puppet_ros.image.tracking.track import Track
 
 pytestmark = pytest.mark.slow
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.image.tracking.heading import HeadingFilter
-from flowing_puppet_ros.image.tracking.track import Track, TrackerSettings
+from flowing_puppet_ros.image.tracking.settings import TrackerSettings
+from flowing_puppet_ros.image.tracking.track import Track
 from flowing_puppet_ros.model.ds.multiview import MultiViewStructures
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.ds.shape import View

@@ -10,7 +10,8 @@ from drawn_people import NAMES, CapsuleModel, Floats, capsule, detection, draw, 
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.flow.estimate import FlowSettings, OpticalFlow
+from flowing_puppet_ros.flow.estimate import OpticalFlow
+from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker
 

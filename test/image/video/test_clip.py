@@ -9,8 +9,9 @@ from flowing_puppet_ros.image.arms.evidence import ArmEvidenceModel
 from flowing_puppet_ros.image.arms.hypotheses import joint_correctness
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame
-from flowing_puppet_ros.image.video.clip import Clip, ClipSettings, TrackedFrame, track_clip, track_live
+from flowing_puppet_ros.image.video.clip import Clip, TrackedFrame, track_clip, track_live
 from flowing_puppet_ros.image.video.detection_worker import DetectionWorker
+from flowing_puppet_ros.image.video.settings import ClipSettings
 from test.helpers.drawn_people import NAMES, CapsuleModel, draw, pose
 from test.helpers.guessing_detector import Guesser, GuessingDetector, NoEvidence, negative
 

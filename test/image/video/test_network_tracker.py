@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.flow.estimate import FlowSettings
+from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.image.formats.keypoints import Keypoints
 from flowing_puppet_ros.image.formats.video_reader import VideoFrame
 from flowing_puppet_ros.image.networks.agreement import calibrate
 from flowing_puppet_ros.image.networks.keypoint_networks import FoundPerson
 from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, TrackResult
-from flowing_puppet_ros.image.video.clip import Clip, ClipSettings, track_clip, track_live
+from flowing_puppet_ros.image.video.clip import Clip, track_clip, track_live
 from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
-from flowing_puppet_ros.image.video.settings import LiveDetectionSettings, NetworkTimingSettings
+from flowing_puppet_ros.image.video.settings import ClipSettings, LiveDetectionSettings, NetworkTimingSettings
 from test.helpers.drawn_people import BACKGROUND, NAMES, CapsuleModel, draw, pose
 
 SCENES = ("one", "two", "crossing", "later", "nobody", "elsewhere")

@@ -14,8 +14,9 @@ import painted_people as painted  # type: ignore[import-not-found]
 import pytest
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.image.detector.part_detector import DetectorSettings, PartDetector
+from flowing_puppet_ros.image.detector.part_detector import PartDetector
 from flowing_puppet_ros.image.formats.annotations import AnnotatedFrame, AnnotatedPerson
+from flowing_puppet_ros.image.settings import DetectorSettings
 from flowing_puppet_ros.learn.detector import command
 from flowing_puppet_ros.learn.detector.boosting import boost
 from flowing_puppet_ros.learn.detector.data import JOINTS, Example, is_close, make_examples

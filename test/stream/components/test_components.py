@@ -18,7 +18,7 @@ from golden_streams import (  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.bag.typestore import typestore
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.flow.estimate import FlowSettings
+from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
 from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent, VisualHullSettings
