@@ -219,8 +219,7 @@ class PersonFinder:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
 
         Points of other people count neither for nor against it. Where it explains few points badly, a new upright body
-        may be better, and is returned instead. What is rejected
-        is remembered as by `find`.
+        may be better, and is returned instead. What is rejected is remembered as by `find`.
         """
         if self._view is None or not len(rows):
             return JudgedFit(0.0, 0.0, fit)
