@@ -218,14 +218,17 @@ class PeopleFitter:
         """Return the capsules (C, 8) of a body with `joints` (J, 3), metres."""
         return list_capsules(dict(zip(self.model.joint_names, joints, strict=True)))
 
-    def fit_claim(self, claim: Claim, person: PersonCloud, known: Cloud | None = None) -> BodyFit | None:
+    def fit_claim(
+        self, claim: Claim, person: PersonCloud, known: Cloud | None = None, is_tracked: bool = False
+    ) -> BodyFit | None:
         """Return the body of a puppet's own points, from its joints; None where there is none.
 
-        `known` is the person's cloud as a tracker has prepared it.
+        `known` is the person's cloud as a tracker has prepared it; `is_tracked`: whether a track tells left from right.
         """
+        fitter = self.joint_fitter
         try:
-            cloud = self.joint_fitter.take_cloud(person, known)
-            return self.joint_fitter.fit(cloud, self.joint_fitter.start(claim.joints), claim.joints)
+            cloud, start = fitter.take_cloud(person, known), fitter.start(claim.joints)
+            return (fitter.refit if is_tracked else fitter.fit)(cloud, start, claim.joints)
         except InputError:
             return None
 

@@ -212,7 +212,7 @@ class FusedTracker:
                 return None if tracker.lost else fit
             doubtful = fit is not None and not fit.reliable and not tracker.hidden and job.track.refit.is_due(stamp)
             if fit is None or tracker.lost or doubtful:
-                fresh = self._people.fit_claim(claim, job.person, tracker.cloud)
+                fresh = self._people.fit_claim(claim, job.person, tracker.cloud, fit is not None)
                 limit = np.inf if fit is None else BETTER_SHARE * fit.two_way_distance
                 better = fresh is not None and fresh.two_way_distance < limit
                 job.track.refit.record(stamp, better)
