@@ -94,14 +94,15 @@ def _make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
 
 def _spin(node: Any) -> None:
     import rclpy
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.executors import ExternalShutdownException
+    from rclpy.experimental import EventsExecutor
 
-    executor = SingleThreadedExecutor()
+    executor = EventsExecutor()
     executor.add_node(node)
     node.get_logger().info("ready" if node.state == "active" else f"{node.state}: waits for a lifecycle manager")
     while rclpy.ok():
         try:
-            executor.spin_once()
+            executor.spin_once(timeout_sec=1.0)
         except (KeyboardInterrupt, ExternalShutdownException):
             break
         except Exception as error:
