@@ -219,16 +219,17 @@ class PeopleFitter:
         return list_capsules(dict(zip(self.model.joint_names, joints, strict=True)))
 
     def fit_claim(
-        self, claim: Claim, person: PersonCloud, known: Cloud | None = None, is_tracked: bool = False
+        self, claim: Claim, person: PersonCloud, known: Cloud | None = None, quick: bool = False
     ) -> BodyFit | None:
         """Return the body of a puppet's own points, from its joints; None where there is none.
 
-        `known` is the person's cloud as a tracker has prepared it; `is_tracked`: whether a track tells left from right.
+        `known` is the person's cloud as a tracker has prepared it; `quick`: without a look at the exchanged sides, which a
+        track tells apart.
         """
         fitter = self.joint_fitter
         try:
             cloud, start = fitter.take_cloud(person, known), fitter.start(claim.joints)
-            return (fitter.refit if is_tracked else fitter.fit)(cloud, start, claim.joints)
+            return (fitter.fit_quickly if quick else fitter.fit)(cloud, start, claim.joints)
         except InputError:
             return None
 

@@ -71,7 +71,7 @@ class _Retry:
 class _PuppetTrack:
     """One person: the `stamp` ns of the last sign, whether it is `proven`, and what was tried for it.
 
-    `refit` from joints, and a search for each limb by its number.
+    `refit` from joints, and a search for each limb by its number. `checked`: whether a fit has told left from right.
     """
 
     id: str
@@ -80,6 +80,7 @@ class _PuppetTrack:
     refit: _Retry = field(default_factory=lambda: _Retry(REFIT_INTERVAL_NS, MAX_PATIENCE))
     searches: dict[int, _Retry] = field(default_factory=dict)
     proven: bool = False
+    checked: bool = False
     motion: TorsoMotion = field(default_factory=TorsoMotion)
 
 
@@ -128,7 +129,12 @@ class FusedTracker:
         return [track.id for track in self._tracks.values() if track.proven and track.id not in self._shown]
 
     def step(
-        self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints], stamp: int
+        self,
+        cloud: SeenCloud,
+        image: RangeImage | None,
+        puppets: Sequence[PuppetJoints],
+        stamp: int,
+        is_live: bool = False,
     ) -> tuple[list[TrackedBody], Bools]:
         """Return the bodies of everybody who is seen, and which points (N,) are theirs.
 
@@ -137,13 +143,14 @@ class FusedTracker:
             image: the cloud's range image, of which each person's field is made.
             puppets: at the time of the cloud.
             stamp: of the cloud in nanoseconds; one before the last restarts the tracker.
+            is_live: whether a new person's first body is wanted at once, and a thorough one in the next cloud.
         """
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
         self._stamp = stamp
         with one_blas_thread():
             jobs, own = self._share_out(cloud, image, self._name(puppets, cloud, stamp), stamp)
-            fits = parallel_map(lambda job: self._track(job, stamp), jobs, self._people.threads)
+            fits = parallel_map(lambda job: self._track(job, stamp, is_live), jobs, self._people.threads)
         found: list[TrackedBody] = []
         for job, fit in zip(jobs, fits, strict=True):
             if isinstance(fit, InputError):
@@ -200,9 +207,9 @@ class FusedTracker:
             anybody[job.person.rows] = True
         return jobs, anybody
 
-    def _track(self, job: _TrackJob, stamp: int) -> BodyFit | InputError | None:
+    def _track(self, job: _TrackJob, stamp: int, is_live: bool) -> BodyFit | InputError | None:
         """Return the person's body: tracked, or fitted from the joints where there is none, or none that is good."""
-        tracker, claim = job.track.tracker, job.claim
+        track, tracker, claim = job.track, job.track.tracker, job.claim
         try:
             predicted = tracker.predict(stamp)
             targets = None if claim is None else self._make_targets(claim, predicted)
@@ -210,12 +217,14 @@ class FusedTracker:
             fit = tracker.track(job.person, targets, places, self._point_limbs(predicted, claim))
             if claim is None:
                 return None if tracker.lost else fit
-            doubtful = fit is not None and not fit.reliable and not tracker.hidden and job.track.refit.is_due(stamp)
-            if fit is None or tracker.lost or doubtful:
-                fresh = self._people.fit_claim(claim, job.person, tracker.cloud, fit is not None)
+            due = fit is not None and not tracker.hidden and not fit.reliable and track.refit.is_due(stamp)
+            if fit is None or tracker.lost or due or not track.checked:
+                quick = track.checked if fit is not None else is_live
+                fresh = self._people.fit_claim(claim, job.person, tracker.cloud, quick)
+                track.checked = not quick or fit is not None
                 limit = np.inf if fit is None else BETTER_SHARE * fit.two_way_distance
                 better = fresh is not None and fresh.two_way_distance < limit
-                job.track.refit.record(stamp, better)
+                track.refit.record(stamp, better)
                 if fit is None or better:
                     if fresh is not None:
                         tracker.start(job.person, fresh)
