@@ -69,8 +69,10 @@ def _place_coarsely(
 def place_others(model: StitchedPuppet, puppets: Sequence[PuppetJoints], cloud: SeenCloud) -> list[CoarsePerson]:
     """Return the people of the puppets with an id of whom there is no depth."""
     named = [puppet for puppet in puppets if puppet.id]
+    if not named:
+        return []
     pixels = cloud.pixels[cloud.seen]
-    seen = cKDTree(pixels) if named and len(pixels) else None
+    seen = cKDTree(pixels) if len(pixels) else None
     found = [_place_coarsely(model, puppet, cloud.camera, seen) for puppet in named]
     return [person for person in found if person is not None]
 

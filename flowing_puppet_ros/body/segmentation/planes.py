@@ -153,8 +153,21 @@ def find_wall(
     `size` is the minimum of its longer and shorter side, metres; without it the plane is larger than a person.
     """
     normals, offsets = _sample_planes(points, rng)
-    count = (np.abs(points @ normals.T - offsets) < thickness).sum(axis=0)
+    count = _count_on_planes(points, normals, offsets, thickness)
     return _fit_best(points, normals, offsets, count, thickness, size)
+
+
+@njit(cache=True, nogil=True)
+def _count_on_planes(points: np.ndarray, normals: np.ndarray, offsets: np.ndarray, thickness: float) -> np.ndarray:
+    """Count (T,) the points (N, 3) that are nearer than `thickness` to each plane."""
+    count = np.zeros(len(normals), np.int64)
+    for trial in range(len(normals)):
+        x, y, z, offset = normals[trial, 0], normals[trial, 1], normals[trial, 2], offsets[trial]
+        on = 0
+        for row in range(len(points)):
+            on += abs(x * points[row, 0] + y * points[row, 1] + z * points[row, 2] - offset) < thickness
+        count[trial] = on
+    return count
 
 
 def _sample_planes(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
