@@ -47,6 +47,11 @@ class Cloud:
         """Index a cloud."""
         return cls(points, normals, NearestPoints(points), viewpoint, None)
 
+    @property
+    def noise(self) -> float:
+        """Deviation of the points along their normals, metres; 0 where it was not measured."""
+        return 0.0
+
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return which vertices (V,) face the viewpoint and are in its field; all when there is no viewpoint."""
         if self.viewpoint is None:

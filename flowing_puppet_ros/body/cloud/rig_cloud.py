@@ -80,7 +80,7 @@ class RigCloud(SingleViewCloud):
             rig.viewpoints.mean(axis=0),
             rig.own(np.concatenate(numbers)),
             RigView(tuple(part.view for part in parts)),  # type: ignore[arg-type]
-            max(part.depth_tolerance for part in parts),
+            max(part.plane_noise for part in parts),
             tuple(parts),
         )
 

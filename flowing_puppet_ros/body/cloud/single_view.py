@@ -32,11 +32,21 @@ class SingleViewCloud(Cloud):
 
     Attributes:
         view: the cloud as its sensor saw it.
-        depth_tolerance: distance in front of the seen surface, metres, at which a vertex is not yet pushed back.
+        plane_noise: median distance of the points from the planes through their neighbours, metres.
     """
 
     view: OneSidedView
-    depth_tolerance: float
+    plane_noise: float
+
+    @property
+    def noise(self) -> float:
+        """Deviation of the points along their normals, metres."""
+        return self.plane_noise
+
+    @property
+    def depth_tolerance(self) -> float:
+        """Distance in front of the seen surface, metres, at which a vertex is not yet pushed back."""
+        return max(MIN_DEPTH_TOLERANCE_M, TOLERANCE_PER_NOISE * self.plane_noise)
 
     @classmethod
     def seen_from(
@@ -63,15 +73,7 @@ class SingleViewCloud(Cloud):
         apart = np.abs(((points[near] - points[own, None]) * normals[own, None]).sum(axis=2))
         noise = float(np.median(apart[near != own[:, None]]))
         view = OneSidedView.build(points, viewpoint, unknown, field)
-        return cls(
-            points,
-            normals,
-            NearestPoints(points),
-            viewpoint,
-            field,
-            view,
-            max(MIN_DEPTH_TOLERANCE_M, TOLERANCE_PER_NOISE * noise),
-        )
+        return cls(points, normals, NearestPoints(points), viewpoint, field, view, noise)
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """Return which vertices (V,) face the sensor, are in its field and not hidden by what it saw."""

@@ -13,6 +13,9 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 
 KERNEL_WIDTH_M = 0.04  # distance to the other surface at which a vertex or point counts a quarter
 MAX_COVERED_DISTANCE_M = 0.04  # between a covered cloud point and the body
+MAX_STRAY_NOISES = 4.0
+"""Distance from the body, in deviations of the cloud's noise and beside those 4 cm, from which on a point is stray. A
+depth camera's noise grows with the distance, and at 3.5 m every tenth point is 4 cm away from a body that is right."""
 # With more of the cloud uncovered, or a part less on the cloud, a limb may be in a wrong place.
 MAX_LIMB_UNCOVERED, MIN_PART_CONFIDENCE = 0.005, 0.3
 MIN_SEEN_SHARE = 0.1  # of a part's vertices
@@ -34,6 +37,7 @@ class FitQuality:
         seen: (16,) whether at least a tenth of the part's surface is seen.
         explained: 0 to 1, how much of the cloud lies on the body.
         uncovered: share of the cloud's points that are farther than 4 cm from the body.
+        stray: share of the cloud's points that are farther from the body than 4 cm and the cloud's noise explain.
         self_intersections: joints whose two parts intersect (centres less than 5.5 cm apart).
         distance: mean distance between body and cloud over both directions, metres.
         surface: the distances from which all of this follows.
@@ -43,6 +47,7 @@ class FitQuality:
     seen: np.ndarray
     explained: float
     uncovered: float
+    stray: float
     self_intersections: int
     distance: float
     surface: SurfaceDistances
@@ -73,12 +78,12 @@ class FitQuality:
 
     @property
     def reliable(self) -> bool:
-        """Whether the confidence is at least 0.6 and at most a twentieth of the cloud is uncovered.
+        """Whether the confidence is at least 0.6 and at most a twentieth of the cloud is stray.
 
         Of 168 fits of whole clouds (Anny, TOSCA, SHREC'19; good and bad searches) it rejects all 10 wrong ones and 9 of
         the 158 right ones, all of them poor.
         """
-        return self.confidence >= MIN_CONFIDENCE and self.uncovered <= MAX_UNCOVERED
+        return self.confidence >= MIN_CONFIDENCE and self.stray <= MAX_UNCOVERED
 
 
 def assess_fit(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> FitQuality:
@@ -104,6 +109,7 @@ def assess_fit(model: StitchedPuppet, vertices: np.ndarray, cloud: Cloud) -> Fit
         count >= MIN_SEEN_SHARE * size,
         float(geman_mcclure(to_vertex**2, KERNEL_WIDTH_M**2).mean()),
         float((to_vertex > MAX_COVERED_DISTANCE_M).mean()),
+        float((to_vertex > np.hypot(MAX_COVERED_DISTANCE_M, MAX_STRAY_NOISES * cloud.noise)).mean()),
         int(np.count_nonzero(apart < MIN_DISJOINT_DISTANCE_M)),
         distances.two_way,
         distances,
