@@ -10,17 +10,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.arrays import F64
-from flowing_puppet_ros.fusion.puppet_joints import MIN_PUPPET_JOINTS, PuppetJoints
+from flowing_puppet_ros.fusion.puppet_joints import LONG_SHARE, MIN_PUPPET_JOINTS, PuppetJoints, measure_bone_distances
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.camera import Camera
 
-LONG_BONES = (
-    ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
-)  # fmt: skip
-"""Whose length in the image tells the distance, on both sides."""
-LONG_SHARE = 0.25
-"""Share of the bones that may appear longer than they are: most are foreshortened, and seem farther away."""
 MIN_CONFIDENCE = 0.3
 RADIUS_M, MAX_SEEN_SHARE = 0.06, 0.3
 """Around a joint, within which a point of the cloud says that there is depth, and the share of joints with depth from
@@ -53,7 +47,7 @@ def _place_coarsely(
     if np.count_nonzero(sure) < MIN_PUPPET_JOINTS:
         return None
     rays = camera.cast_rays(puppet.pixels)
-    distances = _measure_distances(model, rays, sure)
+    distances = measure_bone_distances(model, rays, sure)
     if not len(distances):
         return None
     distance = float(np.quantile(distances, LONG_SHARE))
@@ -75,17 +69,3 @@ def place_others(model: StitchedPuppet, puppets: Sequence[PuppetJoints], cloud: 
     seen = cKDTree(pixels) if len(pixels) else None
     found = [_place_coarsely(model, puppet, cloud.camera, seen) for puppet in named]
     return [person for person in found if person is not None]
-
-
-def _measure_distances(model: StitchedPuppet, rays: F64, sure: np.ndarray) -> F64:
-    """Return the distances (B,) m at which the bones between `sure` (J,) joints have an average person's lengths."""
-    names = model.joint_names
-    average = model.joints(model.vertices(model.rest_state()))
-    found = []
-    for side in ("left", "right"):
-        for above, below in LONG_BONES:
-            first, last = names.index(f"{side}_{above}"), names.index(f"{side}_{below}")
-            if sure[first] and sure[last]:
-                angle = float(np.linalg.norm(rays[first] - rays[last]))
-                found.append(float(np.linalg.norm(average[first] - average[last])) / max(angle, 1e-6))
-    return np.array(found)

@@ -26,7 +26,7 @@ from flowing_puppet_ros.fusion.limb_depths import (
     list_choices,
     measure_seen_share,
 )
-from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, trunk_rows
+from flowing_puppet_ros.fusion.puppet_joints import LONG_SHARE, PuppetJoints, measure_bone_distances, trunk_rows
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -51,6 +51,9 @@ there tell nothing; and joints of the trunk that tell its depth."""
 SAME_PLACE_M, MIN_TRUNK_GAP_M, MIN_OTHER_CONFIDENCE = 0.12, 0.1, 0.3
 """Between the joints of two people of which one was lifted onto the other, by how much it is nearer to the other's
 trunk than to its own along the axis, and what a joint that may be the other's counts at least."""
+MIN_SIZE_BONES, SIZE_CONFIDENCE, SIZE_DEVIATION = 3, 0.3, 0.3
+"""Bones between joints of this confidence that tell how far away somebody is, at least, and the standard deviation of
+the logarithm of that distance: people differ, and bend."""
 MAX_TRUNK_DEPTH_M, MAX_LIMB_DEPTH_M = 0.45, 0.8
 """From the trunk's depth, within which the joints of trunk and limbs are."""
 
@@ -101,7 +104,8 @@ def lift_joints(
     outside = _find_outside(puppet, cloud)
     trunk = trunk_rows(model)
     should = _expect_depths(expected, rays, cloud)
-    depth = _find_trunk_depth(puppet, samples, trunk, should[trunk])
+    likely = float("nan") if expected is not None else _find_likely_depth(model, puppet, samples, rays, axis)
+    depth = _find_trunk_depth(puppet, samples, trunk, should[trunk], likely)
     if expected is not None:
         missed = _find_missed(puppet, samples, depth)
         samples.update(_collect_samples(puppet, cloud, usable, missed, MISSED_FACTOR)[0])
@@ -262,13 +266,40 @@ def _find_around(joints, pixels, depth, focal):  # type: ignore[no-untyped-def]
     return found_joint[:count], found_row[:count]
 
 
-def _find_trunk_depth(puppet: PuppetJoints, samples: dict[int, F64], trunk: list[int], expected: F64) -> float:
+def _find_likely_depth(
+    model: StitchedPuppet, puppet: PuppetJoints, samples: Mapping[int, F64], rays: F64, axis: F64
+) -> float:
+    """Return the depth, metres, at which most joints have a surface, and that the size in the image makes likely.
+
+    Who stands behind a counter is neither on it, though the hips and knees are seen there, nor at the wall, though that
+    is beside the shoulders. Joints count by their squared confidence. NaN where no joint has a surface.
+    """
+    surfaces = {joint: _find_surfaces(values) for joint, values in samples.items()}
+    places = np.concatenate([np.empty(0), *surfaces.values()])
+    if not len(places):
+        return float("nan")
+    votes = np.zeros(len(places))
+    for joint, own in surfaces.items():
+        near = (np.abs(places[:, None] - own) < MAX_TRUNK_DEPTH_M).any(axis=1)
+        votes += np.where(near, puppet.confidence[joint] ** 2, 0.0)
+    sure = puppet.known & (puppet.confidence >= SIZE_CONFIDENCE)
+    bones = measure_bone_distances(model, rays, sure)
+    if len(bones) >= MIN_SIZE_BONES:
+        apparent = float(np.quantile(bones, LONG_SHARE) * np.median(rays[sure] @ axis))
+        votes *= np.exp(-0.5 * (np.log(places / apparent) / SIZE_DEVIATION) ** 2)
+    return float(places[votes.argmax()])
+
+
+def _find_trunk_depth(
+    puppet: PuppetJoints, samples: Mapping[int, F64], trunk: list[int], expected: F64, likely: float
+) -> float:
     """Return the median depth of the trunk, of all joints where the trunk has none, or NaN.
 
-    Joints count by their squared confidence: at hidden hips, the cloud shows the table before them. Where most of its
-    joints have an `expected` depth, metres, NaN elsewhere, the wall beside the shoulders does not count.
+    Joints count by their squared confidence, and where the cloud is near the `expected` depths (J,) m of the trunk's
+    joints, NaN where there is none; near the `likely` one where most have none.
     """
-    middle = float(np.nanmean(expected)) if np.count_nonzero(np.isfinite(expected)) >= MIN_EXPECTED else np.nan
+    known_before = np.count_nonzero(np.isfinite(expected)) >= MIN_EXPECTED
+    middle = float(np.nanmean(expected)) if known_before else likely
     for joints in (trunk, list(samples)):
         known = {joint: samples[joint] for joint in joints if len(samples.get(joint, ())) >= MIN_POINTS}
         near = {joint: values[np.abs(values - middle) < MAX_TRUNK_DEPTH_M] for joint, values in known.items()}

@@ -223,8 +223,8 @@ class PeopleFitter:
     ) -> BodyFit | None:
         """Return the body of a puppet's own points, from its joints; None where there is none.
 
-        `known` is the person's cloud as a tracker has prepared it; `quick`: without a look at the exchanged sides, which a
-        track tells apart.
+        `known` is the person's cloud as a tracker has prepared it; `quick`: without a look at the exchanged sides,
+        which a track tells apart.
         """
         fitter = self.joint_fitter
         try:

@@ -18,6 +18,12 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 ANKLE_DROP = 0.10
 MIN_PUPPET_JOINTS = 4
 """Known joints of a puppet that is believed to be a person."""
+LONG_BONES = (
+    ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle"), ("shoulder", "elbow"), ("elbow", "wrist"),
+)  # fmt: skip
+"""Whose length in the image tells the distance, on both sides."""
+LONG_SHARE = 0.25
+"""Share of the bones that may appear longer than they are: most are foreshortened, and seem farther away."""
 _TRUNK = ("neck", "belly", "face", "right_shoulder", "left_shoulder", "right_hip", "left_hip")
 
 
@@ -126,3 +132,17 @@ def trunk_rows(model: StitchedPuppet) -> list[int]:
 @lru_cache(maxsize=1)
 def _load_flat_model() -> DeformableStructures:
     return DeformableStructures.load("neutral", 14)
+
+
+def measure_bone_distances(model: StitchedPuppet, rays: F64, sure: Bools) -> F64:
+    """Return the distances (B,) m at which the bones between `sure` (J,) joints have an average person's lengths."""
+    names = model.joint_names
+    average = model.joints(model.vertices(model.rest_state()))
+    found = []
+    for side in ("left", "right"):
+        for above, below in LONG_BONES:
+            first, last = names.index(f"{side}_{above}"), names.index(f"{side}_{below}")
+            if sure[first] and sure[last]:
+                angle = float(np.linalg.norm(rays[first] - rays[last]))
+                found.append(float(np.linalg.norm(average[first] - average[last])) / max(angle, 1e-6))
+    return np.array(found)
