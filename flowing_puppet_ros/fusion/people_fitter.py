@@ -102,7 +102,7 @@ class PeopleFitter:
         `image` is the cloud's range image, which says what the sensor can know of each person.
         """
         with one_blas_thread():
-            clear, floor = self.find_clear(cloud.points)
+            clear, floor = self.find_clear(cloud.points, None, cloud.viewpoint)
             claims, _ = self.claim(cloud, puppets, clear)
             people = [make_person(cloud, image, claim.own, floor, 0) for claim in claims]
             found = parallel_map(
@@ -114,12 +114,17 @@ class PeopleFitter:
             if fit is not None and self.is_proven(fit)
         ]
 
-    def find_clear(self, points: F64, cache: PlaneCache | None = None) -> tuple[Bools, Bools]:
-        """Return which points (N,) are neither floor nor wall, and which are floor; `cache` has those of before."""
+    def find_clear(
+        self, points: F64, cache: PlaneCache | None = None, sensor: F64 | None = None
+    ) -> tuple[Bools, Bools]:
+        """Return which points (N,) are neither floor nor wall, and which are floor.
+
+        `cache` has those of before, and `sensor` (3,) m is above the floor.
+        """
         origin, clearance = np.zeros(3), self._settings.plane_clearance
         few = subsample(points)
         known = cache.get(few, clearance, origin) if cache else None
-        floor, walls = known or find_planes(points, clearance)
+        floor, walls = known or find_planes(points, clearance, sensor)
         if cache and known is None:
             cache.put(few, clearance, floor, walls, origin)
         clear = is_clear_of_planes(points, clearance, floor, walls)

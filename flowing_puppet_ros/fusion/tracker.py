@@ -185,7 +185,7 @@ class FusedTracker:
         self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints], stamp: int
     ) -> tuple[list[_TrackJob], Bools]:
         """Return what everybody is tracked with, and which points (N,) are anybody's."""
-        clear, floor = self._people.find_clear(cloud.points, self._planes)
+        clear, floor = self._people.find_clear(cloud.points, self._planes, cloud.viewpoint)
         seen = {puppet.id for puppet in puppets}
         known = {identity: track.tracker.predict(stamp) for identity, track in self._tracks.items()}
         alone = {identity: body for identity, body in known.items() if body is not None and identity not in seen}

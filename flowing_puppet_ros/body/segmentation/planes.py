@@ -95,13 +95,15 @@ class PlaneCache:
         self._has_floor, self._clouds_left = floor is not None, self._max_clouds
 
 
-def find_planes(points: np.ndarray, clearance: float) -> tuple[Plane | None, list[Plane]]:
+def find_planes(
+    points: np.ndarray, clearance: float, sensor: np.ndarray | None = None
+) -> tuple[Plane | None, list[Plane]]:
     """Return the floor, None without one, and the walls in points (N, 3) m with z up, evenly downsampled.
 
-    `clearance` is the half thickness of a plane, metres.
+    `clearance` is the half thickness of a plane, metres, and `sensor` (3,) m is above the floor.
     """
     rng = np.random.default_rng(0)
-    floor = find_floor(subsample(points), clearance, rng)
+    floor = find_floor(subsample(points), clearance, rng, sensor)
     walls: list[Plane] = []
     while len(walls) < MAX_WALLS:
         free = points[is_clear_of_planes(points, clearance, floor, walls)]
@@ -125,13 +127,16 @@ def subsample(points: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(points[:: 1 + len(points) // MAX_PLANE_POINTS])
 
 
-def find_floor(points: np.ndarray, clearance: float, rng: np.random.Generator) -> Plane | None:
+def find_floor(
+    points: np.ndarray, clearance: float, rng: np.random.Generator, sensor: np.ndarray | None = None
+) -> Plane | None:
     """Return the nearly level plane that most points lie on and next to none lie below, or None.
 
     Args:
         points: (N, 3) metres, z up, evenly downsampled.
         clearance: half thickness of the plane, metres.
         rng: source of all randomness.
+        sensor: (3,) m, a place above the floor; None where nobody knows.
     """
     normals, offsets = _sample_planes(points, rng)
     normals, offsets = normals * np.sign(normals[:, 2:]), offsets * np.sign(normals[:, 2])
@@ -139,6 +144,8 @@ def find_floor(points: np.ndarray, clearance: float, rng: np.random.Generator) -
     height = points @ normals[level].T - offsets[level]
     count = (np.abs(height) < clearance).sum(axis=0)
     count[(height < -2 * clearance).mean(axis=0) > MAX_BELOW_FLOOR_SHARE] = 0
+    if sensor is not None:
+        count[normals[level] @ sensor < offsets[level] + clearance] = 0
     return _fit_best(points, normals[level], offsets[level], count, clearance, MIN_FLOOR_SIZE_M)
 
 
