@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
+from flowing_puppet_ros.evaluate.scene.lookalikes import add_lookalikes
 from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, MAKERS, MAX_TRIES, Disc, Mesh
 from flowing_puppet_ros.extras import import_extra
 
@@ -45,15 +46,31 @@ class SyntheticScene:
     floor: float
 
 
-def draw_scene(source: BodySource, rng: np.random.Generator, place: str, scanner: str, people: int) -> SyntheticScene:
-    """Draw a scene with `people` standing or walking people and scan it; as many as find a free place are in it."""
+def draw_scene(
+    source: BodySource, rng: np.random.Generator, place: str, scanner: str, people: int, lookalikes: int = 0
+) -> SyntheticScene:
+    """Draw a scene with `people` standing or walking people and scan it; as many as find a free place are in it.
+
+    Beside what every place has, `lookalikes` other things are in it that stand as people do.
+    """
     height = float(rng.uniform(*SENSOR_HEIGHT_M[place]))
-    meshes, blocked = MAKERS[place](rng)
+    meshes, blocked = make_place(rng, place, lookalikes)
     view = np.pi if scanner.startswith("spinning") else MAX_BEARING_RAD
     bodies = place_people(source, rng, place, people, blocked, view)
     points, owner = scan_scene(meshes, [(body.vertices, source.triangles) for body in bodies], rng, scanner, height)
     down = np.array([0.0, 0.0, -height])
     return SyntheticScene(points, owner, [body.translate(down) for body in bodies], -height)
+
+
+def make_place(rng: np.random.Generator, place: str, lookalikes: int) -> tuple[list[Mesh], list[Disc]]:
+    """Make what stands in a place, with `lookalikes` of things that stand as people do, and the places these take.
+
+    Without any, the same random numbers follow.
+    """
+    meshes, blocked = MAKERS[place](rng)
+    if lookalikes:
+        meshes += add_lookalikes(rng.spawn(1)[0], place, blocked, lookalikes)
+    return meshes, blocked
 
 
 def place_people(
