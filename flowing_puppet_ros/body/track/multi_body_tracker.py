@@ -110,7 +110,7 @@ class _BodyTrack:
         """Ask a scan whether it is a person, unless that was asked lately or too little is seen; return its body."""
         if self.belief is None:
             self.belief = PersonBelief(person.middle[:2])
-        self.belief.visit(person.middle)
+        self.belief.visit(person.points, self.stamp)
         if self.belief.is_due(self.stamp) and not self.tracker.hidden:
             judged = judge(person, fit)
             self.belief.add(judged.probability, judged.confidence, self.stamp, len(person.points))
