@@ -13,6 +13,7 @@ from flowing_puppet_ros.evaluate.scene.synthetic_scenes import (
     MAX_BEARING_RAD,
     SENSOR_HEIGHT_M,
     SyntheticScene,
+    cover_people,
     is_upright,
     make_place,
     place_people,
@@ -34,10 +35,12 @@ def draw_sequence(
     people: int,
     scans: int,
     lookalikes: int = 0,
+    covered: float = 0.0,
 ) -> Iterator[SyntheticScene]:
     """Draw `scans` scans, 0.1 s apart, of one place with people of whom most walk; the sensor stands still.
 
-    The others stand as people in motion capture do, who sway. `lookalikes` as in `draw_scene`.
+    The others stand as people in motion capture do, who sway. `lookalikes` as in `draw_scene`, and of those who stand a
+    share `covered`.
     """
     height = float(rng.uniform(*SENSOR_HEIGHT_M[place]))
     meshes, blocked = make_place(rng, place, lookalikes)
@@ -48,6 +51,8 @@ def draw_sequence(
         walked = _draw_walk(source, rng, place, body, blocked, scans) if rng.random() < WALKING_SHARE else None
         # Their own random numbers: whoever walks does so alike, whether those who stand sway or not.
         motions.append(walked or source.sway(rng.spawn(1)[0], body, scans, RATE_HZ))
+        if covered and walked is None:
+            meshes += cover_people(rng.spawn(1)[0], [body], covered)
     down = np.array([0.0, 0.0, -height])
     for number in range(scans):
         bodies = [motion[number] for motion in motions]
