@@ -21,6 +21,7 @@ MIN_MOVE_M = 0.5  # from the first place on, which furniture does not get by the
 EVERY_SCAN, LATER_NS = 6, 1_000_000_000
 """Scans of which each is asked, and time between those asked later on."""
 MIN_ODDS = 0.02
+MIN_FACING_SCANS = 4  # asked, the first one included, until somebody who stands is turned round
 MIN_WANDER_SCANS, MAX_WANDER_SCANS, MAX_GAP_NS = 30, 60, 300_000_000
 """Scans that show whether something sways, after which that is looked at anew, and time between two of them beyond
 which they do not show it."""
@@ -76,6 +77,7 @@ class PersonBelief:
         moved: whether it was far from its first place.
         shown: whether it ever was taken for a person.
         wander: whether it sways.
+        backward: metres, by how much the scans that were asked prefer a body that is turned round.
     """
 
     first: F64
@@ -87,6 +89,7 @@ class PersonBelief:
     moved: bool = False
     shown: bool = False
     wander: Wander = field(default_factory=Wander)
+    backward: float = 0.0
 
     def is_due(self, stamp: int) -> bool:
         """Return whether the scan of a stamp in nanoseconds should be asked."""
@@ -104,6 +107,19 @@ class PersonBelief:
         place = np.median(points, axis=0)
         self.wander.add(points.mean(axis=0), stamp)
         self.moved = self.moved or bool(np.hypot(*(place[:2] - self.first)) > MIN_MOVE_M)
+
+    @property
+    def asks_facing(self) -> bool:
+        """Whether the next scan should be asked which way somebody faces: a few are, unless a walk shows it."""
+        return not self.moved and self.count < EVERY_SCAN
+
+    def turns(self, preference: float) -> bool:
+        """Take by how much a scan prefers a body that is turned round, in metres, and return whether it should be."""
+        self.backward += preference
+        if self.count < MIN_FACING_SCANS or self.backward < 0:
+            return False
+        self.backward = -self.backward
+        return True
 
     @property
     def probability(self) -> float:

@@ -215,8 +215,10 @@ class PersonFinder:
         return [(judged, replace(candidate, rows=rows[candidate.rows])) for judged, candidate in found]
 
     @one_blas_thread()
-    def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> JudgedFit:
+    def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit, turn: bool = False) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
+
+        With `turn` also about one that faces the other way.
 
         Points of other people count neither for nor against it. Where it explains few points badly, a new upright body
         may be better, and is returned instead. What is rejected is remembered as by `find`.
@@ -237,6 +239,10 @@ class PersonFinder:
             judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
             self._rejected.add(candidate, person.stamp)
+        elif turn and judged.fit is fit:
+            ahead = self.upright.refine([(0.0, fit.state)], cloud, candidate.floor)
+            turned = self.upright.turn_round(fit.state, cloud, candidate.floor)
+            return replace(judged, turned=(turned.fit, ahead.score - turned.score))
         return judged
 
     @one_blas_thread()

@@ -85,3 +85,15 @@ def test_noise_has_a_ratio_of_one_and_a_slow_motion_a_larger_one() -> None:
     phase = 2 * np.pi * np.arange(4000) / 40
     expected = 0.5 / np.sin(np.pi / 40) ** 2
     assert abs(measure_wander(np.column_stack([np.sin(phase)] * 3)) / expected - 1) < 0.01
+
+
+def test_several_scans_decide_which_way_somebody_faces_and_turn_once() -> None:
+    belief = PersonBelief(np.zeros(2))
+    turned = []
+    for preference in (0.004, -0.001, 0.003, -0.002, -0.001):
+        belief.add(0.9, 0.5, belief.asked + TENTH, 60)
+        turned.append(belief.turns(preference))
+    assert turned == [False, False, False, True, False]
+    assert belief.asks_facing
+    belief.visit(np.array([[0.6, 0.0, 1.0]]), 0)  # a walk shows it
+    assert not belief.asks_facing

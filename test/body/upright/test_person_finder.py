@@ -146,3 +146,8 @@ def test_a_full_fit_that_faces_the_other_way_does_not_turn_the_body(scan: tuple[
     chosen = finder.choose_facing(body.person, body.fit, turned)
     assert chosen.state.rotation[0, :2, 0] @ ahead > 0
     assert finder.choose_facing(body.person, body.fit, body.fit) is body.fit
+    assert body.person.rows is not None
+    judged = finder.judge(body.person, body.person.rows, turned, turn=True)
+    assert judged.turned is not None and judged.turned[1] > 0
+    assert judged.turned[0].state.rotation[0, :2, 0] @ ahead > 0
+    assert finder.judge(body.person, body.person.rows, body.fit).turned is None

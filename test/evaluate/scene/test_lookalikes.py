@@ -4,8 +4,10 @@
 import numpy as np
 import pytest
 
+from flowing_puppet_ros.evaluate.body.synthetic_bodies import TrueBody
 from flowing_puppet_ros.evaluate.scene.lookalikes import KINDS, turn_profile
-from flowing_puppet_ros.evaluate.scene.synthetic_scenes import make_place
+from flowing_puppet_ros.evaluate.scene.scene_meshes import make_prism
+from flowing_puppet_ros.evaluate.scene.synthetic_scenes import cover_people, make_place, scan_scene
 
 
 def measure_volume(vertices: np.ndarray, triangles: np.ndarray) -> float:
@@ -36,3 +38,17 @@ def test_scenes_without_lookalikes_are_as_before() -> None:
     assert all(np.array_equal(a[0], b[0]) for a, b in zip(meshes, crowded, strict=False))
     assert len(crowded) >= len(meshes) + 5 and len(taken) == len(blocked) + 5
     assert plain.random() == more.random()
+
+
+def test_what_covers_somebody_stands_between_and_hides_the_legs() -> None:
+    vertices, triangles = make_prism((5.0, 1.0), 0.2, 0, 1.7)
+    person = TrueBody(vertices, np.array([[5.0, 1.0, 0.9]]), hard=False, stature=1.7)
+    low, high = [], []
+    for boxes in ([], cover_people(np.random.default_rng(1), [person], 1.0)):
+        points, owner = scan_scene(boxes, [(vertices, triangles)], np.random.default_rng(0), "spinning-64", 1.5)
+        height = points[owner == 0, 2] + 1.5
+        low.append(int((height < 0.3).sum()))
+        high.append(int((height > 1.55).sum()))
+    assert low[0] > 20 and low[1] == 0
+    assert high[0] == high[1] > 20
+    assert not cover_people(np.random.default_rng(1), [person], 0.0)
