@@ -309,7 +309,10 @@ class PersonFinder:
         if worthwhile and len(starts) > 1:
             others = self.upright.refine(starts[1:], cloud, candidate.floor)
             if others.score < first.score:
-                judged = weigh(others)
+                other = weigh(others)
+                # Who is a person by one of both is one.
+                if other.probability >= min(judged.probability, self._settings.min_probability):
+                    judged = other
         return judged
 
 
