@@ -112,7 +112,7 @@ class _BodyTrack:
             self.belief = PersonBelief(person.middle[:2])
         self.belief.visit(person.points, self.stamp)
         if self.belief.is_due(self.stamp) and not self.tracker.hidden:
-            judged = judge(person, fit, self.belief.asks_facing)
+            judged = judge(person, fit, self.belief.asks_facing(len(person.points)))
             self.belief.add(judged.probability, judged.confidence, self.stamp, len(person.points))
             if judged.turned is not None and self.belief.turns(judged.turned[1]):
                 self.tracker.start(person, judged.turned[0])

@@ -21,7 +21,7 @@ MIN_MOVE_M = 0.5  # from the first place on, which furniture does not get by the
 EVERY_SCAN, LATER_NS = 6, 1_000_000_000
 """Scans of which each is asked, and time between those asked later on."""
 MIN_ODDS = 0.02
-MIN_FACING_SCANS = 4  # asked, the first one included, until somebody who stands is turned round
+FACING_SCANS = 4  # asked, the first one included, that decide together whether somebody is turned round
 MIN_WANDER_SCANS, MAX_WANDER_SCANS, MAX_GAP_NS = 30, 60, 300_000_000
 """Scans that show whether something sways, after which that is looked at anew, and time between two of them beyond
 which they do not show it."""
@@ -108,15 +108,17 @@ class PersonBelief:
         self.wander.add(points.mean(axis=0), stamp)
         self.moved = self.moved or bool(np.hypot(*(place[:2] - self.first)) > MIN_MOVE_M)
 
-    @property
-    def asks_facing(self) -> bool:
-        """Whether the next scan should be asked which way somebody faces: a few are, unless a walk shows it."""
-        return not self.moved and self.count < EVERY_SCAN
+    def asks_facing(self, points: int) -> bool:
+        """Return whether the next scan should be asked which way somebody faces, with so many points.
+
+        The first scans are, unless a walk shows it; many points are seldom wrong, and a body takes longer on them.
+        """
+        return not self.moved and self.count < FACING_SCANS and points < MIN_MANY_POINTS
 
     def turns(self, preference: float) -> bool:
         """Take by how much a scan prefers a body that is turned round, in metres, and return whether it should be."""
         self.backward += preference
-        if self.count < MIN_FACING_SCANS or self.backward < 0:
+        if self.count < FACING_SCANS or self.backward < 0:
             return False
         self.backward = -self.backward
         return True

@@ -90,10 +90,12 @@ def test_noise_has_a_ratio_of_one_and_a_slow_motion_a_larger_one() -> None:
 def test_several_scans_decide_which_way_somebody_faces_and_turn_once() -> None:
     belief = PersonBelief(np.zeros(2))
     turned = []
-    for preference in (0.004, -0.001, 0.003, -0.002, -0.001):
+    for preference in (0.004, -0.001, 0.003, -0.002):
+        assert belief.asks_facing(60) and not belief.asks_facing(600)
         belief.add(0.9, 0.5, belief.asked + TENTH, 60)
         turned.append(belief.turns(preference))
-    assert turned == [False, False, False, True, False]
-    assert belief.asks_facing
-    belief.visit(np.array([[0.6, 0.0, 1.0]]), 0)  # a walk shows it
-    assert not belief.asks_facing
+    assert turned == [False, False, False, True]
+    assert not belief.asks_facing(60)
+    walking = PersonBelief(np.zeros(2))
+    walking.visit(np.array([[0.6, 0.0, 1.0]]), 0)  # a walk shows it
+    assert not walking.asks_facing(60)
