@@ -55,7 +55,7 @@ class FitterSettings(Settings):
 class SegmentationSettings(Settings):
     """Settings of `segment_people`."""
 
-    max_people: int = setting(20, "maximum number of people taken from a cloud, by score", low=1, high=100)
+    max_people: int = setting(30, "maximum number of people taken from a cloud, by score", low=1, high=100)
     max_range: float = setting(
         30.0, "distance from the sensor beyond which points are dropped", unit="m", low=0.5, high=1000.0
     )

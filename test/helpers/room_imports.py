@@ -274,7 +274,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "learn.detector": {"evidence.image", "image.detector", "image.formats", "learn", "model", "model.ds"},
     "learn.ds": {"learn.anny", "model", "model.ds"},
     "learn.likelihood": {"evidence.image", "image.formats", "learn", "model", "model.ds"},
-    "learn.people": {"body", "body.fit", "body.scans", "body.segmentation", "body.upright", "model"},
+    "learn.people": {"body", "body.cloud", "body.fit", "body.scans", "body.segmentation", "body.upright", "model"},
     "learn.sp": {"learn.anny", "model"},
     "learn.thesis_loop": {
         "evidence.image",

@@ -48,8 +48,8 @@ BODY_STRIDE = 8  # every so many vertices stand for a body
 AT_ONCE_INTERVAL_NS = 1_000_000_000  # between attempts at one: people soon stand otherwise
 MAX_FITS_AT_ONCE = 4  # new people in one cloud of a live stream who have a body in it
 
-Judge = Callable[[PersonCloud, BodyFit], JudgedFit]
-"""What a scan says about a body, or about a better one that it has instead."""
+Judge = Callable[[PersonCloud, BodyFit, bool], JudgedFit]
+"""What a scan says about a body, or about a better one that it has instead; if wanted, also about one turned round."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +110,14 @@ class _BodyTrack:
         """Ask a scan whether it is a person, unless that was asked lately or too little is seen; return its body."""
         if self.belief is None:
             self.belief = PersonBelief(person.middle[:2])
-        self.belief.visit(person.middle)
+        self.belief.visit(person.points, self.stamp)
         if self.belief.is_due(self.stamp) and not self.tracker.hidden:
-            judged = judge(person, fit)
+            judged = judge(person, fit, self.belief.asks_facing(len(person.points)))
             self.belief.add(judged.probability, judged.confidence, self.stamp, len(person.points))
+            if judged.turned is not None and self.belief.turns(judged.turned[1]):
+                self.tracker.start(person, judged.turned[0])
+                self.motion.allow_turn()
+                return judged.turned[0]
             if judged.fit is not fit:
                 self.tracker.start(person, judged.fit)
             return judged.fit

@@ -253,10 +253,10 @@ class SceneTracker:
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
 
-    def _judge(self, person: PersonCloud, fit: BodyFit) -> JudgedFit:
+    def _judge(self, person: PersonCloud, fit: BodyFit, turn: bool) -> JudgedFit:
         """Return what the cloud that was searched last says about a body: see `PersonFinder.judge`."""
         assert person.rows is not None
-        return self._finder.judge(person, np.searchsorted(self._searched, np.sort(person.rows)), fit)
+        return self._finder.judge(person, np.searchsorted(self._searched, np.sort(person.rows)), fit, turn)
 
     def _improve(
         self, person: PersonCloud, fit: BodyFit | None, seed: int, progress: Progress | None = None

@@ -29,11 +29,15 @@ class FoundBody:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JudgedFit:
-    """A body: the `probability` that it is a person, and the `confidence` that it is one and close."""
+    """A body: the `probability` that it is a person, and the `confidence` that it is one and close.
+
+    Where it was asked for, `turned` is the body that faces the other way, and by how much that is better (m).
+    """
 
     probability: float
     confidence: float
     fit: BodyFit
+    turned: tuple[BodyFit, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -215,8 +215,10 @@ class PersonFinder:
         return [(judged, replace(candidate, rows=rows[candidate.rows])) for judged, candidate in found]
 
     @one_blas_thread()
-    def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit) -> JudgedFit:
+    def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit, turn: bool = False) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
+
+        With `turn` also about one that faces the other way.
 
         Points of other people count neither for nor against it. Where it explains few points badly, a new upright body
         may be better, and is returned instead. What is rejected is remembered as by `find`.
@@ -226,19 +228,21 @@ class PersonFinder:
         view, rows = self._view.leave_to(rows, self._owned)
         rays, candidate = view.rays, Candidate.of(view.scene, rows)
         window = rays.find_window(person.points)
-        shape = describe_candidates([candidate], view.scene, rays.viewpoint)
-        probability = float(PersonModel.load().trees.predict(shape)[0])
         try:
             cloud = self.upright.make_cloud(person.points, rays.viewpoint, rays.find_unknown(person.points, window))
         except InputError:  # the sensor stands in it
             return JudgedFit(0.0, 0.0, fit)
-        judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, probability, view, window)
+        judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, view, window)
         if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
             other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0])
-            again = self._weigh(other, cloud, candidate, probability, view, window)
+            again = self._weigh(other, cloud, candidate, view, window)
             judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
             self._rejected.add(candidate, person.stamp)
+        elif turn and judged.fit is fit:
+            ahead = self.upright.refine([(0.0, fit.state)], cloud, candidate.floor)
+            turned = self.upright.turn_round(fit.state, cloud, candidate.floor)
+            return replace(judged, turned=(turned.fit, ahead.score - turned.score))
         return judged
 
     @one_blas_thread()
@@ -254,14 +258,13 @@ class PersonFinder:
         found: UprightFit,
         cloud: SingleViewCloud,
         candidate: Candidate,
-        probability: float,
         view: ScanView,
         window: np.ndarray,
     ) -> JudgedFit:
-        evidence = weigh_fit(found, cloud, candidate.rows, view.scene, view.rays, window, self._fitter.model)
+        evidence = weigh_fit(found, cloud, candidate, view.scene, view.rays, window, self._fitter.model)
         model = PersonModel.load()
         odds = COME_ODDS if view.has_come(candidate) else 0.0
-        likely = 0.0 if evidence.between_others else model.combine(probability, evidence, odds)
+        likely = 0.0 if evidence.between_others else model.judge_fit(evidence, odds)
         return JudgedFit(likely, model.rate(likely, evidence), found.fit)
 
     def _may_be_bent(self, candidate: Candidate, scene: SceneHeights, probability: float) -> bool:
@@ -297,7 +300,7 @@ class PersonFinder:
             return None
 
         def weigh(found: UprightFit) -> JudgedFit:
-            return self._weigh(found, cloud, candidate, probability, view, window)
+            return self._weigh(found, cloud, candidate, view, window)
 
         starts = self.upright.find_rough(cloud, candidate.floor)
         first = self.upright.refine(starts[:1], cloud, candidate.floor)
@@ -306,7 +309,10 @@ class PersonFinder:
         if worthwhile and len(starts) > 1:
             others = self.upright.refine(starts[1:], cloud, candidate.floor)
             if others.score < first.score:
-                judged = weigh(others)
+                other = weigh(others)
+                # Who is a person by one of both is one.
+                if other.probability >= min(judged.probability, self._settings.min_probability):
+                    judged = other
         return judged
 
 

@@ -14,9 +14,6 @@ from flowing_puppet_ros.body.upright.verification import EVIDENCE_NAMES, FitEvid
 from flowing_puppet_ros.model import weights
 
 MODEL = "clouds"  # name of the shipped file
-SHAPE_SHARE = 0.5
-"""Share of the filter's log odds that counts beside the judge's: in the places where both were learned the filter
-looks better than it is elsewhere."""
 MIN_ODDS, MAX_ODDS = 0.02, 0.98  # of each forest
 ACCURACY_NAMES = ("cost", "distance", "supported", "explained", "hidden", "log_points", "confidence", "stature")
 """Evidence that tells how close the joints are."""
@@ -71,14 +68,14 @@ class PersonModel:
     Attributes:
         trees: of the filter, over what a candidate looks like.
         judge: trees over the evidence of a fit.
-        fusion: (2,) by which the judge's log odds count, and a constant.
+        calibration: (2,) by which the judge's log odds count, and a constant.
         accuracy: (len(ACCURACY_NAMES) + 1,) weights of evidence, and a constant: log odds that the joints of a person
             are within 10 cm in the mean.
     """
 
     trees: DecisionTrees
     judge: DecisionTrees
-    fusion: np.ndarray
+    calibration: np.ndarray
     accuracy: np.ndarray
 
     @classmethod
@@ -91,20 +88,20 @@ class PersonModel:
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PersonModel:
         """Take the arrays of a file."""
         filters, judge = (DecisionTrees.from_arrays(arrays, name) for name in ("trees", "judge"))
-        return cls(filters, judge, arrays["fusion"], arrays["accuracy"])
+        return cls(filters, judge, arrays["calibration"], arrays["accuracy"])
 
     def to_arrays(self) -> dict[str, np.ndarray]:
         """Return what `from_arrays` takes."""
         return (
             self.trees.to_arrays("trees")
             | self.judge.to_arrays("judge")
-            | {"fusion": self.fusion, "accuracy": self.accuracy}
+            | {"calibration": self.calibration, "accuracy": self.accuracy}
         )
 
-    def combine(self, shape_probability: float, evidence: FitEvidence, odds: float = 0.0) -> float:
-        """Return the probability of a person by the filter, the fit's evidence, and other log odds."""
+    def judge_fit(self, evidence: FitEvidence, odds: float = 0.0) -> float:
+        """Return the probability of a person by the evidence of a fit, and by other log odds."""
         judged = log_odds(self.judge.predict(evidence.values[None])[0])
-        return float(_logistic(weigh_odds(log_odds(shape_probability), judged, self.fusion) + odds))
+        return float(_logistic(calibrate_odds(judged, self.calibration) + odds))
 
     def rate(self, probability: float, evidence: FitEvidence) -> float:
         """Return the probability that a body is a person whose joints are within 10 cm in the mean."""
@@ -117,9 +114,9 @@ def log_odds(probability: np.ndarray | float) -> np.ndarray:
     return np.asarray(np.log(odds / (1 - odds)))
 
 
-def weigh_odds(shape: np.ndarray, judged: np.ndarray, fusion: np.ndarray) -> np.ndarray:
-    """Return the log odds of a person by those of the filter and of the judge."""
-    return np.asarray(SHAPE_SHARE * shape + fusion[0] * judged + fusion[1])
+def calibrate_odds(judged: np.ndarray, calibration: np.ndarray) -> np.ndarray:
+    """Return the log odds of a person by those of the judge."""
+    return np.asarray(calibration[0] * judged + calibration[1])
 
 
 def select_accuracy(evidence: np.ndarray) -> np.ndarray:

@@ -21,10 +21,13 @@ from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 from flowing_puppet_ros.process.threads import one_blas_thread
 
 POSES, YAWS, SHAPE_SCALE = 120, 16, 0.7
-MIN_STRAIGHT_KNEE_RAD, MIN_OTHER_KNEE_RAD = np.radians(150.0), np.radians(95.0)
-MAX_TRUNK_TILT_RAD, MAX_STRIDE_M = np.radians(22.0), 0.35
-"""What makes a drawn body upright: knees, tilt of the trunk, distance of the ankles before each other; hands below the
-neck."""
+MIN_STRAIGHT_KNEE_RAD, MIN_OTHER_KNEE_RAD = np.radians(140.0), np.radians(95.0)
+MAX_TRUNK_TILT_RAD, MAX_STRIDE_M, MAX_BALANCE_M = np.radians(25.0), 0.6, 0.25
+"""What makes a drawn body upright: knees, tilt of the trunk, distance of the ankles before each other and of the middle
+between them from below the hips; hands below the neck."""
+LEAN_RAD, LEAN_DEVIATION_RAD = np.radians(2.0), np.radians(7.0)
+"""Lean of the trunk ahead, and its deviation ahead and to the sides, of people in motion capture who stand or walk; the
+model draws all trunks upright."""
 MEAN_STATURE_M, STATURE_DEVIATION_M, STATURE_COST_M = 1.72, 0.1, 0.002
 """Statures of people, and the mean distance that one squared deviation from them is worth."""
 ROUGH_POINTS, FINE_POINTS = 90, 300  # surface points of a body
@@ -140,9 +143,10 @@ def _draw_bodies(model: StitchedPuppet, rng: np.random.Generator) -> Iterator[tu
     """Draw bodies and their vertices (V, 3) without end, many at a time, which takes a tenth of the time."""
     while True:
         bodies = model.sample_many(rng, POSES, shape_scale=SHAPE_SCALE)
-        arrays = (bodies.center, bodies.rotation, bodies.pose, bodies.shape, model.vertices(bodies))
-        for center, rotation, pose, shape, vertices in zip(*arrays, strict=True):
-            yield BodyState(center, rotation, pose, shape), vertices
+        lean = LEAN_DEVIATION_RAD * rng.standard_normal((POSES, 3)) * [1.0, 1.0, 0.0] + [0.0, LEAN_RAD, 0.0]
+        arrays = (bodies.center, bodies.rotation, bodies.pose, bodies.shape, model.vertices(bodies), so3.exp(lean))
+        for center, rotation, pose, shape, vertices, turn in zip(*arrays, strict=True):
+            yield BodyState(center @ turn.T, turn @ rotation, pose, shape), vertices @ turn.T
 
 
 def _is_upright(joints: dict[str, np.ndarray]) -> bool:
@@ -154,12 +158,14 @@ def _is_upright(joints: dict[str, np.ndarray]) -> bool:
     )
     # The drawn body's torso faces along x, but its trunk need not be upright.
     stride = abs(joints["left_ankle"][0] - joints["right_ankle"][0])
+    balance = (joints["left_ankle"] + joints["right_ankle"]) / 2 - hips
     hands = max(joints["left_wrist"][2], joints["right_wrist"][2])
     return bool(
         trunk[2] > np.cos(MAX_TRUNK_TILT_RAD) * np.linalg.norm(trunk)
         and knees[0] > MIN_OTHER_KNEE_RAD
         and knees[1] > MIN_STRAIGHT_KNEE_RAD
         and stride < MAX_STRIDE_M
+        and np.hypot(*balance[:2]) < MAX_BALANCE_M
         and hands < neck[2]
     )
 

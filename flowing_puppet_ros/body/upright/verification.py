@@ -9,7 +9,8 @@ import numpy as np
 
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
-from flowing_puppet_ros.body.segmentation.candidates import SceneHeights
+from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights
+from flowing_puppet_ros.body.upright.candidate_shape import SHAPE_NAMES, describe_candidates
 from flowing_puppet_ros.body.upright.scan_rays import BANDS, ScanRays
 from flowing_puppet_ros.body.upright.upright_bank import stature_cost
 from flowing_puppet_ros.body.upright.upright_fit import UprightFit
@@ -31,7 +32,7 @@ UNSEEN = -1.0  # in place of a share of no rays
 EVIDENCE_NAMES = (
     "cost", "distance", "supported", "explained", "foreign", "hidden", "log_points", "confidence", "outline",
     "stature", "crown", "shape", *(f"supported_{k}" for k in range(BANDS)), *(f"outline_{k}" for k in range(BANDS)),
-    "close", "alignment",
+    "close", "alignment", *SHAPE_NAMES,
 )  # fmt: skip
 
 
@@ -46,7 +47,8 @@ class FitEvidence:
     points; confidence, of the fit; outline, the share of the rays just left and right of the body that end behind it;
     stature, what it costs; crown, points over the head, for each of the candidate's; shape, how unusual the shape is;
     supported and outline for the legs, the trunk, and head and shoulders; close, as explained, within a smaller
-    distance; and alignment, the mean cosine of the cloud's normals and the body's.
+    distance; alignment, the mean cosine of the cloud's normals and the body's; and what the candidate looks like, by
+    which a coat stand is told from a person whom it would fit.
     """
 
     values: np.ndarray
@@ -61,22 +63,22 @@ class FitEvidence:
 def weigh_fit(
     found: UprightFit,
     cloud: SingleViewCloud,
-    rows: np.ndarray,
+    candidate: Candidate,
     scene: SceneHeights,
     rays: ScanRays,
     window: np.ndarray,
     model: StitchedPuppet,
 ) -> FitEvidence:
-    """Compare a body with the points it was fitted to, the column about it, and the rays of the scan.
+    """Compare a body with the candidate it was fitted to, the column about it, and the rays of the scan.
 
-    The points are the `rows` (N,) of the scene, and `cloud` some of them; `window` (M,) are the rays near the body.
+    `cloud` are some of the candidate's points; `window` (M,) are the rays near the body.
     """
     fit, vertices = found.fit, found.fit.vertices
     normals = vertex_normals(vertices, model.faces)
     count = rays.compare(window, vertices, normals)
     index = NearestPoints(vertices)
     nearest = index.query(cloud.points)[1]
-    distance = index.query(scene.points[rows])[0]
+    distance = index.query(scene.points[candidate.rows])[0]
     middle = vertices[:, :2].mean(axis=0)
     near, away = scene.index.find_near(scene.points, middle, COLUMN_RADIUS_M)
     height = scene.height[near]
@@ -92,16 +94,17 @@ def weigh_fit(
         float((distance < EXPLAINED_M).mean()),
         foreign,
         _share(total[2], sum(total[:3])),
-        float(np.log(len(rows))),
+        float(np.log(len(candidate.rows))),
         fit.confidence,
         _share(total[3], total[4]),
         float(stature_cost(np.array(found.stature))),
-        min(float(crown) / len(rows), MAX_CROWN_SHARE),
+        min(float(crown) / len(candidate.rows), MAX_CROWN_SHARE),
         float(np.sqrt((fit.state.shape**2).mean())),
         *(_share(count.on[k], count.on[k] + count.behind[k]) for k in range(BANDS)),
         *(_share(count.free[k], count.beside[k]) for k in range(BANDS)),
         float((distance < CLOSE_M).mean()),
         float((cloud.normals * normals[nearest]).sum(axis=1).mean()),
+        *describe_candidates([candidate], scene, rays.viewpoint)[0],
     ]
     return FitEvidence(np.array(values, dtype=np.float64))
 

@@ -21,6 +21,9 @@ TILT_DEVIATION = np.radians(8.0)  # rad, of the pelvis from upright, about each 
 MOCAP_RATE_HZ = 20.0
 MOCAP_UNIT_M = 0.0254 / 0.45
 MIN_SPEED_M = 0.01  # mean motion of a joint per frame; slower motion capture does not test tracking
+STANDING_BONES, MAX_STANDING_M = ("LeftFoot", "RightFoot", "Hips"), 0.15
+"""Bones of people who stand, and how far from their first place these are at most."""
+STANDING_WINDOWS = 5  # of motion capture, of which the one that moves least is taken
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,6 +36,7 @@ class TrueBody:
         hard: whether the pose was drawn from joint limits alone, not from motion capture.
         stature: m, of the person standing.
         rest: the same person in Anny's rest pose.
+        pose: (B, 3, 3) rotations of the bones; None where they are not known.
     """
 
     vertices: np.ndarray
@@ -40,6 +44,7 @@ class TrueBody:
     hard: bool
     stature: float
     rest: RestBody | None = None
+    pose: np.ndarray | None = None
 
     def template_vertices(self, model_name: str) -> np.ndarray:
         """Return the true positions (V, 3) m of the vertices of the shipped Stitched Puppet `model_name`."""
@@ -125,11 +130,58 @@ class BodySource:
         down = np.array([0.0, 0.0, -min(float(body.vertices[:, 2].min()) for body in bodies)])
         return [body.translate(down) for body in bodies]
 
+    def sway(self, rng: np.random.Generator, body: TrueBody, frames: int, rate: float) -> list[TrueBody]:
+        """Return a body that stands there for `frames` frames at `rate` Hz, moving as little as people who stand do.
+
+        What motion capture of one of them does to each joint is done to the body's, to and fro where it is too short.
+        InputError if nobody stands in the motion capture.
+        """
+        turns, steps = self._draw_standing(rng, 2 + int(np.ceil((frames - 1) * MOCAP_RATE_HZ / rate)))
+        assert body.rest is not None and body.pose is not None
+        start = self._pose(body.rest, body.pose, np.zeros(3), body.hard)
+        place = (body.joints - start.joints).mean(axis=0)
+        low = float(body.vertices[:, 2].min())
+        bodies = []
+        for key in np.round(np.arange(frames) * MOCAP_RATE_HZ / rate).astype(np.int64):
+            period = max(2 * len(turns) - 2, 1)
+            key = min(key % period, period - key % period)
+            moved = self._pose(body.rest, body.pose @ turns[key], place + body.pose[0] @ steps[key], body.hard)
+            bodies.append(moved.translate(np.array([0.0, 0.0, low - float(moved.vertices[:, 2].min())])))
+        return bodies
+
+    def _draw_standing(self, rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+        """Draw how bones turn (K, B, 3, 3) from the first frame on, and where the pelvis goes (K, 3) m in its frame.
+
+        K is `count` or as many frames as there are.
+        """
+        rest = self._anny.make_rest_body(self._anny.mean_phenotype())
+        feet = [self.bone_names.index(name) for name in STANDING_BONES]
+        found = []
+        for sequence in rng.permutation(np.array(self._read_sequences(), dtype=object)):
+            size = min(count, len(sequence))
+            start = int(rng.integers(0, len(sequence) - size + 1))
+            poses, places = self._retarget(sequence[start : start + size])
+            bones = self._anny.pose(rest, poses, np.arange(1))[1] + places[:, None]
+            away = np.linalg.norm(bones[:, feet] - bones[:1, feet], axis=2).max()
+            if size >= min(count, MOCAP_RATE_HZ) and away < MAX_STANDING_M:
+                found.append((float(np.linalg.norm(np.diff(bones, axis=0), axis=2).mean()), poses, places))
+            if len(found) == STANDING_WINDOWS:
+                break
+        if not found:
+            raise InputError(f"nobody stands in {self._mocap}; give motion capture of people who do")
+        _, poses, places = min(found, key=lambda each: each[0])
+        return np.swapaxes(poses[0], -1, -2) @ poses, (places - places[0]) @ poses[0, 0]
+
     def _pose(self, rest: RestBody, pose: np.ndarray, place: np.ndarray, hard: bool) -> TrueBody:
         vertices, bones = self._anny.pose(rest, pose)
         named = self._anny.locate_landmarks(vertices, bones)
         return TrueBody(
-            vertices + place, np.stack([named[name] for name in self.joint_names]) + place, hard, rest.stature, rest
+            vertices + place,
+            np.stack([named[name] for name in self.joint_names]) + place,
+            hard,
+            rest.stature,
+            rest,
+            pose,
         )
 
     def _draw_sequence(self, rng: np.random.Generator, count: int, min_speed: float) -> tuple[np.ndarray, np.ndarray]:
@@ -138,16 +190,20 @@ class BodySource:
             if len(sequence) < count:
                 continue
             start = int(rng.integers(0, len(sequence) - count + 1))
-            frames = np.asarray(sequence[start : start + count], dtype=np.float64)
-            poses = self._sampler.retarget(frames[:, 3:].reshape((-1, MOCAP_JOINTS, 3)))
-            pelvis = np.swapaxes(rotation.exp(frames[:, 3:6]), -1, -2)
-            poses[:, 0] = FROM_MOCAP @ pelvis @ FROM_MOCAP.T
-            places = (frames[:, :3] - frames[0, :3]) @ FROM_MOCAP.T * MOCAP_UNIT_M
+            poses, places = self._retarget(sequence[start : start + count])
             if self._mean_speed(poses, places) > min_speed:
                 return poses, places
         raise InputError(
             f"{self._mocap} holds no motion of {count} frames that is fast enough; give longer motion capture"
         )
+
+    def _retarget(self, sequence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return bone rotations (K, B, 3, 3), pelvis included, and positions (K, 3) m from the first on, of frames."""
+        frames = np.asarray(sequence, dtype=np.float64)
+        poses = self._sampler.retarget(frames[:, 3:].reshape((-1, MOCAP_JOINTS, 3)))
+        pelvis = np.swapaxes(rotation.exp(frames[:, 3:6]), -1, -2)
+        poses[:, 0] = FROM_MOCAP @ pelvis @ FROM_MOCAP.T
+        return poses, (frames[:, :3] - frames[0, :3]) @ FROM_MOCAP.T * MOCAP_UNIT_M
 
     def _read_sequences(self) -> list[np.ndarray]:
         if self._mocap is None:

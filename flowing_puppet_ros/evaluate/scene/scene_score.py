@@ -15,6 +15,7 @@ MATCH_DISTANCE_M = 0.5  # between a body's middle and a label's, beyond which th
 POINT_BINS = ((25, 40), (40, 80), (80, 400), (400, 10**9))
 RANGE_BINS_M = ((0, 5), (5, 10), (10, 20), (20, 30))
 MIN_TOP_M = 1.2  # over the floor, of people who count: others show no head
+MAX_STANDING_M = 0.25  # that somebody who stands strays from the first place
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,10 +31,12 @@ class ReportedPerson:
 
 @dataclass(frozen=True, slots=True)
 class PersonScore:
-    """A labelled person and what was found there; distances in metres, NaN where nothing was found or is known."""
+    """A labelled person at (x, y) and what was found there; metres, NaN where nothing was found or is known."""
 
     scan: str
     person: int
+    x: float
+    y: float
     points: int
     range: float
     counts: bool
@@ -100,9 +103,10 @@ def _bearing(vertices: np.ndarray, sensor: np.ndarray) -> float:
 def _score_person(
     name: str, row: int, person: LabelledPerson, away: float, counts: bool, body: ReportedPerson | None, gap: float
 ) -> PersonScore:
+    x, y = float(person.middle[0]), float(person.middle[1])
     if body is None:
         nothing = (gap, np.nan, np.nan, np.nan, False, np.nan)
-        return PersonScore(name, row, person.points, away, counts, False, "", *nothing)
+        return PersonScore(name, row, x, y, person.points, away, counts, False, "", *nothing)
     top = float(body.vertices[:, 2].max()) - person.floor
     error, flipped = np.nan, False
     names = [joint for joint in person.joints if joint in body.joints]
@@ -113,7 +117,7 @@ def _score_person(
         turned = float(np.linalg.norm(np.array([body.joints[joint] for joint in swapped]) - truth, axis=1).mean())
         flipped = turned < error
     return PersonScore(
-        name, row, person.points, away, counts, True, body.identity, gap, body.stature - person.stature,
+        name, row, x, y, person.points, away, counts, True, body.identity, gap, body.stature - person.stature,
         top - person.top, error, flipped, body.confidence,
     )  # fmt: skip
 
@@ -133,6 +137,7 @@ def summarise_scenes(people: Sequence[PersonScore], ghosts: Sequence[GhostScore]
         "people": len(counted),
         "found": len(found),
         "recall_percent": _percent(counted),
+        "standing_percent": _percent(find_standing(counted)),
         "ghosts_per_scan": len(ghosts) / max(scans, 1),
         "id_switches": count_id_switches(people),
         "place_median_cm": _median(found, "place_error"),
@@ -183,6 +188,19 @@ def count_id_switches(people: Sequence[PersonScore]) -> int:
             switches += last.get(who, person.identity) != person.identity
             last[who] = person.identity
     return switches
+
+
+def find_standing(people: Sequence[PersonScore]) -> list[PersonScore]:
+    """Return those who stand through all scans of a sequence in which they are; see `count_id_switches` for those."""
+    places: dict[tuple[str, int], list[tuple[float, float]]] = {}
+    for person in people:
+        places.setdefault((person.scan.rpartition("-")[0], person.person), []).append((person.x, person.y))
+    standing = {
+        who
+        for who, seen in places.items()
+        if len(seen) > 1 and np.linalg.norm(np.array(seen) - seen[0], axis=1).max() < MAX_STANDING_M
+    }
+    return [person for person in people if (person.scan.rpartition("-")[0], person.person) in standing]
 
 
 def _percent(people: Sequence[PersonScore]) -> float:

@@ -8,12 +8,14 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
-from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, MAKERS, Disc
+from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, Disc
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import (
     MAX_BEARING_RAD,
     SENSOR_HEIGHT_M,
     SyntheticScene,
+    cover_people,
     is_upright,
+    make_place,
     place_people,
     scan_scene,
 )
@@ -26,17 +28,31 @@ BODY_RADIUS_M = 0.3
 
 
 def draw_sequence(
-    source: BodySource, rng: np.random.Generator, place: str, scanner: str, people: int, scans: int
+    source: BodySource,
+    rng: np.random.Generator,
+    place: str,
+    scanner: str,
+    people: int,
+    scans: int,
+    lookalikes: int = 0,
+    covered: float = 0.0,
 ) -> Iterator[SyntheticScene]:
-    """Draw `scans` scans, 0.1 s apart, of one place with people of whom most walk; the sensor stands still."""
+    """Draw `scans` scans, 0.1 s apart, of one place with people of whom most walk; the sensor stands still.
+
+    The others stand as people in motion capture do, who sway. `lookalikes` as in `draw_scene`, and of those who stand a
+    share `covered`.
+    """
     height = float(rng.uniform(*SENSOR_HEIGHT_M[place]))
-    meshes, blocked = MAKERS[place](rng)
+    meshes, blocked = make_place(rng, place, lookalikes)
     view = np.pi if scanner.startswith("spinning") else MAX_BEARING_RAD
     standing = place_people(source, rng, place, people, blocked, view)
     motions: list[list[TrueBody]] = []
     for body in standing:
         walked = _draw_walk(source, rng, place, body, blocked, scans) if rng.random() < WALKING_SHARE else None
-        motions.append(walked or [body] * scans)
+        # Their own random numbers: whoever walks does so alike, whether those who stand sway or not.
+        motions.append(walked or source.sway(rng.spawn(1)[0], body, scans, RATE_HZ))
+        if covered and walked is None:
+            meshes += cover_people(rng.spawn(1)[0], [body], covered)
     down = np.array([0.0, 0.0, -height])
     for number in range(scans):
         bodies = [motion[number] for motion in motions]

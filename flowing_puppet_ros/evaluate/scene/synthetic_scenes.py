@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
-from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, MAKERS, MAX_TRIES, Disc, Mesh
+from flowing_puppet_ros.evaluate.scene.lookalikes import add_lookalikes
+from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, MAKERS, MAX_TRIES, Disc, Mesh, stand_box
 from flowing_puppet_ros.extras import import_extra
 
 PLACES = ("room", "street", "hall")
@@ -24,6 +25,8 @@ MIN_PERSON_GAP_M = 0.55  # between the middles of two people
 MAX_RANGE_M = 60.0  # of the scanners
 MAX_TRUNK_TILT_RAD, MIN_UPRIGHT_SHARE = np.radians(35.0), 0.85
 """Tilt of the trunk, and height over the stature, of people who stand or walk."""
+MIN_COVER_M, MAX_COVER_M, COVER_GAP_M = (0.3, 1.0, 0.6), (1.8, 4.0, 1.4), 0.5
+"""Depth, width and height of what stands before people who are covered, and how far from their middle."""
 
 MAX_BEARING_RAD = 0.5  # of people before scanners that look ahead only
 
@@ -45,15 +48,52 @@ class SyntheticScene:
     floor: float
 
 
-def draw_scene(source: BodySource, rng: np.random.Generator, place: str, scanner: str, people: int) -> SyntheticScene:
-    """Draw a scene with `people` standing or walking people and scan it; as many as find a free place are in it."""
+def draw_scene(
+    source: BodySource,
+    rng: np.random.Generator,
+    place: str,
+    scanner: str,
+    people: int,
+    lookalikes: int = 0,
+    covered: float = 0.0,
+) -> SyntheticScene:
+    """Draw a scene with `people` standing or walking people and scan it; as many as find a free place are in it.
+
+    Beside what every place has, `lookalikes` other things are in it that stand as people do, and something as high as a
+    table or a car stands before a share of the people, who are `covered` by it.
+    """
     height = float(rng.uniform(*SENSOR_HEIGHT_M[place]))
-    meshes, blocked = MAKERS[place](rng)
+    meshes, blocked = make_place(rng, place, lookalikes)
     view = np.pi if scanner.startswith("spinning") else MAX_BEARING_RAD
     bodies = place_people(source, rng, place, people, blocked, view)
+    if covered:
+        meshes += cover_people(rng.spawn(1)[0], bodies, covered)
     points, owner = scan_scene(meshes, [(body.vertices, source.triangles) for body in bodies], rng, scanner, height)
     down = np.array([0.0, 0.0, -height])
     return SyntheticScene(points, owner, [body.translate(down) for body in bodies], -height)
+
+
+def make_place(rng: np.random.Generator, place: str, lookalikes: int) -> tuple[list[Mesh], list[Disc]]:
+    """Make what stands in a place, with `lookalikes` of things that stand as people do, and the places these take.
+
+    Without any, the same random numbers follow.
+    """
+    meshes, blocked = MAKERS[place](rng)
+    if lookalikes:
+        meshes += add_lookalikes(rng.spawn(1)[0], place, blocked, lookalikes)
+    return meshes, blocked
+
+
+def cover_people(rng: np.random.Generator, people: Sequence[TrueBody], share: float) -> list[Mesh]:
+    """Make boxes between the sensor and a share of the people: tables, counters, cars."""
+    boxes = []
+    for body in people:
+        if rng.random() < share:
+            x, y = body.joints.mean(axis=0)[:2]
+            away, size = float(np.hypot(x, y)), rng.uniform(MIN_COVER_M, MAX_COVER_M)
+            near = (away - COVER_GAP_M - size[0] / 2) / away
+            boxes.append(stand_box(near * x, near * y, 0.0, size, float(np.arctan2(y, x))))
+    return boxes
 
 
 def place_people(

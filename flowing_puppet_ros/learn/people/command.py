@@ -62,12 +62,13 @@ def format_card(examples: CandidateExamples, model: PersonModel, arguments: argp
 _CARD = """# People in scans of scenes
 
 Tells people from what is none: a forest of {trees} trees over the shape and surroundings of a candidate, and one over
-what the rays of the scan say about the upright body that was fitted to it ({nodes} nodes in all). Their log odds are
-joined, and a logistic regression says how likely the joints are within 10 cm; both by what forests say about scans
-that they have not learned from.
+the same and what the rays of the scan say about the upright body that was fitted to it ({nodes} nodes in all), whose
+odds are calibrated. A logistic regression says how likely the joints are within 10 cm. Calibration and regression are
+by what forests say about scans that they have not learned from.
 
 - Learned by `flowing-puppet learn people` from {folders} folders with {scans} scans that have candidates: {people}
-  people and {others} other things; {fits} of all were fitted; seed {seed}.
+  people and {others} other things; {fits} of all were fitted, and every body counts twice: with the candidate's points,
+  and with those that it would have when tracked; seed {seed}.
 - The shipped file was learned from synthetic rooms, streets and halls (`flowing-puppet evaluate scenes --write`; Anny
   bodies in poses of CMU motion capture, four kinds of scanners) and from one real cloud of an empty office (PCL test
   data, BSD). No scan with other terms was used, and no pose is in the file.

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.scans.scan import SUFFIXES, read_scan
 from flowing_puppet_ros.body.scans.scene_labels import LabelledScene, label_scene, read_labels
 from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights, find_candidates
@@ -26,6 +27,7 @@ MIN_POINTS, MAX_RANGE_M = 25, 30.0
 PERSON_M, NOBODY_M = 0.35, 0.7
 """Distance of a candidate from the next person up to which it is that person, and from which on it is none."""
 MIN_PERSON_SHARE = 0.4  # of a person's points that a candidate must have to be that person
+BODY_STRIDE = 8  # every so many vertices stand for a body, as for a tracker
 MIN_ALIKE = 0.1
 """Probability of a person, by its shape, from which on something else is worth a fit."""
 
@@ -37,6 +39,7 @@ class CandidateExamples:
     Attributes:
         shape: (N, len(SHAPE_NAMES)).
         evidence: (N, len(EVIDENCE_NAMES)) of the fits, NaN where none was made.
+        tracked: the same of these bodies with the points that they have in a scan that follows, NaN where too few.
         is_person: (N,) 1 for a person, 0 for none.
         scan: (N,) number of the scan.
         joint_error: (N,) metres, mean error of the joints, NaN where none was fitted or nothing is known.
@@ -44,6 +47,7 @@ class CandidateExamples:
 
     shape: np.ndarray
     evidence: np.ndarray
+    tracked: np.ndarray
     is_person: np.ndarray
     scan: np.ndarray
     joint_error: np.ndarray
@@ -86,7 +90,8 @@ def collect_examples(
     clear = np.flatnonzero(own >= 0)
     alike = np.zeros(len(own))
     alike[clear] = predict_unseen(shape[clear], own[clear], number[clear], seed)
-    evidence, joint_error = np.full((len(own), len(EVIDENCE_NAMES)), np.nan), np.full(len(own), np.nan)
+    evidence, tracked = np.full((2, len(own), len(EVIDENCE_NAMES)), np.nan)
+    joint_error = np.full(len(own), np.nan)
     first = 0
     for scan in tqdm(seen, desc="fits", unit="scan", file=sys.stderr):
         rows = first + np.arange(len(scan.own))
@@ -94,8 +99,10 @@ def collect_examples(
         others = rows[(own[rows] == 0) & (alike[rows] > MIN_ALIKE)]
         others = others[np.argsort(-alike[others], kind="stable")][:max_fits]
         for row in np.sort(np.concatenate([rows[own[rows] == 1], others])):
-            evidence[row], joint_error[row] = scan.weigh(upright, fitter, int(row - rows[0]))
-    return CandidateExamples(shape[clear], evidence[clear], own[clear], number[clear], joint_error[clear])
+            evidence[row], tracked[row], joint_error[row] = scan.weigh(upright, fitter, int(row - rows[0]))
+    return CandidateExamples(
+        shape[clear], evidence[clear], tracked[clear], own[clear], number[clear], joint_error[clear]
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,25 +126,49 @@ class _SeenScan:
         shape = describe_candidates(candidates, scene, viewpoint)
         return cls(scene, ScanRays.of(points, viewpoint), truth, candidates, own, shape)
 
-    def weigh(self, upright: UprightFitter, fitter: BodyFitter, number: int) -> tuple[np.ndarray, float]:
-        """Return the evidence of a candidate's fit and the mean error of its joints, NaN where there is none."""
-        candidate = self.candidates[number]
+    def weigh(self, upright: UprightFitter, fitter: BodyFitter, number: int) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the evidence of a candidate's fit, that of its body as if tracked, and the mean error of its joints.
+
+        What there is not is NaN.
+        """
+        candidate, nothing = self.candidates[number], np.full(len(EVIDENCE_NAMES), np.nan)
+        seen = self._see(upright, candidate)
+        if seen is None:
+            return nothing, nothing, np.nan
+        cloud, window = seen
+        found = upright.fit(cloud, candidate.floor)
+        evidence = weigh_fit(found, cloud, candidate, self.scene, self.rays, window, fitter.model)
+        tracked = nothing
+        known = [found.fit.vertices[::BODY_STRIDE]]
+        rows = find_candidates(self.scene, self.rays.viewpoint, MIN_POINTS, known, only_known=True)[1].get(0)
+        if rows is not None and len(rows) >= MIN_POINTS:
+            other = Candidate.of(self.scene, np.sort(rows))
+            seen = self._see(upright, other)
+            if seen is not None:
+                again = upright.rate(found.fit, seen[0])
+                tracked = weigh_fit(again, seen[0], other, self.scene, self.rays, seen[1], fitter.model).values
+        return (
+            evidence.values,
+            tracked,
+            self._measure_error(fitter, candidate, found.fit) if self.own[number] else np.nan,
+        )
+
+    def _see(self, upright: UprightFitter, candidate: Candidate) -> tuple[SingleViewCloud, np.ndarray] | None:
+        """Return the cloud of a candidate and the rays near it; None where the sensor stands in it."""
         points = self.scene.points[candidate.rows]
         window = self.rays.find_window(points)
         try:
-            cloud = upright.make_cloud(points, self.rays.viewpoint, self.rays.find_unknown(points, window))
+            return upright.make_cloud(points, self.rays.viewpoint, self.rays.find_unknown(points, window)), window
         except InputError:
-            return np.full(len(EVIDENCE_NAMES), np.nan), np.nan
-        found = upright.fit(cloud, candidate.floor)
-        evidence = weigh_fit(found, cloud, candidate.rows, self.scene, self.rays, window, fitter.model)
-        error = np.nan
-        if self.own[number] == 1:
-            away = [np.hypot(*(p.middle - self.truth.sensor[:2] - candidate.middle)) for p in self.truth.people]
-            person = self.truth.people[int(np.argmin(away))]
-            places = dict(zip(fitter.model.joint_names, found.fit.joints + self.truth.sensor, strict=True))
-            gaps = [np.linalg.norm(places[name] - place) for name, place in person.joints.items() if name in places]
-            error = float(np.mean(gaps)) if gaps else np.nan
-        return evidence.values, error
+            return None
+
+    def _measure_error(self, fitter: BodyFitter, candidate: Candidate, fit: BodyFit) -> float:
+        """Return the mean distance (m) of a body's joints from those of the person who is nearest, NaN if unknown."""
+        away = [np.hypot(*(p.middle - self.truth.sensor[:2] - candidate.middle)) for p in self.truth.people]
+        person = self.truth.people[int(np.argmin(away))]
+        places = dict(zip(fitter.model.joint_names, fit.joints + self.truth.sensor, strict=True))
+        gaps = [np.linalg.norm(places[name] - place) for name, place in person.joints.items() if name in places]
+        return float(np.mean(gaps)) if gaps else np.nan
 
 
 def _label(candidate: Candidate, truth: LabelledScene) -> int:

@@ -11,9 +11,9 @@ from scipy.optimize import minimize
 from flowing_puppet_ros.body.upright.person_model import (
     DecisionTrees,
     PersonModel,
+    calibrate_odds,
     log_odds,
     select_accuracy,
-    weigh_odds,
 )
 from flowing_puppet_ros.learn.people.examples import CandidateExamples
 from flowing_puppet_ros.learn.people.unseen import make_forest, predict_unseen
@@ -27,28 +27,31 @@ def learn_model(examples: CandidateExamples, seed: int) -> PersonModel:
     from sklearn.linear_model import LogisticRegression
 
     fitted = examples.fitted
-    evidence, truth, scan = examples.evidence[fitted], examples.is_person[fitted], examples.scan[fitted]
-    shape = log_odds(predict_unseen(examples.shape, examples.is_person, examples.scan, seed)[fitted])
-    judged = log_odds(predict_unseen(evidence, truth, scan, seed))
-    fusion = _fit_fusion(shape, judged, truth)
-    known = np.isfinite(examples.joint_error[fitted])
-    inputs, close = select_accuracy(evidence[known]), examples.joint_error[fitted][known] < CLOSE_M
+    tracked = np.isfinite(examples.tracked).all(axis=1)
+    evidence = np.concatenate([examples.evidence[fitted], examples.tracked[tracked]])
+    truth, scan, error = (
+        np.concatenate([each[fitted], each[tracked]])
+        for each in (examples.is_person, examples.scan, examples.joint_error)
+    )
+    calibration = _calibrate(log_odds(predict_unseen(evidence, truth, scan, seed)), truth)
+    known = np.isfinite(error)
+    inputs, close = select_accuracy(evidence[known]), error[known] < CLOSE_M
     mean, scale = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-9)
     accuracy = LogisticRegression(C=REGULARISATION).fit((inputs - mean) / scale, close)
     weight = accuracy.coef_[0] / scale
     return PersonModel(
         _flatten(make_forest(seed).fit(examples.shape, examples.is_person)),
         _flatten(make_forest(seed).fit(evidence, truth)),
-        fusion,
+        calibration,
         np.append(weight, accuracy.intercept_[0] - weight @ mean),
     )
 
 
-def _fit_fusion(shape: np.ndarray, judged: np.ndarray, truth: np.ndarray) -> np.ndarray:
+def _calibrate(judged: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Return the weight of the judge's log odds (N,) and the constant under which people (N,) are likeliest."""
 
-    def cost(fusion: np.ndarray) -> float:
-        odds = weigh_odds(shape, judged, fusion)
+    def cost(calibration: np.ndarray) -> float:
+        odds = calibrate_odds(judged, calibration)
         return float(np.logaddexp(0.0, np.where(truth == 1, -odds, odds)).mean())
 
     return np.asarray(minimize(cost, np.array([1.0, 0.0]), method="Nelder-Mead").x)
@@ -73,6 +76,6 @@ def _flatten(forest: Any) -> DecisionTrees:
         first += tree.node_count
     feature, threshold, left, right, value = (np.concatenate(each) for each in zip(*columns, strict=True))
     return DecisionTrees(
-        np.array(roots, np.int32), feature.astype(np.int16), threshold, left.astype(np.int32), right.astype(np.int32),
-        value,
+        np.array(roots, np.int32), feature.astype(np.int16), threshold.astype(np.float32), left.astype(np.int32),
+        right.astype(np.int32), value.astype(np.float32),
     )  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-TREES, MAX_DEPTH, MIN_LEAF_EXAMPLES = 150, 14, 2
+TREES, MAX_DEPTH, MIN_LEAF_EXAMPLES, FEATURE_SHARE = 150, 14, 2, 0.5
 FOLDS = 5
 """Parts of the scans; what is said about each is learned from the others, so that the odds are those of new scans."""
 
@@ -33,6 +33,7 @@ def make_forest(seed: int) -> Any:
         TREES,
         max_depth=MAX_DEPTH,
         min_samples_leaf=MIN_LEAF_EXAMPLES,
+        max_features=FEATURE_SHARE,
         class_weight="balanced",
         random_state=seed,
     )

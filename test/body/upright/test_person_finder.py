@@ -129,6 +129,19 @@ def test_the_bank_stands_on_the_floor_and_is_of_many_statures() -> None:
     assert 0.05 < bank.stature.std() < 0.12 and 1.6 < bank.stature.mean() < 1.8
 
 
+def test_the_bank_leans_and_strides_as_people_do() -> None:
+    """Of 240 people in motion capture who stand or walk, shoulders are 7 cm from above the hips, strides 23 cm."""
+    model = StitchedPuppet.load()
+    joints = [
+        dict(zip(model.joint_names, model.joints(model.vertices(s)), strict=True))
+        for s in make_upright_bank(model).states
+    ]
+    lean = [(j["left_shoulder"] + j["right_shoulder"] - j["left_hip"] - j["right_hip"])[:2] / 2 for j in joints]
+    stride = [abs(j["left_ankle"][0] - j["right_ankle"][0]) for j in joints]
+    assert 0.05 < np.hypot(*np.transpose(lean)).mean() < 0.11
+    assert 0.15 < np.mean(stride) < 0.3 and max(stride) > 0.5
+
+
 @LEARN
 def test_a_full_fit_that_faces_the_other_way_does_not_turn_the_body(scan: tuple[np.ndarray, np.ndarray, float]) -> None:
     points, owner, _ = scan
@@ -146,3 +159,8 @@ def test_a_full_fit_that_faces_the_other_way_does_not_turn_the_body(scan: tuple[
     chosen = finder.choose_facing(body.person, body.fit, turned)
     assert chosen.state.rotation[0, :2, 0] @ ahead > 0
     assert finder.choose_facing(body.person, body.fit, body.fit) is body.fit
+    assert body.person.rows is not None
+    judged = finder.judge(body.person, body.person.rows, turned, turn=True)
+    assert judged.turned is not None and judged.turned[1] > 0
+    assert judged.turned[0].state.rotation[0, :2, 0] @ ahead > 0
+    assert finder.judge(body.person, body.person.rows, body.fit).turned is None

@@ -124,6 +124,26 @@ def test_bodies_stand_and_their_template_is_on_them(source: BodySource) -> None:
 
 
 @LEARN
+def test_who_stands_sways_as_motion_capture_does_and_keeps_the_feet(source: BodySource, tmp_path: Path) -> None:
+    frames = np.zeros((30, 117))
+    frames[:, 3 + 3 * 21 + 1] = np.linspace(0, 1.2, 30)  # an arm swings
+    np.savez(tmp_path / "still.npz", swing=frames)
+    rng = np.random.default_rng(1)
+    body = source.draw_body(rng, hard=False)
+    swayed = BodySource(tmp_path / "still.npz").sway(rng, body, 12, 10.0)
+    assert len(swayed) == 12 and np.abs(swayed[0].vertices - body.vertices).max() < 1e-9
+    place = {name: [each.joints[source.joint_names.index(name)] for each in swayed] for name in source.joint_names}
+    assert all(np.ptp(place[name], axis=0).max() < 1e-6 for name in ("left_ankle", "right_wrist", "neck"))
+    arm = np.array(place["left_wrist"]) - place["left_shoulder"]
+    length = np.linalg.norm(arm, axis=1)
+    assert np.ptp(length) < 1e-6
+    steps = np.linalg.norm(np.diff(arm, axis=0), axis=1)  # 2 of 29 frames, in each of which it turns by 1.2 / 29
+    assert 0.02 < steps.max() <= 2 * np.sin(1.2 / 29) * length[0] + 1e-9 and np.ptp(steps) < 1e-6
+    with pytest.raises(InputError, match="nobody stands"):
+        source.sway(rng, body, 12, 10.0)
+
+
+@LEARN
 def test_bodies_are_drawn_by_the_seed(source: BodySource) -> None:
     first, again, other = (source.draw_body(np.random.default_rng(seed), hard=True).vertices for seed in (3, 3, 4))
     np.testing.assert_array_equal(first, again)

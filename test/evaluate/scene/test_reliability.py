@@ -8,7 +8,7 @@ import numpy as np
 from flowing_puppet_ros.evaluate.scene.reliability import tabulate_reliability
 from flowing_puppet_ros.evaluate.scene.scene_score import GhostScore, PersonScore, count_id_switches
 
-PERSON = PersonScore("a", 0, 100, 5.0, True, True, "b1", 0.0, 0.0, 0.0, 0.05, False, 0.9)
+PERSON = PersonScore("a", 0, 5.0, 0.0, 100, 5.0, True, True, "b1", 0.0, 0.0, 0.0, 0.05, False, 0.9)
 
 
 def test_ghosts_and_distant_joints_are_wrong_and_unknown_joints_do_not_count() -> None:

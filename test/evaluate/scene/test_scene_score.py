@@ -13,6 +13,7 @@ from flowing_puppet_ros.evaluate.scene.scene_meshes import make_prism
 from flowing_puppet_ros.evaluate.scene.scene_score import (
     ReportedPerson,
     count_id_switches,
+    find_standing,
     score_scene,
     summarise_scenes,
     tabulate_bins,
@@ -88,3 +89,14 @@ def test_scanners_see_the_near_side_of_what_stands_before_them(scanner: str) -> 
     assert abs(np.median(ray) - 0.3) < 0.03 and own[:, 0].max() < 4.1 and own[:, 2].max() < 0.9
     around = points[(owner < 0) & (points[:, 2] > -1.1) & (points[:, 2] < 1.7)]
     assert len(around) and (np.hypot(*around[:, :2].T) > 6.5).all()
+
+
+def test_who_stands_is_told_from_who_walks() -> None:
+    people = []
+    for step in range(4):
+        entry = [box(5 + 0.05 * step, 0), box(8 + 0.2 * step, 3)]
+        points = np.concatenate([column(5 + 0.05 * step, 0, 100), column(8 + 0.2 * step, 3, 60)])
+        found = [body(8 + 0.2 * step, 3)] + ([body(5, 0, "b2")] if step else [])
+        people += score_scene(f"a-{step}", label_scene(entry, points, "a"), found, 50, np.pi)[0]
+    assert [person.person for person in find_standing(people)] == [0] * 4
+    assert summarise_scenes(people, [], 4)["standing_percent"] == 75

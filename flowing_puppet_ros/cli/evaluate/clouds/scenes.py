@@ -76,6 +76,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--places", nargs="+", choices=PLACES, default=PLACES, help="of synthetic scenes [all]")
     parser.add_argument("--scanners", nargs="+", choices=SCANNERS, default=SCANNERS[:3], help="[all but depth]")
     parser.add_argument("--people", type=int, default=4, help="people in a synthetic scene [%(default)s]")
+    parser.add_argument(
+        "--lookalikes", type=int, default=0, help="more things that stand as people do, a scene [%(default)s]"
+    )
+    parser.add_argument(
+        "--covered", type=float, default=0.0, help="share of people with a table or car before them [%(default)s]"
+    )
     parser.add_argument("--scene-seed", type=int, default=1, help="seed of the synthetic scenes [%(default)s]")
     parser.add_argument(
         "--mocap", type=Path, metavar="NPZ", help="motion capture that synthetic people's poses are from"
@@ -169,10 +175,11 @@ def _draw(arguments: argparse.Namespace) -> Iterator[tuple[str, SyntheticScene, 
         place = arguments.places[number % len(arguments.places)]
         scanner = arguments.scanners[(number // len(arguments.places)) % len(arguments.scanners)]
         rng = np.random.default_rng([arguments.scene_seed, number])
+        more = (arguments.lookalikes, arguments.covered)
         drawn = (
-            draw_sequence(source, rng, place, scanner, arguments.people, arguments.length)
+            draw_sequence(source, rng, place, scanner, arguments.people, arguments.length, *more)
             if arguments.length > 1
-            else [draw_scene(source, rng, place, scanner, arguments.people)]
+            else [draw_scene(source, rng, place, scanner, arguments.people, *more)]
         )
         for step, scene in enumerate(drawn):
             suffix = f"-{step:03d}" if arguments.length > 1 else ""
