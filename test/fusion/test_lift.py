@@ -54,6 +54,19 @@ def test_joints_lie_behind_the_surface_on_their_rays(
     assert lifted.depth == pytest.approx(2.5)
 
 
+def test_who_stands_behind_a_counter_is_not_lifted_onto_it(model: StitchedPuppet) -> None:
+    # A person of 1.7 m is 2.5 m away if shoulders and hips are 110 px apart; the counter hides the hips and what is
+    # below, and one shoulder lies beside the person, on the wall.
+    counter, person = wall(1.2), wall(2.5, -0.3, 0.19)
+    counter, person = counter[counter[:, 1] > 0.02], person[person[:, 1] < 0.03]
+    points = np.concatenate([counter, person, wall(4.0)])
+    seen = SeenCloud.of(points, camera(0.006))  # a camera that stands apart does not see what others hide
+    legs = {"right_knee": (300, 370), "left_knee": (340, 370), "right_ankle": (300, 450), "left_ankle": (340, 450)}
+    found = puppet(model, **legs)
+    lifted = lift_joints(model, found, seen, np.ones(len(points), dtype=bool))
+    assert lifted.depth == pytest.approx(2.5)
+
+
 def test_a_joint_in_a_hole_of_the_depth_has_no_depth_and_no_confidence(model: StitchedPuppet) -> None:
     points = np.concatenate([wall(2.5, -1.5, 0.3), wall(2.5, 0.5, 1.5)])  # the wrist is at x = 0.4
     seen = SeenCloud.of(points, camera())

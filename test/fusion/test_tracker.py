@@ -21,6 +21,7 @@ from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
+from flowing_puppet_ros.fusion.joint_fit import JointFitter
 from flowing_puppet_ros.fusion.people_fitter import Claim, FusionSettings, PeopleFitter
 from flowing_puppet_ros.fusion.tracker import FusedTracker
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -44,12 +45,14 @@ class Walk:
     def __init__(self, model: StitchedPuppet) -> None:
         self.model, self.tracker = model, tracker(model)
 
-    def see(self, frame: int, identity: str | None = "a1", depth: bool = True) -> list[TrackedBody]:
+    def see(
+        self, frame: int, identity: str | None = "a1", depth: bool = True, is_live: bool = False
+    ) -> list[TrackedBody]:
         """Track the frame, with the puppet under an id, or without one (None), with or without depth of him."""
         self.man = stand_at(joints_of(raise_left=0.3 + 0.06 * frame), 2.4, -0.3 + 0.06 * frame)
         seen: Watched = watch([self.man] if depth else [], seed=frame)
         puppets = [] if identity is None else [find_puppet(self.model, self.man, CAMERA, identity, 5.0, frame)]
-        return self.tracker.step(seen.seen_by(CAMERA), seen.image, puppets, (1 + frame) * FRAME_NS)[0]
+        return self.tracker.step(seen.seen_by(CAMERA), seen.image, puppets, (1 + frame) * FRAME_NS, is_live)[0]
 
     def stand(self, second: int) -> list[TrackedBody]:
         """Track the man of frame 0, who stands still, at a time in seconds."""
@@ -99,8 +102,8 @@ def test_fits_that_find_nothing_better_become_rare(model: StitchedPuppet, monkey
     walk, found, fitted = Walk(model), PeopleFitter.fit_claim, list[int]()
     track = BodyTracker.track
 
-    def fit(people: PeopleFitter, claim: Claim, person: PersonCloud, known: Any) -> BodyFit | None:
-        made = None if fitted else found(people, claim, person, known)
+    def fit(people: PeopleFitter, claim: Claim, person: PersonCloud, *given: Any) -> BodyFit | None:
+        made = None if fitted else found(people, claim, person, *given)
         fitted.append(person.stamp // NANOSECONDS - 1)
         return made
 
@@ -113,6 +116,28 @@ def test_fits_that_find_nothing_better_become_rare(model: StitchedPuppet, monkey
     for second in range(9):
         assert len(walk.stand(second)) == 1
     assert fitted == [0, 1, 3, 7]
+
+
+def test_live_a_new_body_comes_quickly_and_is_checked_in_the_next_cloud(
+    model: StitchedPuppet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk, tried = Walk(model), list[str]()
+    for name in ("fit", "fit_quickly"):
+        way = getattr(JointFitter, name)
+
+        def note(fitter: JointFitter, *given: Any, name: str = name, way: Any = way) -> BodyFit:
+            tried.append(name)
+            fit: BodyFit = way(fitter, *given)
+            return fit
+
+        monkeypatch.setattr(JointFitter, name, note)
+    for frame in range(3):
+        (body,) = walk.see(frame, is_live=True)
+        assert walk.error(body) < 0.045
+    assert tried == ["fit_quickly", "fit"]
+    tried.clear()
+    Walk(model).see(0)  # in a replay nobody waits
+    assert tried == ["fit"]
 
 
 def test_puppets_without_ids_get_some_that_stay(model: StitchedPuppet) -> None:

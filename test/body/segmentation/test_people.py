@@ -102,5 +102,8 @@ def test_floor_is_the_level_plane_below_and_walls_are_larger_than_people(person:
     assert abs(floor.offset) < 0.02
     wall = find_wall(scene[20000:32000:5], 0.05, np.random.default_rng(0))
     assert wall is not None and abs(abs(wall.normal[1]) - 1) < 1e-3
+    below = np.array([0.0, 0.0, -0.5])
+    assert find_floor(scene[::10], 0.05, np.random.default_rng(0), below) is None  # no sensor is below the floor
+    assert find_floor(scene[::10], 0.05, np.random.default_rng(0), -below) is not None
     assert find_floor(person, 0.05, np.random.default_rng(0)) is None
     assert find_wall(person, 0.05, np.random.default_rng(0)) is None
