@@ -65,6 +65,41 @@ def test_a_leg_on_the_other_one_leaves_its_cloud_uncovered(
     center[right], rotation[right] = center[left], rotation[left]
     quality = assess_fit(model, model.vertices(replace(body, center=center, rotation=rotation)), cloud)
     assert quality.part_confidence[right].min() > 0.4
+    assert quality.uncovered > 0.05
+    assert quality.limb_suspect
+
+
+def test_an_arm_in_an_arm_is_a_fold_that_costs(model: StitchedPuppet, body: BodyState, cloud: Cloud) -> None:
+    upper, lower = model.tree.index("left_upper_arm"), model.tree.index("left_lower_arm")
+    away = tuple(body.center[upper] - body.center[lower] + 0.01)
+    quality = assess_fit(model, model.vertices(moved(body, (lower,), away)), cloud)
+    assert quality.self_intersections == 1
+    assert quality.cost > quality.distance
+    assert quality.limb_suspect and not quality.reliable
+
+
+def test_parts_that_the_sensor_cannot_see_are_not_held_against_the_body(
+    model: StitchedPuppet, body: BodyState, cloud: Cloud
+) -> None:
+    sensor = np.array([4.0, 0.0, 0.5])
+    facing = cloud.sees(cloud.points, cloud.normals) & (((sensor - cloud.points) * cloud.normals).sum(axis=1) > 0)
+    half = Cloud.of(cloud.points[facing], cloud.normals[facing], sensor)
+    quality = assess_fit(model, model.vertices(body), half)
+    assert quality.reliable and quality.confidence > 0.95
+    none = Cloud.of(cloud.points, cloud.normals, np.array([0.0, 0.0, 0.0]))
+    inside = assess_fit(model, model.vertices(body), none)
+    assert not inside.seen.all()
+
+
+def test_points_that_the_noise_of_the_sensor_explains_are_not_stray(model: StitchedPuppet, body: BodyState) -> None:
+    sensor, rng = np.array([4.0, 0.0, 0.5]), np.random.default_rng(0)
+    points, normals = sample_surface(model.vertices(body), model.faces, rng, 20000)
+    facing = ((sensor - points) * normals).sum(axis=1) > 0
+    points, normals = points[facing], normals[facing]
+    ray = (points - sensor) / np.linalg.norm(points - sensor, axis=1, keepdims=True)
+    noisy = points + 0.032 * rng.standard_normal((len(points), 1)) * ray
+    seen = SingleViewCloud.seen_from(noisy, normals, sensor)
+    quality = assess_fit(model, model.vertices(body), seen)
     assert quality.uncovered > 0.05 > quality.stray
     assert quality.reliable
     assert not assess_fit(model, model.vertices(body), replace(seen, plane_noise=0.0)).reliable
