@@ -17,6 +17,8 @@ from flowing_puppet_ros.process.memory import limit_arenas
 from flowing_puppet_ros.process.threads import one_blas_thread, one_opencv_thread
 from flowing_puppet_ros.stream.pipeline import SWITCH_INTERVAL_S
 
+SPIN_TIMEOUT_S = 1.0
+"""In which an interrupt is noticed: without an end to its waiting, the executor of events notices none."""
 _COMPONENT_NODE = "flowing_puppet_ros.node.component_node"
 
 
@@ -92,17 +94,31 @@ def _make_parser(name: str, description: str | None) -> argparse.ArgumentParser:
     )
 
 
+def _make_executor() -> Any:
+    """Return rclpy's executor that is told of messages, or the older one where rclpy has no other.
+
+    The older one prepares all subscriptions anew for every message: 0.12 of a core instead of 0.05 for depth, its
+    calibration and puppets at 30 Hz.
+    """
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor()
+    return EventsExecutor()
+
+
 def _spin(node: Any) -> None:
     import rclpy
     from rclpy.executors import ExternalShutdownException
-    from rclpy.experimental import EventsExecutor
 
-    executor = EventsExecutor()
+    executor = _make_executor()
     executor.add_node(node)
     node.get_logger().info("ready" if node.state == "active" else f"{node.state}: waits for a lifecycle manager")
     while rclpy.ok():
         try:
-            executor.spin_once(timeout_sec=1.0)
+            executor.spin_once(timeout_sec=SPIN_TIMEOUT_S)
         except (KeyboardInterrupt, ExternalShutdownException):
             break
         except Exception as error:
