@@ -71,6 +71,8 @@ def make_clouds(seed: int = 0, people: int = 1) -> np.ndarray:
 def make_rgbd(seed: int = 0) -> dict[str, Any]:
     """Draw colour and depth of somebody who waves and somebody who walks, and their keypoints with 5 px of noise.
 
+    The room is drawn without them, too.
+
     The keypoint networks rarely find drawn people, so that the keypoints are published as detections.
     """
     source = BodySource()
@@ -84,11 +86,14 @@ def make_rgbd(seed: int = 0) -> dict[str, Any]:
     cameras = studio.cameras.place(look_along(np.array([1.0, 0.0, 0.0]), 0.12), np.array([-3.2, 0.0, 1.3]))
     room = studio.furnish(rng, [body for person in people for body in (person[0], person[-1])], cameras)
     frames = [studio.look(rng, [person[number] for person in people], room, cameras) for number in range(RGBD_COUNT)]
+    empty = studio.look(rng, [], room, cameras)
     keypoints = [[np.column_stack([seen.pixels, seen.confidence]) for seen in frame.keypoints] for frame in frames]
     return {
         "colour": np.stack([frame.rgb for frame in frames]),
         "depth": np.stack([to_millimetres(frame.depth) for frame in frames]),
         "keypoints": np.array(keypoints),
+        "empty_colour": empty.rgb,
+        "empty_depth": to_millimetres(empty.depth),
         "matrix": cameras.depth.matrix,
     }
 

@@ -3,7 +3,8 @@
 
 `python -m benchmarks.live_rgbd INPUT.npz --rate HZ --seconds S` starts both nodes as processes of their own, publishes
 `colour` (N, H, W, 3), `depth` (N, H, W) mm and, where the file has them, `keypoints` (N, P, 12, 3) as detections, back
-and forth, stamped with the current time, and prints one JSON object.
+and forth, stamped with the current time, and prints one JSON object. For the first second, which is not measured, the
+room is empty (`empty_colour` (H, W, 3), `empty_depth` (H, W) mm).
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import BODIES, CAMERA_INFO, IMAGE, PUPPETS
 
 FRAME = "camera_optical_frame"
+EMPTY_S = 1.0
 NODES = {
     "puppet_tracker": ("image", "detections"),
     "body_fitter": ("depth", "camera_info"),
@@ -48,17 +50,20 @@ class RgbdFeeder(Node):
         header = make_header(factory, 0, FRAME)
         height, width = arrays["depth"].shape[1:]
         info = make_camera_info(factory, header, (width, height), arrays["matrix"], np.zeros(5))
-        once: list[dict[str, Any]] = []
-        for number, (colour, depth) in enumerate(zip(arrays["colour"], arrays["depth"], strict=True)):
+        keypoints = arrays.get("keypoints", [None] * len(arrays["depth"]))
+
+        def make_moment(colour: np.ndarray, depth: np.ndarray, people: np.ndarray | None) -> dict[str, Any]:
             messages = {
                 "camera_info": info,
                 "image": make_image(factory, header, colour, "rgb8"),
                 "depth": make_image(factory, header, depth, "16UC1"),
             }
-            if "keypoints" in arrays:
-                messages["detections"] = make_detections(factory, header, arrays["keypoints"][number])
-            once.append(messages)
+            return messages if people is None else messages | {"detections": make_detections(factory, header, people)}
+
+        once = [make_moment(*each) for each in zip(arrays["colour"], arrays["depth"], keypoints, strict=True)]
         self._moments = [*once, *once[-2:0:-1]]
+        nobody = None if keypoints[0] is None else keypoints[0][:0]
+        self._empty = make_moment(arrays["empty_colour"], arrays["empty_depth"], nobody)
         kinds = {"camera_info": CAMERA_INFO, "image": IMAGE, "depth": IMAGE, "detections": PUPPETS}
         self.feeds = {
             name: self.create_publisher(message_type(kinds[name]), name, QoSProfile(depth=4)) for name in once[0]
@@ -72,13 +77,14 @@ class RgbdFeeder(Node):
                 message_type(kind), name, lambda message, name=name: self._record(name, message), QoSProfile(depth=50)
             )
 
-    def send(self) -> None:
-        """Publish the next moment, stamped now."""
+    def send(self, with_people: bool) -> None:
+        """Publish the next moment, or the empty room, stamped now."""
         stamp = self.get_clock().now().to_msg()
-        for name, message in self._moments[self.sent % len(self._moments)].items():
+        moment = self._moments[self.sent % len(self._moments)] if with_people else self._empty
+        for name, message in moment.items():
             message.header.stamp = stamp
             self.feeds[name].publish(message)
-        self.sent += 1
+        self.sent += with_people
 
     def _record(self, name: str, message: Any) -> None:
         latency = (self.get_clock().now().nanoseconds - header_ns(message.header)) * 1e-9
@@ -128,25 +134,33 @@ def measure(arrays: Any, rate: float, seconds: float) -> dict[str, Any]:
                 raise RuntimeError("a node did not start")
             executor.spin_once(timeout_sec=0.1)
         time.sleep(1.0)  # until everybody has found everybody
+        _feed(feeder, executor, rate, EMPTY_S, with_people=False)
         start = time.monotonic()
-        while (now := time.monotonic()) < start + seconds:
-            due = start + feeder.sent / rate
-            if now >= due:
-                feeder.send()
-            executor.spin_once(timeout_sec=max(0.0, min(due - now, 0.05)))
+        _feed(feeder, executor, rate, seconds, with_people=True)
         return summarise(feeder, start, seconds) | {"input_hz": rate}
+
+
+def _feed(feeder: RgbdFeeder, executor: SingleThreadedExecutor, rate: float, seconds: float, with_people: bool) -> None:
+    """Publish moments for so long and take in what comes back."""
+    start, sent = time.monotonic(), 0
+    while (now := time.monotonic()) < start + seconds:
+        due = start + sent / rate
+        if now >= due:
+            feeder.send(with_people)
+            sent += 1
+        executor.spin_once(timeout_sec=max(0.0, min(due - now, 0.05)))
 
 
 def summarise(feeder: RgbdFeeder, start: float, seconds: float) -> dict[str, Any]:
     """Return the figures of what came."""
-    bodies = feeder.results["bodies"]
+    bodies = [result for result in feeder.results["bodies"] if result[0] > start]
     first = next((arrival for arrival, _, people in bodies if people), None)
     everybody = next((arrival for arrival, _, people in bodies if people >= max(feeder.people, 2)), None)
     steady = [latency for arrival, latency, _ in bodies if first is not None and arrival > first + 1.0]
     lasted = start + seconds - first - 1.0 if first is not None else 0.0
     return {
         "sent": feeder.sent,
-        "puppets_hz": round(len(feeder.results["puppets"]) / seconds, 2),
+        "puppets_hz": round(sum(arrival > start for arrival, _, _ in feeder.results["puppets"]) / seconds, 2),
         "lock_on_s": None if first is None else round(first - start, 2),
         "everybody_s": None if everybody is None else round(everybody - start, 2),
         "output_hz": round(len(steady) / lasted, 2) if lasted > 0 else 0.0,

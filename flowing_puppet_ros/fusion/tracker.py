@@ -129,28 +129,25 @@ class FusedTracker:
         return [track.id for track in self._tracks.values() if track.proven and track.id not in self._shown]
 
     def step(
-        self,
-        cloud: SeenCloud,
-        image: RangeImage | None,
-        puppets: Sequence[PuppetJoints],
-        stamp: int,
-        is_live: bool = False,
+        self, cloud: SeenCloud, image: RangeImage | None, puppets: Sequence[PuppetJoints], stamp: int
     ) -> tuple[list[TrackedBody], Bools]:
         """Return the bodies of everybody who is seen, and which points (N,) are theirs.
+
+        Whoever comes into a running stream has a body at once, by a quick fit, and a thorough one in the next cloud. In
+        the first cloud all fits are thorough, since there may be no other.
 
         Args:
             cloud: with the pixels of the camera that saw the puppets.
             image: the cloud's range image, of which each person's field is made.
             puppets: at the time of the cloud.
             stamp: of the cloud in nanoseconds; one before the last restarts the tracker.
-            is_live: whether a new person's first body is wanted at once, and a thorough one in the next cloud.
         """
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
-        self._stamp = stamp
+        is_first, self._stamp = self._stamp is None, stamp
         with one_blas_thread():
             jobs, own = self._share_out(cloud, image, self._name(puppets, cloud, stamp), stamp)
-            fits = parallel_map(lambda job: self._track(job, stamp, is_live), jobs, self._people.threads)
+            fits = parallel_map(lambda job: self._track(job, stamp, not is_first), jobs, self._people.threads)
         found: list[TrackedBody] = []
         for job, fit in zip(jobs, fits, strict=True):
             if isinstance(fit, InputError):
@@ -207,7 +204,7 @@ class FusedTracker:
             anybody[job.person.rows] = True
         return jobs, anybody
 
-    def _track(self, job: _TrackJob, stamp: int, is_live: bool) -> BodyFit | InputError | None:
+    def _track(self, job: _TrackJob, stamp: int, is_running: bool) -> BodyFit | InputError | None:
         """Return the person's body: tracked, or fitted from the joints where there is none, or none that is good."""
         track, tracker, claim = job.track, job.track.tracker, job.claim
         try:
@@ -219,7 +216,7 @@ class FusedTracker:
                 return None if tracker.lost else fit
             due = fit is not None and not tracker.hidden and not fit.reliable and track.refit.is_due(stamp)
             if fit is None or tracker.lost or due or not track.checked:
-                quick = track.checked if fit is not None else is_live
+                quick = track.checked if fit is not None else is_running
                 fresh = self._people.fit_claim(claim, job.person, tracker.cloud, quick)
                 track.checked = not quick or fit is not None
                 limit = np.inf if fit is None else BETTER_SHARE * fit.two_way_distance

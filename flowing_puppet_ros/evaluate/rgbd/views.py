@@ -223,7 +223,7 @@ class RgbdStudio:
             clothed = [*(self._wardrobe.dress(body, k) for k, body in enumerate(later)), *room]
             colour = self._render(self._colour_rays, cameras.colour, clothed)
         rgb = colour.rgb + IMAGE_GRAIN * for_image.standard_normal(colour.rgb.shape)
-        joints = np.stack([body.joints[self._limbs] for body in bodies])
+        joints = np.array([body.joints[self._limbs] for body in bodies]).reshape(-1, len(self._limbs), 3)
         scaled = noise * cameras.colour.focal / NOISE_FOCAL_PX
         keypoints, seen = [], []
         for k, body in enumerate(later):

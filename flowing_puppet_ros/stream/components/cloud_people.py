@@ -94,8 +94,7 @@ class CloudPeople:
             self._report.count_unusable(error)
             return FoundPeople(coarse=place_others(self._model, puppets, seen))
         if is_known:
-            is_live = background is not None
-            bodies, own = self._fused.step(seen, scene.draw_image(), paired.puppets, scene.stamp, is_live)
+            bodies, own = self._fused.step(seen, scene.draw_image(), paired.puppets, scene.stamp)
         else:
             bodies, own = self._fused.step_alone(seen, scene.draw_image(), paired.puppets)
         occluded = self._fused.occluded_ids
