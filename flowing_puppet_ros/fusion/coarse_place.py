@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from flowing_puppet_ros.arrays import F64
-from flowing_puppet_ros.fusion.puppet_joints import LONG_SHARE, MIN_PUPPET_JOINTS, PuppetJoints, measure_bone_distances
+from flowing_puppet_ros.fusion.puppet_joints import MIN_PUPPET_JOINTS, PuppetJoints, measure_distance_by_size
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.camera import Camera
@@ -47,10 +47,9 @@ def _place_coarsely(
     if np.count_nonzero(sure) < MIN_PUPPET_JOINTS:
         return None
     rays = camera.cast_rays(puppet.pixels)
-    distances = measure_bone_distances(model, rays, sure)
-    if not len(distances):
+    distance = measure_distance_by_size(model, rays, sure)
+    if np.isnan(distance):
         return None
-    distance = float(np.quantile(distances, LONG_SHARE))
     if seen is not None:
         radius = RADIUS_M * camera.focal / distance
         near, _ = seen.query(puppet.pixels[sure], distance_upper_bound=max(radius, 1.0))

@@ -140,7 +140,7 @@ class JointFitter:
         """Fit a body from `start` and with the sides exchanged, whichever is better."""
         coarse = CoarseCloud.of(cloud)
         unknown = measure_unknown_share(self.model, start, cloud)
-        pulled, close, free = (strengthen_priors(weights, unknown) for weights in (PULLED, CLOSE, FREE))
+        pulled, close = (strengthen_priors(weights, unknown) for weights in (PULLED, CLOSE))
         terms, run = [cloud.free_space_term], self.fitter.gauss_newton.run
         targets, bank = self.make_targets(joints), self.fitter.hypotheses.pose_bank
         body = run(start, cloud, targets, pulled, terms)
@@ -154,9 +154,7 @@ class JointFitter:
             body, coarse, joints, self.limbs.find_doubtful(body, joints),
             lambda tried: run(tried, cloud, targets, close, terms),
         )  # fmt: skip
-        held = self.hold(joints, targets, unknown)
-        fit = self.fitter.assess(run(body, cloud, held, free, terms), cloud)
-        return replace(fit, reliable=fit.reliable and not self.limbs.contradicts(fit.state, joints))
+        return self._finish(body, cloud, joints, targets, unknown)
 
     def fit_quickly(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
         """Fit a body to the person's points, from `start`, in a quarter of the time of `fit`.
@@ -164,10 +162,17 @@ class JointFitter:
         Left and right are taken as the joints say, and limbs that are elsewhere are left to `hang_anew`.
         """
         unknown = measure_unknown_share(self.model, start, cloud)
-        pulled, free = (strengthen_priors(weights, unknown) for weights in (QUICK, FREE))
-        terms, run, targets = [cloud.free_space_term], self.fitter.gauss_newton.run, self.make_targets(joints)
-        body = run(start, cloud, targets, pulled, terms)
-        fit = self.fitter.assess(run(body, cloud, self.hold(joints, targets, unknown), free, terms), cloud)
+        pulled, targets = strengthen_priors(QUICK, unknown), self.make_targets(joints)
+        body = self.fitter.gauss_newton.run(start, cloud, targets, pulled, [cloud.free_space_term])
+        return self._finish(body, cloud, joints, targets, unknown)
+
+    def _finish(
+        self, body: BodyState, cloud: SingleViewCloud, joints: LiftedJoints, targets: JointTargets, unknown: float
+    ) -> BodyFit:
+        """Take the last steps, in which the cloud decides, and tell how good the body is."""
+        free, held = strengthen_priors(FREE, unknown), self.hold(joints, targets, unknown)
+        body = self.fitter.gauss_newton.run(body, cloud, held, free, [cloud.free_space_term])
+        fit = self.fitter.assess(body, cloud)
         return replace(fit, reliable=fit.reliable and not self.limbs.contradicts(fit.state, joints))
 
     def hang_anew(

@@ -26,7 +26,7 @@ from flowing_puppet_ros.fusion.limb_depths import (
     list_choices,
     measure_seen_share,
 )
-from flowing_puppet_ros.fusion.puppet_joints import LONG_SHARE, PuppetJoints, measure_bone_distances, trunk_rows
+from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, measure_distance_by_size, trunk_rows
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -283,9 +283,9 @@ def _find_likely_depth(
         near = (np.abs(places[:, None] - own) < MAX_TRUNK_DEPTH_M).any(axis=1)
         votes += np.where(near, puppet.confidence[joint] ** 2, 0.0)
     sure = puppet.known & (puppet.confidence >= SIZE_CONFIDENCE)
-    bones = measure_bone_distances(model, rays, sure)
-    if len(bones) >= MIN_SIZE_BONES:
-        apparent = float(np.quantile(bones, LONG_SHARE) * np.median(rays[sure] @ axis))
+    distance = measure_distance_by_size(model, rays, sure, MIN_SIZE_BONES)
+    if np.isfinite(distance):
+        apparent = distance * float(np.median(rays[sure] @ axis))
         votes *= np.exp(-0.5 * (np.log(places / apparent) / SIZE_DEVIATION) ** 2)
     return float(places[votes.argmax()])
 

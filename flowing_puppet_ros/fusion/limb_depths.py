@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from numba import njit
 from numba.extending import register_jitable
 
 from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.fusion.puppet_joints import find_average_joints
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 CHAINS = (("shoulder", "elbow", "wrist", "hand"), ("hip", "knee", "ankle", "foot"))
@@ -131,7 +131,7 @@ def choose_depths(model: StitchedPuppet, choices: Mapping[int, DepthChoices]) ->
             own = choices[row]
             place[slot, : count[slot]] = own.points
             lists[:, slot, : count[slot]] = own.depth, own.cost, own.spread
-    template = _find_template(model)[rows]
+    template = find_average_joints(model)[rows]
     best, cost = np.full(len(rows), -1), np.inf
     for scale in SCALES:
         total, taken = _choose_for_size(count, place, lists, scale * template)
@@ -139,12 +139,6 @@ def choose_depths(model: StitchedPuppet, choices: Mapping[int, DepthChoices]) ->
         if total < cost:
             best, cost = taken, total
     return {row: int(choice) for row, choice in zip(rows, best, strict=True) if choice >= 0}
-
-
-@lru_cache(maxsize=3)
-def _find_template(model: StitchedPuppet) -> F64:
-    """Return the joints (J, 3) m of the mean body."""
-    return model.joints(model.vertices(model.rest_state()))
 
 
 @njit(cache=True, nogil=True)

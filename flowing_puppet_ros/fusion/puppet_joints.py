@@ -134,10 +134,22 @@ def _load_flat_model() -> DeformableStructures:
     return DeformableStructures.load("neutral", 14)
 
 
-def measure_bone_distances(model: StitchedPuppet, rays: F64, sure: Bools) -> F64:
-    """Return the distances (B,) m at which the bones between `sure` (J,) joints have an average person's lengths."""
-    names = model.joint_names
-    average = model.joints(model.vertices(model.rest_state()))
+@lru_cache(maxsize=3)
+def find_average_joints(model: StitchedPuppet) -> F64:
+    """Return the joints (J, 3) m of the average body."""
+    return np.asarray(model.joints(model.vertices(model.rest_state())))
+
+
+def measure_distance_by_size(model: StitchedPuppet, rays: F64, sure: Bools, min_bones: int = 1) -> float:
+    """Return how far away, in metres, a person of average size is; NaN where fewer than `min_bones` tell.
+
+    Args:
+        model: the body model.
+        rays: (J, 3) unit vectors from the camera to the joints.
+        sure: (J,) joints whose rays count.
+        min_bones: least number of bones between them.
+    """
+    names, average = model.joint_names, find_average_joints(model)
     found = []
     for side in ("left", "right"):
         for above, below in LONG_BONES:
@@ -145,4 +157,4 @@ def measure_bone_distances(model: StitchedPuppet, rays: F64, sure: Bools) -> F64
             if sure[first] and sure[last]:
                 angle = float(np.linalg.norm(rays[first] - rays[last]))
                 found.append(float(np.linalg.norm(average[first] - average[last])) / max(angle, 1e-6))
-    return np.array(found)
+    return float(np.quantile(found, LONG_SHARE)) if len(found) >= min_bones else float("nan")

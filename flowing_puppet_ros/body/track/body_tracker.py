@@ -51,7 +51,7 @@ VISIBLE_HALF_LIFE_S = 2.0  # in which the normal visible surface falls to half w
 MAX_TURNED_RATIO = 1.25
 """Two-way distance of a body that walks ahead, relative to that of one that walks backwards, up to which it is taken:
 few points hardly tell front from back, and hardly anybody walks backwards."""
-MAX_VIEW_POINTS = 2500
+MAX_TRACKED_POINTS = 2500
 """Of one side of a person whose joints somebody sees: the shape comes from many clouds, and no full fit from these."""
 ALIGN_GAP_NS = 100_000_000
 """Time between clouds from which on a body is first moved to the joints that somebody sees."""
@@ -252,7 +252,7 @@ class BodyTracker:
             vertices = self._fitter.model.vertices(self._predict(last, points.mean(axis=0), stamp))
             normals = estimate_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
         if targets is not None and viewpoint is not None and person.field is not None:
-            points, normals = downsample(points, normals, MAX_VIEW_POINTS)
+            points, normals = downsample(points, normals, MAX_TRACKED_POINTS)
         if few and viewpoint is not None:
             cloud: Cloud = self._upright.make_cloud(points, viewpoint, None, person.field)
         else:
