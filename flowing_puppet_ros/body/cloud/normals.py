@@ -16,7 +16,7 @@ from flowing_puppet_ros.evidence.cloud.one_sided import measure_stretch
 
 MIN_NEIGHBOURS, MAX_NEIGHBOURS = 9, 24  # points by which a normal is estimated
 POINTS_PER_NEIGHBOUR = 100  # points of a cloud for each of them
-NEIGHBOURS_PER_STRETCH = 4  # for the rings of a LiDAR: those of one ring lie on a line and say nothing about a plane
+NEIGHBOURS_PER_STRETCH = 3  # for the rings of a LiDAR: those of one ring lie on a line and say nothing about a plane
 MAX_RING_NEIGHBOURS = 40
 MIN_SPREAD = 1e-6  # of points across their widest plane, for one along it; they lie in that plane below it
 ORIENTATION_RADIUS_M = 0.12  # neighbourhood whose mean lies inside a limb
