@@ -124,7 +124,7 @@ class PersonFinder:
         self._view = None
         if len(points) < self._settings.min_points:
             return []
-        scene = SceneHeights.of(points)
+        scene = SceneHeights.of(points, viewpoint)
         candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known)
         if only_known and len(owned) < sum(len(body) > 0 for body in known):
             candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
