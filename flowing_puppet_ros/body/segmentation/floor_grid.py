@@ -20,7 +20,7 @@ LOW_SHARE = 0.03
 """Share of a cell's points that may lie below its floor: reflections and noise."""
 MIN_CELL_POINTS = 3
 MAX_SLOPE = 0.05  # of the floor against the plane, so that cells on furniture and cars take their neighbours' floor
-MAX_KERB_M = 0.15
+MAX_KERB_M = 0.2
 MAX_BELOW_PLANE_M = 1.0  # a cell that is lower shows a reflection or a shaft
 AZIMUTH_BINS, MIN_RAY_GAP, LIMIT_GAPS = 360, 0.005, 0.6
 """Bins of azimuth in which the lowest ray is looked up, slope between two rays one above the other at least, and gaps
@@ -60,9 +60,11 @@ class FloorGrid:
         if not np.isfinite(above).any():
             above[:] = 0.0
         eroded = _limit_slope(above, MAX_SLOPE * CELL_M)
-        # What was lowered by more than a kerb stands on the floor, and where nothing was seen, no slope is known.
-        nearest = distance_transform_edt(above - eroded > MAX_KERB_M, return_distances=False, return_indices=True)
-        return cls(base + gaussian_filter(eroded[tuple(nearest)], BLUR_CELLS, mode="nearest"), low)
+        nearest = distance_transform_edt(eroded < above, return_distances=False, return_indices=True)
+        floor = eroded[tuple(nearest)]
+        # What is higher than a kerb stands on the floor, which is as high there as where it is seen.
+        floor = np.where(above - floor > MAX_KERB_M, floor, eroded)
+        return cls(base + gaussian_filter(floor, BLUR_CELLS, mode="nearest"), low)
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Return the heights (N,) of points (N, 3) over the floor, metres."""
