@@ -19,7 +19,9 @@ CELL_M, MAX_CELLS = 1.0, 200  # edge of a cell; cells a side, so that the grid e
 LOW_SHARE = 0.03
 """Share of a cell's points that may lie below its floor: reflections and noise."""
 MIN_CELL_POINTS = 3
-MAX_SLOPE = 0.05  # of the floor against the plane, so that cells on furniture and cars take their neighbours' floor
+MAX_SLOPE, MAX_RAMP_SLOPE = 0.05, 0.1
+"""Of the floor against the plane, so that cells on furniture and cars take their neighbours' floor; of cells in which
+nothing stands up."""
 MAX_KERB_M = 0.2
 MAX_BELOW_PLANE_M = 1.0  # a cell that is lower shows a reflection or a shaft
 AZIMUTH_BINS, MIN_RAY_GAP, LIMIT_GAPS = 360, 0.005, 0.6
@@ -51,7 +53,7 @@ class FloorGrid:
         points = np.ascontiguousarray(points)
         low, shape, all_inside = lay_grid(points, CELL_M, MAX_CELLS)
         by_lowest_ray = np.zeros(len(points), dtype=bool) if viewpoint is None else _find_lowest_rays(points, viewpoint)
-        lowest, cut = _find_lowest(points, by_lowest_ray, low, shape, all_inside)
+        lowest, upright, cut = _find_lowest(points, by_lowest_ray, low, shape, all_inside)
         x, y = (low[k] + CELL_M * (np.arange(shape[k]) + 0.5) for k in (0, 1))
         plane = _fit_plane(lowest, cut, x, y, points)
         base = plane[0] + plane[1] * x[:, None] + plane[2] * y[None, :]
@@ -59,7 +61,7 @@ class FloorGrid:
         above[np.isnan(above) | (above < -MAX_BELOW_PLANE_M) | (cut & (above > 0))] = np.inf
         if not np.isfinite(above).any():
             above[:] = 0.0
-        eroded = _limit_slope(above, MAX_SLOPE * CELL_M)
+        eroded = _limit_slope(above, CELL_M * np.where(upright, MAX_SLOPE, MAX_RAMP_SLOPE))
         nearest = distance_transform_edt(eroded < above, return_distances=False, return_indices=True)
         floor = eroded[tuple(nearest)]
         # What is higher than a kerb stands on the floor, which is as high there as where it is seen.
@@ -115,22 +117,23 @@ def _find_slopes(points, viewpoint):  # type: ignore[no-untyped-def]
 
 def _find_lowest(
     points: np.ndarray, by_lowest_ray: np.ndarray, low: np.ndarray, shape: np.ndarray, all_inside: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return a low percentile (W, D) of z in each cell, NaN where too few points are, and where the floor is lower.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a low percentile (W, D) of z in each cell, NaN where too few points are, and where something stands.
 
-    That is where something stands whose lowest point is `by_lowest_ray` (N,).
+    And where its floor is lower, since its lowest point is `by_lowest_ray` (N,).
     """
     if not all_inside:
         inside = ~((points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1))
         points, by_lowest_ray = points[inside], by_lowest_ray[inside]
-    lowest, cut = _select_lowest(points, by_lowest_ray, *sort_into_cells(points, low, shape, CELL_M))
-    size = int(shape[0]), int(shape[1])
-    return lowest.reshape(size), cut.reshape(size)
+    found = _select_lowest(points, by_lowest_ray, *sort_into_cells(points, low, shape, CELL_M))
+    lowest, upright, cut = (each.reshape(int(shape[0]), int(shape[1])) for each in found)
+    return lowest, upright, cut
 
 
 @njit(cache=True, nogil=True)
 def _select_lowest(points, by_lowest_ray, order, first):  # type: ignore[no-untyped-def]
-    lowest, cut = np.full(len(first) - 1, np.nan), np.zeros(len(first) - 1, np.bool_)
+    lowest = np.full(len(first) - 1, np.nan)
+    upright, cut = np.zeros((2, len(lowest)), np.bool_)
     for cell in range(len(lowest)):
         count = first[cell + 1] - first[cell]
         if count >= MIN_CELL_POINTS:
@@ -138,10 +141,11 @@ def _select_lowest(points, by_lowest_ray, order, first):  # type: ignore[no-unty
             for k in range(count):
                 z[k] = points[order[first[cell] + k], 2]
             least = order[first[cell] + z.argmin()]
-            cut[cell] = by_lowest_ray[least] and z.max() - z.min() > MIN_UPRIGHT_M
+            upright[cell] = z.max() - z.min() > MIN_UPRIGHT_M
+            cut[cell] = upright[cell] and by_lowest_ray[least]
             rank = int(LOW_SHARE * count)
             lowest[cell] = np.partition(z, rank)[rank]
-    return lowest, cut
+    return lowest, upright, cut
 
 
 def _fit_plane(lowest: np.ndarray, cut: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -169,8 +173,8 @@ def _fit_plane(lowest: np.ndarray, cut: np.ndarray, x: np.ndarray, y: np.ndarray
 
 
 @njit(cache=True, nogil=True)
-def _limit_slope(heights: np.ndarray, step: float) -> np.ndarray:
-    """Lower each cell to what its neighbours allow at `step` m a cell."""
+def _limit_slope(heights: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Lower each cell (W, D) to what its neighbours allow at its `step` (W, D) m a cell."""
     result = heights.copy()
     wide, deep = result.shape
     for turn in range(4):
@@ -182,7 +186,7 @@ def _limit_slope(heights: np.ndarray, step: float) -> np.ndarray:
                 for di in range(-1, 2):
                     for dj in range(-1, 2):
                         if 0 <= i + di < wide and 0 <= j + dj < deep:
-                            best = min(best, result[i + di, j + dj] + step * np.sqrt(float(di * di + dj * dj)))
+                            best = min(best, result[i + di, j + dj] + step[i, j] * np.sqrt(float(di * di + dj * dj)))
                 result[i, j] = best
     return result
 
