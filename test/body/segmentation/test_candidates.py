@@ -56,7 +56,7 @@ def test_the_floor_follows_a_ramp_and_not_what_stands_on_it() -> None:
     points = np.column_stack([xy, np.clip(0.08 * xy[:, 0] - 0.16, 0.0, 0.64) + rng.normal(0, 0.01, len(xy))])
     floor = FloorGrid.find(np.concatenate([points, figure(5.0, 0.0, 0.24, rng)]), SENSOR)
     for x in (-5.0, 5.0, 8.0, 12.0):
-        assert abs(floor.locate(x, 0.0) - np.clip(0.08 * x - 0.16, 0.0, 0.64)) < 0.07
+        assert abs(floor.locate(x, 0.0) - np.clip(0.08 * x - 0.16, 0.0, 0.64)) < 0.09
 
 
 def test_a_floor_that_was_cut_away_is_where_the_legs_end() -> None:
