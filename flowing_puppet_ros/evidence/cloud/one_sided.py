@@ -170,20 +170,22 @@ def _measure_stretch(directions: np.ndarray, every: int) -> float:
     return float(np.clip(ratio, 1 / MAX_STRETCH, MAX_STRETCH))
 
 
-@njit(cache=True, nogil=True)
+# No NaN is compared, so that the smallest of many is found several at a time.
+@njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})
 def _find_gaps(directions, every):  # type: ignore[no-untyped-def]
     """Return the distances (M,) from every such direction to the next one to its sides, and to the next up or down."""
     count = (len(directions) + every - 1) // every
-    across, down = np.full(count, np.inf), np.full(count, np.inf)
+    across, down, none = np.empty(count), np.empty(count), np.inf
+    x, y = directions[:, 0].copy(), directions[:, 1].copy()
     for number in range(count):
-        x, y = directions[number * every, 0], directions[number * every, 1]
-        for k in range(len(directions)):
-            dx, dy = abs(directions[k, 0] - x), abs(directions[k, 1] - y)
-            if dx > dy:
-                across[number] = min(across[number], dx * dx + dy * dy)
-            elif dy > 0:
-                down[number] = min(down[number], dx * dx + dy * dy)
-    return np.sqrt(across), np.sqrt(down)
+        own_x, own_y, nearest_across, nearest_down = x[number * every], y[number * every], none, none
+        for k in range(len(x)):
+            dx, dy = abs(x[k] - own_x), abs(y[k] - own_y)
+            squared = dx * dx + dy * dy
+            nearest_across = min(nearest_across, squared if dx > dy else none)
+            nearest_down = min(nearest_down, none if dx > dy or dy == 0.0 else squared)
+        across[number], down[number] = np.sqrt(nearest_across), np.sqrt(nearest_down)
+    return across, down
 
 
 def distances(targets: np.ndarray, points: np.ndarray, allowed: np.ndarray) -> np.ndarray:
