@@ -38,7 +38,7 @@ BEST_OF_WAY = 2  # bodies of those that face the same way that many points refin
 COST_SCALE_M, SAME_POSE_M, FINAL_STEPS = 0.003, 0.2, 2
 """Difference of the costs of two bodies at which the worse counts 1 / e, mean distance of their joints up to which they
 are averaged, and steps from the mean."""
-CLOSE_M, CLOSE_WORTH_M, ALIGNMENT_WORTH_M = 0.03, 0.3, 0.1
+CLOSE_M, CLOSE_WORTH_M, ALIGNMENT_WORTH_M = 0.03, 0.1, 0.1
 """Distance up to which a point is close to a body, and what a share of 1 of close points and a cosine of 1 between the
 normals are worth."""
 FLOOR_WEIGHT, SOLE_VERTICES = 0.3, 25
