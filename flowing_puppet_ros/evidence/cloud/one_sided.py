@@ -24,9 +24,9 @@ MAX_CELLS = 60_000  # of the grid of directions
 SPACING_NEIGHBOUR = 4  # the spacing of directions is the distance to this neighbour ...
 SPACING_PERCENTILE = 90  # ... at this percentile over the cloud, or so many points of it
 MAX_SPACING_POINTS = 1000
-MAX_GAP_POINTS, MIN_STRETCH, MAX_STRETCH = 60, 2.0, 8.0
-"""Points at which the gaps down and across are measured, at most, and their ratio from which on, and up to which, it
-counts."""
+MAX_GAP_PAIRS, MIN_STRETCH, MAX_STRETCH = 200_000, 2.0, 8.0
+"""Pairs of points of which the gaps down and across are measured, about, at most, and their ratio from which on, and up
+to which, it counts."""
 TOLERANCE_SPACINGS = 1.5
 """Spacings of the seen directions beyond which a direction is beside the silhouette."""
 MAX_DISTANCE_M = 0.15
@@ -84,7 +84,7 @@ class OneSidedView:
         """
         axes = _axes(points.mean(axis=0) - viewpoint)
         directions, depth = _project(points, viewpoint, axes)
-        stretch = _measure_stretch(directions, 1 + len(directions) // MAX_GAP_POINTS)
+        stretch = _measure_stretch(directions)
         squeeze = np.array([1.0, 1.0 / stretch])
         directions *= squeeze
         every = 1 + len(points) // MAX_SPACING_POINTS
@@ -160,11 +160,11 @@ def measure_stretch(points: np.ndarray, viewpoint: np.ndarray) -> float:
     It is 1 where they are much the same, as in a depth image, and above 1 for the rings of a LiDAR.
     """
     directions = _project(points, viewpoint, _axes(points.mean(axis=0) - viewpoint))[0]
-    return _measure_stretch(directions, 1 + len(directions) // MAX_GAP_POINTS)
+    return _measure_stretch(directions)
 
 
-def _measure_stretch(directions: np.ndarray, every: int) -> float:
-    across, down = _find_gaps(directions, every)
+def _measure_stretch(directions: np.ndarray) -> float:
+    across, down = _find_gaps(directions, 1 + len(directions) ** 2 // MAX_GAP_PAIRS)
     ratio = float(np.median(down) / max(float(np.median(across)), 1e-9))
     ratio = 1.0 if not np.isfinite(ratio) or 1 / MIN_STRETCH < ratio < MIN_STRETCH else ratio
     return float(np.clip(ratio, 1 / MAX_STRETCH, MAX_STRETCH))
