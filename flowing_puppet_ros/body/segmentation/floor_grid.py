@@ -33,7 +33,7 @@ MAX_PLANE_SLOPE = 0.25
 BLUR_CELLS = 0.7
 FLOOR_THICKNESS_M, MIN_FLOOR_SHARE, MAX_CEILING_SHARE = 0.1, 0.25, 0.08
 """Distance from the floor up to which points are on it, the share of a scan's points that are on it at least, and the
-share that may be on what is lowest in a scan that is upside down."""
+share that may be on what is lowest in a scan that is upside down, or below it in one that is not."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,11 +79,11 @@ class FloorGrid:
 
 def looks_upside_down(points: np.ndarray) -> bool:
     """Return whether a scene (N, 3) m with N > 0 has its floor above everything else: its sensor hangs head first."""
-    below, above = (
-        float((np.abs(FloorGrid.find(each).height(each)) < FLOOR_THICKNESS_M).mean())
-        for each in (points, points * np.array([1.0, 1.0, -1.0]))
-    )
-    return above > MIN_FLOOR_SHARE and below < MAX_CEILING_SHARE
+    height, other = (FloorGrid.find(each).height(each) for each in (points, points * np.array([1.0, 1.0, -1.0])))
+    if (np.abs(other) < FLOOR_THICKNESS_M).mean() <= MIN_FLOOR_SHARE:
+        return False
+    too_low = (height < -MIN_UPRIGHT_M).mean()
+    return bool((np.abs(height) < FLOOR_THICKNESS_M).mean() < MAX_CEILING_SHARE or too_low > MAX_CEILING_SHARE)
 
 
 def _find_lowest_rays(points: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
