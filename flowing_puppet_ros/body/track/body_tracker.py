@@ -61,13 +61,15 @@ ALIGN_GAP_NS = 100_000_000
 class _TrackState:
     """What is known of the person after a cloud.
 
-    `best` two-way distance in metres since the last full fit, `frames` whose shape was learned, `visible` surface that
-    is normally seen (points times squared metres of distance), `lost`: the body is not where the person is.
+    `best` two-way distance in metres since the last full fit, of a cloud of `best_points`, `frames` whose shape was
+    learned, `visible` surface that is normally seen (points times squared metres of distance), `lost`: the body is not
+    where the person is.
     """
 
     before: BodyObservation | None = None
     last: BodyObservation | None = None
     best: float = np.inf
+    best_points: int = 0
     frames: int = 0
     visible: float = 0.0
     hidden: bool = False
@@ -107,7 +109,7 @@ class BodyTracker:
         self._no_joints = JointTargets.none(fitter.model)
         self._upright = UprightFitter(fitter)
         self.counters: Counter[str] = Counter()
-        self._quick = False
+        self._quick = self._only_upright = False
         self.cloud: Cloud | None = None
         self.reset()
 
@@ -125,17 +127,22 @@ class BodyTracker:
         """Whether the last body is not where the person is."""
         return self._state.lost
 
-    def fork(self, quick: bool) -> BodyTracker:
-        """Return a tracker that knows the same person and goes its own way from here; `quick`: in its full fits too."""
+    def fork(self, quick: bool, upright: bool) -> BodyTracker:
+        """Return a tracker that knows the same person and goes its own way from here.
+
+        Its full fits are `quick`, or, where the floor is known, of `upright` bodies only.
+        """
         made = copy(self)
-        made._quick = quick
+        made._quick, made._only_upright = quick, upright
         made.counters = self.counters.copy()
         return made
 
     def start(self, person: PersonCloud, fit: BodyFit) -> None:
         """Start from a body that was found in the person's cloud."""
-        seen = BodyObservation(fit, person.stamp, person.points.mean(axis=0))
-        self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
+        seen = BodyObservation(fit, person.stamp, person.points.mean(axis=0), len(person.points))
+        self._state = _TrackState(
+            last=seen, best=fit.two_way_distance, best_points=len(person.points), frames=1, lost=False
+        )
 
     def correct(self, fit: BodyFit, parts: Sequence[int]) -> None:
         """Take another body for the last cloud, of which `parts` are elsewhere; they are not taken to have moved."""
@@ -183,8 +190,9 @@ class BodyTracker:
 
     def accept(self) -> None:
         """Take the last body for the best there is: a full fit has found none that is closer."""
-        if self._state.last is not None:
-            self._state = replace(self._state, best=self._state.last.fit.two_way_distance, lost=False)
+        last = self._state.last
+        if last is not None:
+            self._state = replace(self._state, best=last.fit.two_way_distance, best_points=last.points, lost=False)
 
     def track_or_refit(self, person: PersonCloud, seed: int | None = None, progress: Progress | None = None) -> BodyFit:
         """Fit the next cloud of the person, by a full fit when there is no track or it is lost.
@@ -274,16 +282,18 @@ class BodyTracker:
         if start is None:
             start = self._predict(last, cloud.points.mean(axis=0), prepared.stamp)
         fit = self._step(start, prepared)
-        return fit, self._is_lost(fit)
+        return fit, self._is_lost(fit, prepared)
 
     def _record(self, fit: BodyFit, lost: bool, prepared: _Prepared) -> BodyFit:
         state = self._state
         if prepared.few:
             fit = keep_place_only(self._fitter.model, fit, len(prepared.cloud.points))
-        seen = BodyObservation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
-        best = state.best if lost or prepared.occluded else min(state.best, fit.two_way_distance)
+        points = len(prepared.cloud.points)
+        seen = BodyObservation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0), points)
+        if not lost and not prepared.occluded and fit.two_way_distance < state.best:
+            state = replace(state, best=fit.two_way_distance, best_points=points)
         frames = state.frames + (not prepared.occluded)
-        self._state = replace(state, before=state.last, last=seen, best=best, frames=frames, lost=lost)
+        self._state = replace(state, before=state.last, last=seen, frames=frames, lost=lost)
         return fit
 
     def _step(self, start: BodyState, prepared: _Prepared) -> BodyFit:
@@ -292,7 +302,7 @@ class BodyTracker:
         if places is not None and last is not None and prepared.stamp - last.stamp >= ALIGN_GAP_NS:
             start = align(self._fitter.gauss_newton, start, places)
         fit = self._refine(start, prepared, NARROW_WIDTHS_M, steps)
-        if not self._is_lost(fit):
+        if not self._is_lost(fit, prepared):
             self.counters["tracked"] += 1
             return fit
         self.counters["widened"] += 1
@@ -308,9 +318,10 @@ class BodyTracker:
         """Return the full fit, unless the tracked body is closer to the cloud; its distance is the new best."""
         self.counters["searched"] += 1
         cloud = prepared.cloud
-        if prepared.few and prepared.floor is not None and isinstance(cloud, SingleViewCloud):
+        upright = prepared.few or self._only_upright
+        if upright and prepared.floor is not None and isinstance(cloud, SingleViewCloud):
             fit = self._upright.fit(cloud, prepared.floor).fit
-            return self._keep_closer(tracked, fit)
+            return self._keep_closer(tracked, fit, len(cloud.points))
         # Normals that were turned by a body that is lost would mislead the search.
         normals = None if prepared.oriented else cloud.normals
         # On the model's surface: vertices refined beyond it would come and go with the full fits.
@@ -324,14 +335,14 @@ class BodyTracker:
             nonrigid=False,
             quick=self._quick,
         )
-        return self._keep_closer(tracked, fit)
+        return self._keep_closer(tracked, fit, len(cloud.points))
 
-    def _keep_closer(self, tracked: BodyFit | None, fit: BodyFit) -> BodyFit:
+    def _keep_closer(self, tracked: BodyFit | None, fit: BodyFit, points: int) -> BodyFit:
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
-            self._state = replace(self._state, best=tracked.two_way_distance)
+            self._state = replace(self._state, best=tracked.two_way_distance, best_points=points)
             return tracked
         # How much of the person is normally seen does not depend on the body.
-        self._state = _TrackState(best=fit.two_way_distance, visible=self._state.visible)
+        self._state = _TrackState(best=fit.two_way_distance, best_points=points, visible=self._state.visible)
         return fit
 
     def _predict(self, last: BodyObservation, middle: F64, stamp: int) -> BodyState:
@@ -377,5 +388,9 @@ class BodyTracker:
         body = hang_unseen_parts(self._fitter.model, (last, body), cloud, prepared.targets)
         return self._fitter.assess(body, cloud)
 
-    def _is_lost(self, fit: BodyFit) -> bool:
-        return fit.two_way_distance > self._settings.lost_ratio * self._state.best + self._settings.lost_distance
+    def _is_lost(self, fit: BodyFit, prepared: _Prepared) -> bool:
+        best, points = self._state.best, len(prepared.cloud.points)
+        if prepared.floor is not None and points < self._state.best_points:
+            # The farther somebody walks away, the farther are the points from each other, and a body from them.
+            best *= float(np.sqrt(self._state.best_points / points))
+        return fit.two_way_distance > self._settings.lost_ratio * best + self._settings.lost_distance

@@ -128,11 +128,12 @@ def _is_jump(before: BodyFit, after: BodyFit, nanoseconds: int) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyObservation:
-    """A fit, the time of its cloud in nanoseconds, and the mean (3,) of the cloud's points, metres."""
+    """A fit, the time of its cloud in nanoseconds, the mean (3,) of the cloud's points, metres, and their number."""
 
     fit: BodyFit
     stamp: int
     middle: F64
+    points: int = 0
 
 
 def extrapolate(before: BodyObservation | None, last: BodyObservation, stamp: int) -> BodyState:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,10 +81,19 @@ class ScanView:
 
 @dataclass(slots=True, eq=False)
 class FitBudget:
-    """How many bodies may still be fitted in a scan, and how many of them in a row may be nobody; None: any number."""
+    """How many bodies may still be fitted in a scan.
+
+    Attributes:
+        fits: candidates to which bodies are fitted.
+        max_misses: so many of them in a row that are nobody end it; None: none does.
+        quick: whether the bank's best body alone is fitted to a candidate that it proves to be a person, and its other
+            bodies to one of those that it does not prove, where it proves nobody.
+        misses: how many in a row were nobody so far.
+    """
 
     fits: int
-    max_misses: int | None
+    max_misses: int | None = None
+    quick: bool = False
     misses: int = 0
 
     def spend(self) -> bool:
@@ -106,3 +116,26 @@ def take_apart(
             taken.append(middle)
             kept.append((judged, candidate))
     return kept
+
+
+def find_only_reached(
+    offered: Sequence[tuple[Candidate, float]], expected: Mapping[int, np.ndarray], reach: Sequence[float]
+) -> dict[int, int]:
+    """Return which of the candidates can only be one of the people `expected`, who can only be there.
+
+    Args:
+        offered: candidates, each with a probability.
+        expected: by number, where (2,) m people should be who are not seen there.
+        reach: metres within which each may be, by that number; nobody is found where it is empty.
+    """
+    near = {
+        owner: [
+            number
+            for number, (candidate, _) in enumerate(offered)
+            if np.hypot(*(candidate.middle - place)) < reach[owner]
+        ]
+        for owner, place in expected.items()
+        if reach
+    }
+    wanted = Counter(number for numbers in near.values() for number in numbers)
+    return {numbers[0]: owner for owner, numbers in near.items() if len(numbers) == 1 and wanted[numbers[0]] == 1}

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from flowing_puppet_ros.body.upright.found_body import (
     FoundBody,
     JudgedFit,
     ScanView,
+    find_only_reached,
     take_apart,
 )
 from flowing_puppet_ros.body.upright.person_model import PersonModel
@@ -30,7 +32,8 @@ from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS, Upright
 from flowing_puppet_ros.body.upright.verification import weigh_fit
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import find_beside
-from flowing_puppet_ros.process.threads import one_blas_thread
+from flowing_puppet_ros.model.sp import BodyState
+from flowing_puppet_ros.process.threads import one_blas_thread, parallel_map, usable_threads
 from flowing_puppet_ros.settings import Settings, setting
 
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
@@ -77,6 +80,7 @@ class PersonFinder:
         self._fitter = fitter
         self._settings = settings
         self.upright = UprightFitter(fitter)
+        self._threads = usable_threads(fitter.settings.threads)
         self._rejected = RejectedPlaces(settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
         self._view: ScanView | None = None
@@ -100,8 +104,8 @@ class PersonFinder:
         viewpoint: np.ndarray,
         stamp: int,
         known: Sequence[np.ndarray] = (),
-        max_fits: int | None = None,
-        max_misses: int | None = None,
+        reach: Sequence[float] = (),
+        budget: FitBudget | None = None,
         remember: bool = True,
         come: np.ndarray | None = None,
         only_known: bool = False,
@@ -114,8 +118,9 @@ class PersonFinder:
             viewpoint: (3,) position of the sensor, metres.
             stamp: of the scan in nanoseconds.
             known: points (K, 3) in metres on each body that is expected in the scan, at its predicted position.
-            max_fits: bodies that are fitted at most, the likeliest first; None: as set.
-            max_misses: so many fits in a row of which none is a person end it; None: none does.
+            reach: metres within which somebody of these who is not seen there may be instead: a candidate that only one
+                of them can have reached is theirs, and needs no fit; of none where it is empty.
+            budget: of fits, to the likeliest candidates first; None: as many as are set.
             remember: whether what is no person is remembered, and what was none is left out.
             come: which (N,) points lie where the scans before saw through; None where nothing is known.
             only_known: nobody else is looked for, unless one of those who are expected is not there.
@@ -142,8 +147,13 @@ class PersonFinder:
         middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
         unseen = {owner: middle for owner, middle in enumerate(middles) if owner not in seen}
         taken = [middle for owner, middle in enumerate(middles) if owner in seen]
-        budget = FitBudget(self._settings.max_fits if max_fits is None else max_fits, max_misses)
-        found, bent = self._fit_offered(self._choose(candidates, view), view, budget)
+        budget = FitBudget(self._settings.max_fits) if budget is None else budget
+        offered = self._choose(candidates, view)
+        for number, owner in sorted(find_only_reached(offered, unseen, reach).items(), reverse=True):
+            people.append(FoundBody(make(offered.pop(number)[0].rows, owner=owner), None))
+            self._owned[people[-1].person.rows] = True
+            taken.append(unseen.pop(owner))
+        found, bent = self._fit_offered(offered, view, budget)
         accepted: list[tuple[JudgedFit, Candidate]] = []
         fresh = take_apart(found, taken)
         while fresh:
@@ -166,13 +176,27 @@ class PersonFinder:
     ) -> tuple[list[tuple[JudgedFit, Candidate]], list[Candidate]]:
         """Fit candidates with their probabilities by shape, and return who is a person, and who may be a bent one."""
         found, bent = [], []
-        for candidate, probability in offered:
+        started: dict[int, _FirstFit | None] = {}
+        if budget.quick:
+            some = [candidate for candidate, _ in offered[: budget.fits]]
+            start = partial(self._start, view=view, quick=True)
+            started = dict(enumerate(parallel_map(start, some, self._threads)))
+        # In a live stream, who is found at once does not wait for what may be nobody.
+        likely = sum(each is not None and self._is_proven(each.judged) for each in started.values())
+        for number, (candidate, probability) in enumerate(offered):
             if not budget.spend():
                 break
-            judged = self._judge(candidate, probability, view)
-            if judged is None:
+            first = started[number] if budget.quick else self._start(candidate, view)
+            if first is None:
                 continue
-            if judged.probability >= self._settings.min_probability:
+            judged = first.judged
+            worthwhile = judged.probability >= MIN_WORTHWHILE or probability >= MIN_SHAPELY
+            if worthwhile and not (budget.quick and self._is_proven(judged)):
+                if likely:
+                    continue  # the next scans try the others
+                likely += budget.quick
+                judged = self._try_others(first, candidate, view)
+            if self._is_proven(judged):
                 found.append((judged, candidate))
                 budget.misses = 0
                 continue
@@ -215,13 +239,15 @@ class PersonFinder:
         return [(judged, replace(candidate, rows=rows[candidate.rows])) for judged, candidate in found]
 
     @one_blas_thread()
-    def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit, turn: bool = False) -> JudgedFit:
+    def judge(
+        self, person: PersonCloud, rows: np.ndarray, fit: BodyFit, turn: bool = False, quick: bool = False
+    ) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
 
         With `turn` also about one that faces the other way.
 
-        Points of other people count neither for nor against it. Where it explains few points badly, a new upright body
-        may be better, and is returned instead. What is rejected is remembered as by `find`.
+        Points of other people count neither for nor against it. Where it explains few points badly, a new upright body,
+        a `quick` one or the best, may be better, and is returned instead. What is rejected is remembered as by `find`.
         """
         if self._view is None or not len(rows):
             return JudgedFit(0.0, 0.0, fit)
@@ -234,7 +260,7 @@ class PersonFinder:
             return JudgedFit(0.0, 0.0, fit)
         judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, view, window)
         if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
-            other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0])
+            other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0], quick)
             again = self._weigh(other, cloud, candidate, view, window)
             judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
@@ -290,8 +316,11 @@ class PersonFinder:
                 chosen.append((candidate, likely))
         return chosen
 
-    def _judge(self, candidate: Candidate, probability: float, view: ScanView) -> JudgedFit | None:
-        """Return the body and how likely it is a person; None where no body can be fitted."""
+    def _is_proven(self, judged: JudgedFit) -> bool:
+        return judged.probability >= self._settings.min_probability
+
+    def _start(self, candidate: Candidate, view: ScanView, quick: bool = False) -> _FirstFit | None:
+        """Fit the bank's best body, and judge it; None where no body can be fitted."""
         rays, points = view.rays, view.scene.points[candidate.rows]
         window = rays.find_window(points)
         try:
@@ -299,21 +328,31 @@ class PersonFinder:
         except InputError:  # the sensor stands in it
             return None
 
-        def weigh(found: UprightFit) -> JudgedFit:
-            return self._weigh(found, cloud, candidate, view, window)
+        starts = self.upright.find_rough(cloud, candidate.floor, quick=quick)
+        found = self.upright.refine(starts[:1], cloud, candidate.floor)
+        return _FirstFit(cloud, window, starts[1:], found, self._weigh(found, cloud, candidate, view, window))
 
-        starts = self.upright.find_rough(cloud, candidate.floor)
-        first = self.upright.refine(starts[:1], cloud, candidate.floor)
-        judged = weigh(first)
-        worthwhile = judged.probability >= MIN_WORTHWHILE or probability >= MIN_SHAPELY
-        if worthwhile and len(starts) > 1:
-            others = self.upright.refine(starts[1:], cloud, candidate.floor)
-            if others.score < first.score:
-                other = weigh(others)
-                # Who is a person by one of both is one.
-                if other.probability >= min(judged.probability, self._settings.min_probability):
-                    judged = other
-        return judged
+    def _try_others(self, first: _FirstFit, candidate: Candidate, view: ScanView) -> JudgedFit:
+        """Return the best of the bank's other bodies where it is better than the first, else the first."""
+        if not first.others:
+            return first.judged
+        others = self.upright.refine(first.others, first.cloud, candidate.floor)
+        if others.score < first.found.score:
+            other = self._weigh(others, first.cloud, candidate, view, first.window)
+            # Who is a person by one of both is one.
+            if other.probability >= min(first.judged.probability, self._settings.min_probability):
+                return other
+        return first.judged
+
+
+class _FirstFit(NamedTuple):
+    """The bank's best body on a candidate: its cloud, the rays about it, other bodies to start from, and the result."""
+
+    cloud: SingleViewCloud
+    window: np.ndarray
+    others: list[tuple[float, BodyState]]
+    found: UprightFit
+    judged: JudgedFit
 
 
 def _pop_nearest(middles: dict[int, np.ndarray], place: np.ndarray) -> int | None:

@@ -106,14 +106,21 @@ class UprightFitter:
         points = downsample(points, None, MAX_FIT_POINTS)[0]
         return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, unknown, field)
 
-    def find_rough(self, cloud: SingleViewCloud, floor: float) -> list[tuple[float, BodyState]]:
-        """Return the bank's best bodies with their costs in metres."""
-        return make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS)
+    def find_rough(
+        self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False
+    ) -> list[tuple[float, BodyState]]:
+        """Return the bank's best bodies with their costs in metres; `quick`: of a fourth of it; `facing` as there."""
+        return make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS, facing, 2 if quick else 1)
 
-    def fit(self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None) -> UprightFit:
-        """Fit the best upright body to a cloud; `floor` is z of the floor, m; `facing` (2,) as in `UprightBank`."""
-        starts = make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS, facing)
-        return self.refine(starts, cloud, floor)
+    def fit(
+        self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False
+    ) -> UprightFit:
+        """Fit the best upright body to a cloud; `floor` is z of the floor, m; `facing` (2,) as in `UprightBank`.
+
+        A `quick` one is that of the best of a part of the bank, in a tenth of the time.
+        """
+        starts = self.find_rough(cloud, floor, facing, quick)
+        return self.refine(starts[:1] if quick else starts, cloud, floor)
 
     def refine(self, starts: list[tuple[float, BodyState]], cloud: SingleViewCloud, floor: float) -> UprightFit:
         """Refine bodies and return the best; `floor` is z of the floor, metres."""

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One person of several who are tracked: where they are, what tracks their body, and whether they are a person."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.track.body_tracker import BodyTracker
+from flowing_puppet_ros.body.track.person_belief import EVERY_SCAN, PersonBelief
+from flowing_puppet_ros.body.track.rig_scene import shows_person
+from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
+from flowing_puppet_ros.body.upright.found_body import JudgedFit
+from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
+from flowing_puppet_ros.errors import InputError
+
+VELOCITY_GAIN = 0.5  # fraction of a new velocity that is taken, but for the first
+MAX_VELOCITY_GAP_NS = 1_000_000_000  # between clouds that give a velocity
+REACH_M, SPEED_M_PER_S, CHANGE_M_PER_S = 0.4, 2.0, 1.0
+"""From where somebody is expected to where they may be: by how the middle of what is seen differs, by the speed of one
+whose velocity is not known yet, and by how a known one changes while nobody sees them."""
+KNOWN_SIGHTINGS = 3  # clouds from which on a velocity is known
+REFIT_INTERVAL_NS = 5_000_000_000  # from one full fit of an unreliable body to the next
+LOST_INTERVAL_NS, MAX_DOUBLINGS = 1_000_000_000, 4
+"""The same of a lost body where full fits are to be seldom; each doubles both, so many times: what several full fits
+did not mend, more of them hardly will."""
+AT_ONCE_INTERVAL_NS = 1_000_000_000  # between attempts at a body at once: people soon stand otherwise
+TURN_INTERVAL_NS = 1_000_000_000  # between attempts to turn a body round that walks backwards
+
+Judge = Callable[[PersonCloud, BodyFit, bool], JudgedFit]
+"""What a scan says about a body, or about a better one that it has instead; if wanted, also about one turned round."""
+
+
+@dataclass(slots=True, eq=False)
+class PersonTrack:
+    """One person.
+
+    The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, its `motion`, the number
+    of full fits and the stamp of the last, those of the last attempts to turn it round and at a body at once, whether
+    it is `proven` to be a person, what scans said about that, the number of clouds that showed them, and whether the
+    body is a `rough` one that came at once.
+    """
+
+    id: str
+    number: int
+    middle: F64
+    stamp: int
+    tracker: BodyTracker
+    velocity: F64 = field(default_factory=lambda: np.zeros(3))
+    motion: TorsoMotion = field(default_factory=TorsoMotion)
+    fits: int = 0
+    fitted: int = 0
+    turned: int = -TURN_INTERVAL_NS
+    tried: int = -AT_ONCE_INTERVAL_NS
+    proven: bool = True
+    belief: PersonBelief | None = None
+    sightings: int = 1
+    rough: bool = False
+
+    @property
+    def shows_reliable(self) -> bool:
+        """Whether the last body is reliable."""
+        return self.tracker.last is not None and self.tracker.last.reliable
+
+    def predict_middle(self, stamp: int) -> F64:
+        """Return where the middle should be at a later time in nanoseconds."""
+        return np.asarray(self.middle + self.velocity * 1e-9 * (stamp - self.stamp))
+
+    def reach(self, stamp: int) -> float:
+        """Return how far (m) from `predict_middle` the person may be at a time in nanoseconds."""
+        speed = SPEED_M_PER_S if self.sightings < KNOWN_SIGHTINGS else CHANGE_M_PER_S
+        return REACH_M + speed * 1e-9 * (stamp - self.stamp)
+
+    def is_due(self, stamp: int) -> bool:
+        """Return whether a scan of a time in nanoseconds should be asked whether this is a person."""
+        return self.belief is None or self.belief.is_due(stamp)
+
+    def count_asked(self) -> tuple[int, int]:
+        """Return how many scans were asked, as far as that matters, and the stamp of the last."""
+        return (0, 0) if self.belief is None else (min(self.belief.count, EVERY_SCAN), self.belief.asked)
+
+    def wants_fit(self, fit: BodyFit | None, stamp: int, seldom: bool) -> bool:
+        """Return whether a full fit may give a better body than that of the cloud of a time in nanoseconds."""
+        if fit is None or self.rough:
+            return True
+        passed, doubled = stamp - self.fitted, 2 ** min(self.fits, MAX_DOUBLINGS) if seldom else 1
+        # A full fit to the little that is seen of a hidden person would bend the body.
+        if not fit.reliable and not self.tracker.hidden and passed >= REFIT_INTERVAL_NS * doubled:
+            return True
+        return self.tracker.lost and (not seldom or passed >= LOST_INTERVAL_NS * doubled)
+
+    def prove(self, person: PersonCloud, fit: BodyFit) -> bool:
+        """Return whether it is known to be a person, as a body of theirs may show from then on."""
+        self.proven = self.proven or shows_person(person, fit)
+        return self.proven and (self.belief is None or self.belief.decide())
+
+    def start(self, person: PersonCloud, fit: BodyFit, rough: bool) -> None:
+        """Start with a body that was found in the person's cloud, and what was said about it there."""
+        self.tracker.start(person, fit)
+        self.rough = rough and not fit.reliable
+        # Many points tell more than an upright body shows: a full fit may follow at once.
+        doubtful = not fit.reliable and len(person.points) >= MIN_MANY_POINTS
+        self.fitted = person.stamp - REFIT_INTERVAL_NS if doubtful else person.stamp
+        if person.proven:
+            self.belief = PersonBelief(person.middle[:2])
+            self.belief.add(person.score, fit.confidence, self.stamp, len(person.points))
+
+    def weigh(self, person: PersonCloud, fit: BodyFit, judge: Judge | None) -> BodyFit:
+        """Ask a scan, if any, whether it is a person, unless too little is seen; return its body."""
+        if self.belief is None:
+            self.belief = PersonBelief(person.middle[:2])
+        self.belief.visit(person.points, self.stamp)
+        if judge is not None and not self.tracker.hidden:
+            judged = judge(person, fit, self.belief.asks_facing(len(person.points)))
+            self.belief.add(judged.probability, judged.confidence, self.stamp, len(person.points))
+            if judged.turned is not None and self.belief.turns(judged.turned[1]):
+                self.tracker.start(person, judged.turned[0])
+                self.motion.allow_turn()
+                return judged.turned[0]
+            if judged.fit is not fit:
+                self.tracker.start(person, judged.fit)
+            return judged.fit
+        return fit
+
+    def show(self, fit: BodyFit) -> TrackedBody:
+        """Return its body at the time of the last cloud, with what is known of its motion."""
+        if self.belief is not None and self.belief.confidence is not None:
+            fit = replace(fit, confidence=self.belief.confidence)
+        return self.motion.add(self.id, self.stamp, fit, self.tracker.hidden)
+
+    def update(self, middle: F64, stamp: int) -> None:
+        """Take where the person is now."""
+        if 0 < stamp - self.stamp <= MAX_VELOCITY_GAP_NS:
+            measured = (middle - self.middle) / (1e-9 * (stamp - self.stamp))
+            self.velocity = self.velocity + (VELOCITY_GAIN if self.sightings > 1 else 1.0) * (measured - self.velocity)
+        else:
+            self.velocity = np.zeros(3)
+        self.middle, self.stamp, self.sightings = middle, stamp, self.sightings + 1
+
+
+def track_person(pair: tuple[PersonTrack, PersonCloud]) -> BodyFit | InputError | None:
+    """Track a person to their next cloud and return the body, None where there is none yet, or what is wrong."""
+    track, person = pair
+    try:
+        if person.stamp - track.turned >= TURN_INTERVAL_NS and track.motion.walks_backwards():
+            track.turned = person.stamp
+            turned = track.tracker.turn_round(person)
+            if turned is not None:
+                track.motion.allow_turn()
+                return turned
+        return track.tracker.track(person)
+    except InputError as error:
+        return error
