@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +26,14 @@ from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.settings import BodyTrackerSettings
-from flowing_puppet_ros.body.track.tracked_body import BodyObservation, align, extrapolate, translate
+from flowing_puppet_ros.body.track.tracked_body import (
+    BodyObservation,
+    TrackState,
+    align,
+    extrapolate,
+    is_far,
+    translate,
+)
 from flowing_puppet_ros.body.upright.upright_fit import (
     FEW_POINTS,
     MANY_POINTS,
@@ -55,25 +62,6 @@ MAX_TRACKED_POINTS = 2500
 """Of one side of a person whose joints somebody sees: the shape comes from many clouds, and no full fit from these."""
 ALIGN_GAP_NS = 100_000_000
 """Time between clouds from which on a body is first moved to the joints that somebody sees."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _TrackState:
-    """What is known of the person after a cloud.
-
-    `best` two-way distance in metres since the last full fit, of a cloud of `best_points`, `frames` whose shape was
-    learned, `visible` surface that is normally seen (points times squared metres of distance), `lost`: the body is not
-    where the person is.
-    """
-
-    before: BodyObservation | None = None
-    last: BodyObservation | None = None
-    best: float = np.inf
-    best_points: int = 0
-    frames: int = 0
-    visible: float = 0.0
-    hidden: bool = False
-    lost: bool = True
 
 
 class _Prepared(NamedTuple):
@@ -115,7 +103,7 @@ class BodyTracker:
 
     def reset(self) -> None:
         """Forget the person."""
-        self._state = _TrackState()
+        self._state = TrackState()
 
     @property
     def last(self) -> BodyFit | None:
@@ -140,7 +128,7 @@ class BodyTracker:
     def start(self, person: PersonCloud, fit: BodyFit) -> None:
         """Start from a body that was found in the person's cloud."""
         seen = BodyObservation(fit, person.stamp, person.points.mean(axis=0), len(person.points))
-        self._state = _TrackState(
+        self._state = TrackState(
             last=seen, best=fit.two_way_distance, best_points=len(person.points), frames=1, lost=False
         )
 
@@ -302,7 +290,7 @@ class BodyTracker:
         if places is not None and last is not None and prepared.stamp - last.stamp >= ALIGN_GAP_NS:
             start = align(self._fitter.gauss_newton, start, places)
         fit = self._refine(start, prepared, NARROW_WIDTHS_M, steps)
-        if not self._is_lost(fit, prepared):
+        if not self._is_lost(fit, prepared) or self._was_as_lost(fit):
             self.counters["tracked"] += 1
             return fit
         self.counters["widened"] += 1
@@ -342,15 +330,16 @@ class BodyTracker:
             self._state = replace(self._state, best=tracked.two_way_distance, best_points=points)
             return tracked
         # How much of the person is normally seen does not depend on the body.
-        self._state = _TrackState(best=fit.two_way_distance, best_points=points, visible=self._state.visible)
+        self._state = TrackState(best=fit.two_way_distance, best_points=points, visible=self._state.visible)
         return fit
 
     def _predict(self, last: BodyObservation, middle: F64, stamp: int) -> BodyState:
         """Return the last body, moved on by its last motion in proportion to the time.
 
-        After a long gap, which a full fit leaves in a live stream too, it moves as the middle of the cloud did.
+        Without one, and after a long gap, which a full fit leaves in a live stream too, it moves as the middle of the
+        cloud did.
         """
-        if stamp - last.stamp > 1e9 * self._settings.max_time_gap:
+        if stamp - last.stamp > 1e9 * self._settings.max_time_gap or is_far(self._state.before, last, stamp):
             return replace(last.fit.state, center=last.fit.state.center + middle - last.middle)
         return extrapolate(self._state.before, last, stamp)
 
@@ -387,6 +376,13 @@ class BodyTracker:
         last = start if self._state.last is None else self._state.last.fit.state
         body = hang_unseen_parts(self._fitter.model, (last, body), cloud, prepared.targets)
         return self._fitter.assess(body, cloud)
+
+    def _was_as_lost(self, fit: BodyFit) -> bool:
+        """Return whether more steps with a wider kernel left the body before as far from its cloud."""
+        last = self._state.last
+        if last is None or not self._state.lost:
+            return False
+        return fit.two_way_distance <= self._settings.lost_ratio * last.fit.two_way_distance
 
     def _is_lost(self, fit: BodyFit, prepared: _Prepared) -> bool:
         best, points = self._state.best, len(prepared.cloud.points)

@@ -25,6 +25,7 @@ from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCl
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.person_track import AT_ONCE_INTERVAL_NS, Judge, PersonTrack, track_person
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
+from flowing_puppet_ros.body.upright.found_body import ExpectedPerson
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.process.threads import parallel_map, usable_threads
@@ -94,9 +95,9 @@ class MultiBodyTracker:
             found.append(fit.vertices[::BODY_STRIDE] + moved if fit else np.empty((0, 3)))
         return found
 
-    def list_reach(self, stamp: int) -> list[float]:
-        """Return how far (m) each may be from there at a time in ns, in the order of `predict_bodies`."""
-        return [track.reach(stamp) for track in self._tracks]
+    def expect_people(self, stamp: int) -> list[ExpectedPerson]:
+        """Return where everybody may be at a time in ns, in the order of `predict_bodies`."""
+        return [track.expect(stamp) for track in self._tracks]
 
     def step(
         self,

@@ -15,16 +15,17 @@ from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.person_belief import EVERY_SCAN, PersonBelief
 from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
-from flowing_puppet_ros.body.upright.found_body import JudgedFit
+from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, JudgedFit
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 
-VELOCITY_GAIN = 0.5  # fraction of a new velocity that is taken, but for the first
-MAX_VELOCITY_GAP_NS = 1_000_000_000  # between clouds that give a velocity
+VELOCITY_HALF_LIFE_NS = 100_000_000  # in which half of a velocity is replaced by a new one
+MAX_VELOCITY_GAP_NS = 2_000_000_000  # between clouds that give a velocity
 REACH_M, SPEED_M_PER_S, CHANGE_M_PER_S = 0.4, 2.0, 1.0
 """From where somebody is expected to where they may be: by how the middle of what is seen differs, by the speed of one
 whose velocity is not known yet, and by how a known one changes while nobody sees them."""
-KNOWN_SIGHTINGS = 3  # clouds from which on a velocity is known
+MAX_CLAIM_GAP_NS = 150_000_000
+"""Time within which the body of somebody whose velocity is not known yet tells which points are theirs."""
 REFIT_INTERVAL_NS = 5_000_000_000  # from one full fit of an unreliable body to the next
 LOST_INTERVAL_NS, MAX_DOUBLINGS = 1_000_000_000, 4
 """The same of a lost body where full fits are to be seldom; each doubles both, so many times: what several full fits
@@ -42,7 +43,7 @@ class PersonTrack:
 
     The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, its `motion`, the number
     of full fits and the stamp of the last, those of the last attempts to turn it round and at a body at once, whether
-    it is `proven` to be a person, what scans said about that, the number of clouds that showed them, and whether the
+    it is `proven` to be a person, what scans said about that, whether the velocity is known (`moves`), and whether the
     body is a `rough` one that came at once.
     """
 
@@ -59,7 +60,7 @@ class PersonTrack:
     tried: int = -AT_ONCE_INTERVAL_NS
     proven: bool = True
     belief: PersonBelief | None = None
-    sightings: int = 1
+    moves: bool = False
     rough: bool = False
 
     @property
@@ -71,10 +72,12 @@ class PersonTrack:
         """Return where the middle should be at a later time in nanoseconds."""
         return np.asarray(self.middle + self.velocity * 1e-9 * (stamp - self.stamp))
 
-    def reach(self, stamp: int) -> float:
-        """Return how far (m) from `predict_middle` the person may be at a time in nanoseconds."""
-        speed = SPEED_M_PER_S if self.sightings < KNOWN_SIGHTINGS else CHANGE_M_PER_S
-        return REACH_M + speed * 1e-9 * (stamp - self.stamp)
+    def expect(self, stamp: int) -> ExpectedPerson:
+        """Return where the person may be at a time in nanoseconds; nowhere without a body, as that needs a fit."""
+        gap = stamp - self.stamp
+        speed = CHANGE_M_PER_S if self.moves else SPEED_M_PER_S
+        reach = REACH_M + speed * 1e-9 * gap if self.tracker.last is not None else 0.0
+        return ExpectedPerson(self.predict_middle(stamp)[:2], reach, self.moves or gap <= MAX_CLAIM_GAP_NS)
 
     def is_due(self, stamp: int) -> bool:
         """Return whether a scan of a time in nanoseconds should be asked whether this is a person."""
@@ -137,10 +140,11 @@ class PersonTrack:
         """Take where the person is now."""
         if 0 < stamp - self.stamp <= MAX_VELOCITY_GAP_NS:
             measured = (middle - self.middle) / (1e-9 * (stamp - self.stamp))
-            self.velocity = self.velocity + (VELOCITY_GAIN if self.sightings > 1 else 1.0) * (measured - self.velocity)
+            kept = 0.5 ** ((stamp - self.stamp) / VELOCITY_HALF_LIFE_NS) if self.moves else 0.0
+            self.velocity, self.moves = measured + kept * (self.velocity - measured), True
         else:
-            self.velocity = np.zeros(3)
-        self.middle, self.stamp, self.sightings = middle, stamp, self.sightings + 1
+            self.velocity, self.moves = np.zeros(3), False
+        self.middle, self.stamp = middle, stamp
 
 
 def track_person(pair: tuple[PersonTrack, PersonCloud]) -> BodyFit | InputError | None:

@@ -24,7 +24,7 @@ from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, M
 from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
-from flowing_puppet_ros.body.upright.found_body import FitBudget, FoundBody, JudgedFit
+from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget, FoundBody, JudgedFit
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
@@ -138,15 +138,16 @@ class SceneTracker:
             return self._tracker.step_one(person, seed, executor), []
         known = self._tracker.predict_bodies(cloud.stamp) if settings.track else ()
         if self._is_one_sided(cloud, remember=True):
-            reach = self._tracker.list_reach(cloud.stamp) if executor is not None and settings.track else ()
-            found = self._find(cloud, known, reach, settings.track, live=executor is not None)
+            live = executor is not None and settings.track
+            expected = self._tracker.expect_people(cloud.stamp) if live else ()
+            found = self._find(cloud, known, expected, settings.track, live)
             if not settings.track:
                 fits = {id(body.person): body.fit for body in found}
                 named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
                 return [TrackedBody(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
             first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
             seen = [body.person for body in found]
-            judge = partial(self._judge, quick=executor is not None)
+            judge = partial(self._judge, quick=live)
             bodies = self._tracker.step(seen, cloud.stamp, seed, executor, first, judge)
             return bodies, self._tracker.occluded_ids
         people = self._with_viewpoint(cloud, self._segment(cloud, known, self._planes))
@@ -187,7 +188,7 @@ class SceneTracker:
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
         """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
-        return self._find(cloud, (), (), remember=False)
+        return self._find(cloud)
 
     def fit_found(self, found: Sequence[FoundBody], seed: int, progress: Progress | None = None) -> list[BodyFit]:
         """Return the bodies of people found in a scene, fitted again where that may help, without the doubtful."""
@@ -228,9 +229,14 @@ class SceneTracker:
         return rows, np.asarray(cloud.points[rows], dtype=np.float64)
 
     def _find(
-        self, cloud: SceneCloud, known: Sequence[F64], reach: Sequence[float], remember: bool, live: bool = False
+        self,
+        cloud: SceneCloud,
+        known: Sequence[F64] = (),
+        expected: Sequence[ExpectedPerson] = (),
+        remember: bool = False,
+        live: bool = False,
     ) -> list[FoundBody]:
-        """Find the people of a single view; the known ones first. All, or of a tracked stream the likeliest."""
+        """Find the people of a single view; the known ones first. All, or of a live stream the likeliest."""
         rows, points = self._in_range(cloud)
         self._searched = rows
         if not self._was_searched and len(points):
@@ -249,7 +255,7 @@ class SceneTracker:
             cloud.viewpoint,
             cloud.stamp,
             known,
-            reach,
+            expected,
             self._make_budget(remember, live, is_tracked),
             remember,
             come,

@@ -136,6 +136,30 @@ class BodyObservation:
     points: int = 0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackState:
+    """What is known of the person after a cloud.
+
+    `best` two-way distance in metres since the last full fit, of a cloud of `best_points`, `frames` whose shape was
+    learned, `visible` surface that is normally seen (points times squared metres of distance), `lost`: the body is not
+    where the person is.
+    """
+
+    before: BodyObservation | None = None
+    last: BodyObservation | None = None
+    best: float = np.inf
+    best_points: int = 0
+    frames: int = 0
+    visible: float = 0.0
+    hidden: bool = False
+    lost: bool = True
+
+
+def is_far(before: BodyObservation | None, last: BodyObservation, stamp: int) -> bool:
+    """Return whether a time in nanoseconds is farther from the last one than the last motion tells about."""
+    return before is None or stamp - last.stamp > MAX_STRETCH * (last.stamp - before.stamp)
+
+
 def extrapolate(before: BodyObservation | None, last: BodyObservation, stamp: int) -> BodyState:
     """Return the last body, moved on by its last motion in proportion to the time."""
     state = last.fit.state

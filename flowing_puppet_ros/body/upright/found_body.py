@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,18 @@ class FoundBody:
 
     person: PersonCloud
     fit: BodyFit | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExpectedPerson:
+    """Somebody who is known: expected at a `place` (2,) m, within `reach` m of which they may be in a scan.
+
+    `claims`: whether the body there tells which points are theirs, so that only who has none is looked for.
+    """
+
+    place: np.ndarray
+    reach: float
+    claims: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,23 +131,23 @@ def take_apart(
 
 
 def find_only_reached(
-    offered: Sequence[tuple[Candidate, float]], expected: Mapping[int, np.ndarray], reach: Sequence[float]
+    offered: Sequence[tuple[Candidate, float]], unseen: Collection[int], expected: Sequence[ExpectedPerson]
 ) -> dict[int, int]:
-    """Return which of the candidates can only be one of the people `expected`, who can only be there.
+    """Return which of the candidates can only be one of the people who are not seen, and can only be there.
 
     Args:
         offered: candidates, each with a probability.
-        expected: by number, where (2,) m people should be who are not seen there.
-        reach: metres within which each may be, by that number; nobody is found where it is empty.
+        unseen: indices into `expected`.
+        expected: where people may be; nobody is found where it is empty.
     """
     near = {
         owner: [
             number
             for number, (candidate, _) in enumerate(offered)
-            if np.hypot(*(candidate.middle - place)) < reach[owner]
+            if np.hypot(*(candidate.middle - expected[owner].place)) < expected[owner].reach
         ]
-        for owner, place in expected.items()
-        if reach
+        for owner in unseen
+        if expected
     }
     wanted = Counter(number for numbers in near.values() for number in numbers)
     return {numbers[0]: owner for owner, numbers in near.items() if len(numbers) == 1 and wanted[numbers[0]] == 1}

@@ -18,6 +18,7 @@ from flowing_puppet_ros.body.segmentation.people import person_score
 from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
 from flowing_puppet_ros.body.upright.found_body import (
     SAME_PERSON_M,
+    ExpectedPerson,
     FitBudget,
     FoundBody,
     JudgedFit,
@@ -104,7 +105,7 @@ class PersonFinder:
         viewpoint: np.ndarray,
         stamp: int,
         known: Sequence[np.ndarray] = (),
-        reach: Sequence[float] = (),
+        expected: Sequence[ExpectedPerson] = (),
         budget: FitBudget | None = None,
         remember: bool = True,
         come: np.ndarray | None = None,
@@ -118,8 +119,8 @@ class PersonFinder:
             viewpoint: (3,) position of the sensor, metres.
             stamp: of the scan in nanoseconds.
             known: points (K, 3) in metres on each body that is expected in the scan, at its predicted position.
-            reach: metres within which somebody of these who is not seen there may be instead: a candidate that only one
-                of them can have reached is theirs, and needs no fit; of none where it is empty.
+            expected: where these may be who are not seen there: a candidate that only one of them can have reached is
+                theirs, and needs no fit. Nobody is where it is empty.
             budget: of fits, to the likeliest candidates first; None: as many as are set.
             remember: whether what is no person is remembered, and what was none is left out.
             come: which (N,) points lie where the scans before saw through; None where nothing is known.
@@ -130,6 +131,10 @@ class PersonFinder:
         if len(points) < self._settings.min_points:
             return []
         scene = SceneHeights.of(points)
+        middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
+        if expected:
+            known = [body if each.claims else body[:0] for body, each in zip(known, expected, strict=True)]
+            only_known = only_known and all(each.claims for each in expected)
         candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known)
         if only_known and len(owned) < sum(len(body) > 0 for body in known):
             candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
@@ -144,12 +149,11 @@ class PersonFinder:
             self._owned[body.person.rows] = True
         view = self._view = ScanView(scene, ScanRays.of(points, viewpoint), stamp, remember, come)
         seen = {body.person.owner for body in people}
-        middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
         unseen = {owner: middle for owner, middle in enumerate(middles) if owner not in seen}
         taken = [middle for owner, middle in enumerate(middles) if owner in seen]
         budget = FitBudget(self._settings.max_fits) if budget is None else budget
         offered = self._choose(candidates, view)
-        for number, owner in sorted(find_only_reached(offered, unseen, reach).items(), reverse=True):
+        for number, owner in sorted(find_only_reached(offered, unseen, expected).items(), reverse=True):
             people.append(FoundBody(make(offered.pop(number)[0].rows, owner=owner), None))
             self._owned[people[-1].person.rows] = True
             taken.append(unseen.pop(owner))
@@ -162,8 +166,8 @@ class PersonFinder:
             fresh = take_apart(self._look_beside(fresh, view, budget), taken)
         for judged, candidate in accepted:
             # Who stands at a wall may have no points by the prediction: the candidate there is that person.
-            owner = _pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
-            person = make(candidate.rows, score=judged.probability, owner=owner)
+            near = _pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
+            person = make(candidate.rows, score=judged.probability, owner=near)
             people.append(FoundBody(person, replace(judged.fit, confidence=judged.confidence)))
         for candidate in bent:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
