@@ -42,6 +42,9 @@ BODY_STRIDE = 8  # every so many vertices stand for a body
 MAX_FITS_AT_ONCE = 4  # new people in one cloud of a live stream who have a body in it
 MAX_LIVE_ASKED = 2  # bodies about which one scan of a live stream is asked, so that nobody waits for the others
 
+Fitted = BodyFit | InputError | None
+"""What came of a person's cloud: a body, why there is none, or nothing yet."""
+
 
 @dataclass(frozen=True)
 class MultiBodyTrackerSettings(BodyTrackerSettings):
@@ -135,6 +138,9 @@ class MultiBodyTracker:
         followed = [pair for pair in matched if pair[0].number not in started]
         tracked = iter(parallel_map(track_person, followed, self._threads))
         fitted = [started[track.number] if track.number in started else next(tracked) for track, _ in matched]
+        if judge is not None:
+            fitted = self._drop_doubles(matched, fitted)
+            matched = [pair for pair in matched if pair[0] in self._tracks]
         due = self._choose_asked(matched, stamp, MAX_LIVE_ASKED if executor is not None else None)
         bodies: list[TrackedBody] = []
         new: list[tuple[PersonTrack, SeededCloud]] = []
@@ -240,7 +246,7 @@ class MultiBodyTracker:
     def _choose_asked(self, seen: Sequence[tuple[PersonTrack, PersonCloud]], stamp: int, count: int | None) -> set[int]:
         """Return the numbers of the tracks about which a scan is asked; at most `count`, who were asked least first."""
         due = [track for track, _ in seen if track.is_due(stamp)]
-        return {track.number for track in sorted(due, key=PersonTrack.count_asked)[:count]}
+        return {track.number for track in sorted(due, key=PersonTrack.rank_asked)[:count]}
 
     def _associate(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[PersonTrack, PersonCloud]]:
         """Match the people to the tracks at minimum total cost; the others start tracks."""
@@ -273,6 +279,15 @@ class MultiBodyTracker:
         name, tracker = self.make_id(), BodyTracker(self._fitter, self._settings)
         self._tracks.append(PersonTrack(name, self._started, middle, stamp, tracker, proven=proven))
         return self._tracks[-1]
+
+    def _drop_doubles(
+        self, matched: Sequence[tuple[PersonTrack, PersonCloud]], fitted: Sequence[Fitted]
+    ) -> list[Fitted]:
+        """Drop who is another person of the same cloud, and return what was fitted to the others."""
+        seen = [track for track, _ in matched]
+        doubles = [track for track in seen if any(track.is_double_of(other) for other in seen)]
+        self._tracks = [track for track in self._tracks if track not in doubles]
+        return [fit for track, fit in zip(seen, fitted, strict=True) if track not in doubles]
 
     def _drop_lost(self, stamp: int) -> None:
         kept = [track for track in self._tracks if stamp - track.stamp <= 1e9 * self._settings.hold]

@@ -33,6 +33,8 @@ did not mend, more of them hardly will."""
 AT_ONCE_INTERVAL_NS = 1_000_000_000  # between attempts at a body at once: people soon stand otherwise
 TURN_INTERVAL_NS = 1_000_000_000  # between attempts to turn a body round that walks backwards
 
+DOUBLE_M = 0.2  # between the middles of two bodies, up to which one of the two people is none
+
 Judge = Callable[[PersonCloud, BodyFit, bool], JudgedFit]
 """What a scan says about a body, or about a better one that it has instead; if wanted, also about one turned round."""
 
@@ -83,9 +85,24 @@ class PersonTrack:
         """Return whether a scan of a time in nanoseconds should be asked whether this is a person."""
         return self.belief is None or self.belief.is_due(stamp)
 
-    def count_asked(self) -> tuple[int, int]:
-        """Return how many scans were asked, as far as that matters, and the stamp of the last."""
-        return (0, 0) if self.belief is None else (min(self.belief.count, EVERY_SCAN), self.belief.asked)
+    def rank_asked(self) -> tuple[bool, int, int]:
+        """Return what is the less, the sooner a scan is to be asked: who is not shown, by how often and when it was."""
+        if self.belief is None:
+            return False, 0, 0
+        return self.belief.shown, min(self.belief.count, EVERY_SCAN), self.belief.asked
+
+    def is_double_of(self, other: PersonTrack) -> bool:
+        """Return whether another track, of which more is known, was seen with its body where this one has its own."""
+        own, known = self.tracker.last, other.tracker.last
+        if own is None or known is None or other.stamp != self.stamp or self._standing >= other._standing:
+            return False
+        return bool(np.hypot(*(own.vertices.mean(axis=0) - known.vertices.mean(axis=0))[:2]) < DOUBLE_M)
+
+    @property
+    def _standing(self) -> tuple[bool, int, int]:
+        """What is the more, the more is known of the person: whether it is shown, how often that was asked, its age."""
+        shown, asked = (False, 0) if self.belief is None else (self.belief.shown, self.belief.count)
+        return shown, asked, -self.number
 
     def wants_fit(self, fit: BodyFit | None, stamp: int, seldom: bool) -> bool:
         """Return whether a full fit may give a better body than that of the cloud of a time in nanoseconds."""

@@ -246,7 +246,7 @@ class SceneTracker:
         normals = None if cloud.normals is None else cloud.normals[rows]
         # Who is tracked needs no search, and who comes can wait for a few scans.
         is_tracked = any(len(body) for body in known)
-        only_known = live and is_tracked and self._since_search + 1 < SEARCH_EVERY
+        only_known = live and is_tracked and self._since_search + 1 < SEARCH_EVERY and not self._finder.left_over
         self._since_search = self._since_search + 1 if only_known else 0
         come = self._seen_free.add(points, cloud.viewpoint) if remember and not only_known else None
         found = self._finder.find(

@@ -151,3 +151,13 @@ def find_only_reached(
     }
     wanted = Counter(number for numbers in near.values() for number in numbers)
     return {numbers[0]: owner for owner, numbers in near.items() if len(numbers) == 1 and wanted[numbers[0]] == 1}
+
+
+def pop_nearest(middles: dict[int, np.ndarray], place: np.ndarray) -> int | None:
+    """Return whose middle (2,) m is so near to a place that they are one person, and take it out; None for nobody."""
+    away = {owner: float(np.hypot(*(middle - place))) for owner, middle in middles.items()}
+    nearest = min(away, key=away.__getitem__, default=None)
+    if nearest is None or away[nearest] > SAME_PERSON_M:
+        return None
+    del middles[nearest]
+    return nearest

@@ -24,6 +24,7 @@ from flowing_puppet_ros.body.upright.found_body import (
     JudgedFit,
     ScanView,
     find_only_reached,
+    pop_nearest,
     take_apart,
 )
 from flowing_puppet_ros.body.upright.person_model import PersonModel
@@ -74,7 +75,13 @@ class PersonFinderSettings(Settings):
 
 
 class PersonFinder:
-    """Finds the people in the scans of one sensor, and remembers what was none."""
+    """Finds the people in the scans of one sensor, and remembers what was none.
+
+    Attributes:
+        upright: fits the bodies.
+        last_rejected: what was no person in the last scan.
+        left_over: whether candidates of the last scan were left to the next one.
+    """
 
     def __init__(self, fitter: BodyFitter, settings: PersonFinderSettings) -> None:
         """Fit with the model of `fitter`."""
@@ -84,6 +91,7 @@ class PersonFinder:
         self._threads = usable_threads(fitter.settings.threads)
         self._rejected = RejectedPlaces(settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
+        self.left_over = False
         self._view: ScanView | None = None
         self._owned = np.empty(0, dtype=bool)
 
@@ -127,6 +135,7 @@ class PersonFinder:
             only_known: nobody else is looked for, unless one of those who are expected is not there.
         """
         self.last_rejected = []
+        self.left_over = False
         self._view = None
         if len(points) < self._settings.min_points:
             return []
@@ -163,10 +172,11 @@ class PersonFinder:
         while fresh:
             self._own(points, fresh)
             accepted += fresh
-            fresh = take_apart(self._look_beside(fresh, view, budget), taken)
+            # A quick body leaves points of its own person, too.
+            fresh = [] if budget.quick else take_apart(self._look_beside(fresh, view, budget), taken)
         for judged, candidate in accepted:
             # Who stands at a wall may have no points by the prediction: the candidate there is that person.
-            near = _pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
+            near = pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
             person = make(candidate.rows, score=judged.probability, owner=near)
             people.append(FoundBody(person, replace(judged.fit, confidence=judged.confidence)))
         for candidate in bent:
@@ -189,6 +199,7 @@ class PersonFinder:
         likely = sum(each is not None and self._is_proven(each.judged) for each in started.values())
         for number, (candidate, probability) in enumerate(offered):
             if not budget.spend():
+                self.left_over = True
                 break
             first = started[number] if budget.quick else self._start(candidate, view)
             if first is None:
@@ -197,7 +208,8 @@ class PersonFinder:
             worthwhile = judged.probability >= MIN_WORTHWHILE or probability >= MIN_SHAPELY
             if worthwhile and not (budget.quick and self._is_proven(judged)):
                 if likely:
-                    continue  # the next scans try the others
+                    self.left_over = True
+                    continue
                 likely += budget.quick
                 judged = self._try_others(first, candidate, view)
             if self._is_proven(judged):
@@ -357,16 +369,6 @@ class _FirstFit(NamedTuple):
     others: list[tuple[float, BodyState]]
     found: UprightFit
     judged: JudgedFit
-
-
-def _pop_nearest(middles: dict[int, np.ndarray], place: np.ndarray) -> int | None:
-    """Return whose middle (2,) m is so near to a place that they are one person, and take it out; None for nobody."""
-    away = {owner: float(np.hypot(*(middle - place))) for owner, middle in middles.items()}
-    nearest = min(away, key=away.__getitem__, default=None)
-    if nearest is None or away[nearest] > SAME_PERSON_M:
-        return None
-    del middles[nearest]
-    return nearest
 
 
 def _make_person(
