@@ -28,8 +28,8 @@ MAX_CLAIM_GAP_NS = 150_000_000
 """Time within which the body of somebody whose velocity is not known yet tells which points are theirs."""
 REFIT_INTERVAL_NS = 5_000_000_000  # from one full fit of an unreliable body to the next
 LOST_INTERVAL_NS, MAX_DOUBLINGS = 1_000_000_000, 4
-"""The same of a lost body where full fits are to be seldom; each doubles both, so many times: what several full fits
-did not mend, more of them hardly will."""
+"""The same of a lost body where full fits are to be seldom, from the second on; each doubles both, so many times: what
+several full fits did not mend, more of them hardly will."""
 AT_ONCE_INTERVAL_NS = 1_000_000_000  # between attempts at a body at once: people soon stand otherwise
 TURN_INTERVAL_NS = 1_000_000_000  # between attempts to turn a body round that walks backwards
 
@@ -112,7 +112,7 @@ class PersonTrack:
         # A full fit to the little that is seen of a hidden person would bend the body.
         if not fit.reliable and not self.tracker.hidden and passed >= REFIT_INTERVAL_NS * doubled:
             return True
-        return self.tracker.lost and (not seldom or passed >= LOST_INTERVAL_NS * doubled)
+        return self.tracker.lost and (not seldom or self.fits < 2 or passed >= LOST_INTERVAL_NS * doubled)
 
     def prove(self, person: PersonCloud, fit: BodyFit) -> bool:
         """Return whether it is known to be a person, as a body of theirs may show from then on."""

@@ -17,6 +17,7 @@ from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 
 MAX_STRETCH = 2.0  # frames by which a motion is extrapolated at most
+FIRST_GAP_NS = 150_000_000  # time after the first frame up to which somebody is taken to be where they were
 ALIGNED = RefineWeights(stitch=1.0, pose=1e-5, shape=1e-2, pairwise=1e-5, sigma_start=0.4, sigma_end=0.08, iterations=6)
 """To joints alone, the shape being known."""
 
@@ -156,8 +157,9 @@ class TrackState:
 
 
 def is_far(before: BodyObservation | None, last: BodyObservation, stamp: int) -> bool:
-    """Return whether a time in nanoseconds is farther from the last one than the last motion tells about."""
-    return before is None or stamp - last.stamp > MAX_STRETCH * (last.stamp - before.stamp)
+    """Return whether a time in nanoseconds is farther from the last one than the last motion, if any, tells about."""
+    known = FIRST_GAP_NS if before is None else MAX_STRETCH * (last.stamp - before.stamp)
+    return stamp - last.stamp > known
 
 
 def extrapolate(before: BodyObservation | None, last: BodyObservation, stamp: int) -> BodyState:

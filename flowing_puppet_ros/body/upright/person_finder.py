@@ -49,6 +49,7 @@ COME_ODDS, COME_FILTER = 1.5, 0.3
 """Log odds by which something that stands where the sensor once saw through is a person, and the share of the filter's
 limit that is asked of it. Cars and doors move too."""
 COLUMN_FILTER = 0.7  # the same of a column of a larger cluster: who stands close to others has a part of their shape
+MIN_QUICK_BESIDE = 0.75  # probability of who is found beside a quick body
 BESIDE_M, CONTEXT_M, OWN_M = 1.0, 1.0, 0.10
 """Distance from a person within which others are looked for in what that person leaves, of their surroundings beyond,
 and from a body, up to which points are its own."""
@@ -172,8 +173,7 @@ class PersonFinder:
         while fresh:
             self._own(points, fresh)
             accepted += fresh
-            # A quick body leaves points of its own person, too.
-            fresh = [] if budget.quick else take_apart(self._look_beside(fresh, view, budget), taken)
+            fresh = take_apart(self._look_beside(fresh, view, budget), taken)
         for judged, candidate in accepted:
             # Who stands at a wall may have no points by the prediction: the candidate there is that person.
             near = pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
@@ -252,6 +252,8 @@ class PersonFinder:
             if any(np.hypot(*(candidate.middle - middle)) < BESIDE_M for middle in middles)
         ]
         found, _ = self._fit_offered(self._choose(fresh, left), left, budget)
+        if budget.quick:  # such a body leaves points of its own person, too
+            found = [each for each in found if each[0].probability >= MIN_QUICK_BESIDE]
         return [(judged, replace(candidate, rows=rows[candidate.rows])) for judged, candidate in found]
 
     @one_blas_thread()
