@@ -40,7 +40,8 @@ MAX_OTHER_WAY_RATIO = 0.8
 """Two-way distance of a full fit that faces the other way, relative to the tracked body's, up to which it is taken."""
 BODY_STRIDE = 8  # every so many vertices stand for a body
 MAX_FITS_AT_ONCE = 4  # new people in one cloud of a live stream who have a body in it
-MAX_LIVE_ASKED = 2  # bodies about which one scan of a live stream is asked, so that nobody waits for the others
+MAX_LIVE_ASKED = 2
+"""Bodies about which one scan of a live stream is asked, so that nobody waits for the others; one if all are shown."""
 
 Fitted = BodyFit | InputError | None
 """What came of a person's cloud: a body, why there is none, or nothing yet."""
@@ -141,7 +142,7 @@ class MultiBodyTracker:
         if judge is not None:
             fitted = self._drop_doubles(matched, fitted)
             matched = [pair for pair in matched if pair[0] in self._tracks]
-        due = self._choose_asked(matched, stamp, MAX_LIVE_ASKED if executor is not None else None)
+        due = self._choose_asked(matched, stamp, live=executor is not None)
         bodies: list[TrackedBody] = []
         new: list[tuple[PersonTrack, SeededCloud]] = []
         waiting: list[tuple[PersonTrack, SeededCloud]] = []
@@ -243,10 +244,13 @@ class MultiBodyTracker:
                     track.tracker.accept()
                 track.rough = False
 
-    def _choose_asked(self, seen: Sequence[tuple[PersonTrack, PersonCloud]], stamp: int, count: int | None) -> set[int]:
-        """Return the numbers of the tracks about which a scan is asked; at most `count`, who were asked least first."""
-        due = [track for track, _ in seen if track.is_due(stamp)]
-        return {track.number for track in sorted(due, key=PersonTrack.rank_asked)[:count]}
+    def _choose_asked(self, seen: Sequence[tuple[PersonTrack, PersonCloud]], stamp: int, live: bool) -> set[int]:
+        """Return the numbers of the tracks about which a scan is asked; live, of few who were asked least, in turns."""
+        due = sorted((track for track, _ in seen if track.is_due(stamp)), key=PersonTrack.rank_asked)
+        if live:
+            waiting = sum(not track.is_shown for track in due)
+            due = due[: min(max(waiting, 1), MAX_LIVE_ASKED)]
+        return {track.number for track in due}
 
     def _associate(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[PersonTrack, PersonCloud]]:
         """Match the people to the tracks at minimum total cost; the others start tracks."""

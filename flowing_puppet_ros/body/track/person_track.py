@@ -85,11 +85,16 @@ class PersonTrack:
         """Return whether a scan of a time in nanoseconds should be asked whether this is a person."""
         return self.belief is None or self.belief.is_due(stamp)
 
+    @property
+    def is_shown(self) -> bool:
+        """Whether it was taken for a person."""
+        return self.belief is not None and self.belief.shown
+
     def rank_asked(self) -> tuple[bool, int, int]:
         """Return what is the less, the sooner a scan is to be asked: who is not shown, by how often and when it was."""
         if self.belief is None:
             return False, 0, 0
-        return self.belief.shown, min(self.belief.count, EVERY_SCAN), self.belief.asked
+        return self.is_shown, min(self.belief.count, EVERY_SCAN), self.belief.asked
 
     def is_double_of(self, other: PersonTrack) -> bool:
         """Return whether another track, of which more is known, was seen with its body where this one has its own."""
@@ -101,8 +106,7 @@ class PersonTrack:
     @property
     def _standing(self) -> tuple[bool, int, int]:
         """What is the more, the more is known of the person: whether it is shown, how often that was asked, its age."""
-        shown, asked = (False, 0) if self.belief is None else (self.belief.shown, self.belief.count)
-        return shown, asked, -self.number
+        return self.is_shown, 0 if self.belief is None else self.belief.count, -self.number
 
     def wants_fit(self, fit: BodyFit | None, stamp: int, seldom: bool) -> bool:
         """Return whether a full fit may give a better body than that of the cloud of a time in nanoseconds."""

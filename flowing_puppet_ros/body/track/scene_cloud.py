@@ -90,6 +90,8 @@ class SceneCloud:
         """Return its range image; a scan without order is drawn into one as its sensor is held."""
         if self.image is not None:
             return self.image
+        if np.array_equal(self.to_sensor, np.eye(3)):  # held level, which saves a third of the time
+            return RangeImage.of_scan(self.points, self.viewpoint)
         drawn = RangeImage.of_scan((self.points - self.viewpoint) @ self.to_sensor.T, np.zeros(3))
         return drawn.turn(self.to_sensor.T).move(self.viewpoint)
 

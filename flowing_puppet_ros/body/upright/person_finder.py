@@ -49,7 +49,7 @@ COME_ODDS, COME_FILTER = 1.5, 0.3
 """Log odds by which something that stands where the sensor once saw through is a person, and the share of the filter's
 limit that is asked of it. Cars and doors move too."""
 COLUMN_FILTER = 0.7  # the same of a column of a larger cluster: who stands close to others has a part of their shape
-MIN_QUICK_BESIDE = 0.75  # probability of who is found beside a quick body
+MIN_QUICK_BESIDE = 0.5  # probability of who is found beside a quick body
 BESIDE_M, CONTEXT_M, OWN_M = 1.0, 1.0, 0.10
 """Distance from a person within which others are looked for in what that person leaves, of their surroundings beyond,
 and from a body, up to which points are its own."""
@@ -157,7 +157,7 @@ class PersonFinder:
         self._owned = np.zeros(len(points), dtype=bool)
         for body in people:
             self._owned[body.person.rows] = True
-        view = self._view = ScanView(scene, ScanRays.of(points, viewpoint), stamp, remember, come)
+        view = self._view = ScanView(scene, ScanRays(points, viewpoint), stamp, remember, come)
         seen = {body.person.owner for body in people}
         unseen = {owner: middle for owner, middle in enumerate(middles) if owner not in seen}
         taken = [middle for owner, middle in enumerate(middles) if owner in seen]
