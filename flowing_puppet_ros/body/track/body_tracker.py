@@ -60,6 +60,7 @@ MAX_TURNED_RATIO = 1.25
 few points hardly tell front from back, and hardly anybody walks backwards."""
 MAX_TRACKED_POINTS = 2500
 """Of one side of a person whose joints somebody sees: the shape comes from many clouds, and no full fit from these."""
+LONG_GAP_NS = 250_000_000  # time between clouds from which on the middle of the cloud tells better where somebody went
 ALIGN_GAP_NS = 100_000_000
 """Time between clouds from which on a body is first moved to the joints that somebody sees."""
 
@@ -337,11 +338,14 @@ class BodyTracker:
         """Return the last body, moved on by its last motion in proportion to the time.
 
         Without one, and after a long gap, which a full fit leaves in a live stream too, it moves as the middle of the
-        cloud did.
+        cloud did; after a shorter one, it turns by its last motion.
         """
         if stamp - last.stamp > 1e9 * self._settings.max_time_gap or is_far(self._state.before, last, stamp):
             return replace(last.fit.state, center=last.fit.state.center + middle - last.middle)
-        return extrapolate(self._state.before, last, stamp)
+        moved = extrapolate(self._state.before, last, stamp)
+        if stamp - last.stamp <= LONG_GAP_NS:
+            return moved
+        return replace(moved, center=moved.center + middle - last.middle - (moved.center[0] - last.fit.state.center[0]))
 
     def _update_visible(self, points: F64, stamp: int, viewpoint: F64, min_visible: float) -> bool:
         """Return whether less than a share of the person is seen than normally; what is normal follows what is seen."""

@@ -225,7 +225,9 @@ class MultiBodyTracker:
         known = track.tracker.last
         # Live, a body that may have a limb wrong is shown and tracked while a better one is searched.
         quick = executor is not None and known is None
-        self._background_fit.start(track.number, track.tracker.fork(quick, track.rough), cloud, executor)
+        upright = executor is not None and track.uprights > 0
+        track.uprights -= upright
+        self._background_fit.start(track.number, track.tracker.fork(quick, upright), cloud, executor)
         self._adopt_finished_fit()
         fit = track.tracker.last
         return [track.show(fit)] if known is None and fit is not None and track.prove(cloud.person, fit) else []
@@ -237,12 +239,14 @@ class MultiBodyTracker:
             return
         number, tracker = finished
         for track in self._tracks:
-            if track.number == number and tracker.last is not None:
+            if track.number != number:
+                continue
+            if tracker.last is not None:
                 if _is_better(tracker.last, track.tracker.last, 1.0 if track.rough else MAX_OTHER_WAY_RATIO):
                     track.tracker = tracker
                 else:
                     track.tracker.accept()
-                track.rough = False
+            track.rough = False
 
     def _choose_asked(self, seen: Sequence[tuple[PersonTrack, PersonCloud]], stamp: int, live: bool) -> set[int]:
         """Return the numbers of the tracks about which a scan is asked; live, of few who were asked least, in turns."""
