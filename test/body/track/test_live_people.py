@@ -81,7 +81,7 @@ def _make_tracker() -> SceneTracker:
 def test_walkers_keep_their_ids_when_scans_are_left_out(
     person: tuple[np.ndarray, np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After 0.6 s somebody whose velocity nobody knows yet is 0.6 m on, beyond a body; nobody is fitted anew for that."""
+    """After 0.6 s somebody whose velocity nobody knows yet is 0.6 m on; nobody is fitted anew for that."""
     fitted: list[int] = []
     start = PersonFinder._start
     monkeypatch.setattr(PersonFinder, "_start", lambda *given, **named: fitted.append(1) or start(*given, **named))  # type: ignore[func-returns-value]
