@@ -38,6 +38,8 @@ NO_BODY_PENALTY_M = 0.6  # for tracks without a body, which are often fragments 
 OWNED_FACTOR = 0.3  # of the distance where the track's body lies in the cloud
 MAX_OTHER_WAY_RATIO = 0.8
 """Two-way distance of a full fit that faces the other way, relative to the tracked body's, up to which it is taken."""
+ROUGH_OTHER_WAY_RATIO = 1.25
+"""The same where the tracked body is a rough one: nobody compared both ways then."""
 BODY_STRIDE = 8  # every so many vertices stand for a body
 MAX_FITS_AT_ONCE = 4  # new people in one cloud of a live stream who have a body in it
 MAX_LIVE_ASKED = 2
@@ -241,11 +243,12 @@ class MultiBodyTracker:
         for track in self._tracks:
             if track.number != number:
                 continue
-            if tracker.last is not None:
-                if _is_better(tracker.last, track.tracker.last, 1.0 if track.rough else MAX_OTHER_WAY_RATIO):
-                    track.tracker = tracker
-                else:
-                    track.tracker.accept()
+            if tracker.last is not None and _is_better(
+                tracker.last, track.tracker.last, ROUGH_OTHER_WAY_RATIO if track.rough else MAX_OTHER_WAY_RATIO
+            ):
+                track.adopt(tracker)
+            elif tracker.last is not None:
+                track.tracker.accept()
             track.rough = False
 
     def _choose_asked(self, seen: Sequence[tuple[PersonTrack, PersonCloud]], stamp: int, live: bool) -> set[int]:

@@ -138,6 +138,12 @@ class PersonTrack:
             self.belief = PersonBelief(person.middle[:2])
             self.belief.add(person.score, fit.confidence, self.stamp, len(person.points))
 
+    def adopt(self, tracker: BodyTracker) -> None:
+        """Go on with the tracker that a full fit has led to; a rough body is turned by that without being a jump."""
+        self.tracker = tracker
+        if self.rough:
+            self.motion.allow_turn()
+
     def weigh(self, person: PersonCloud, fit: BodyFit, judge: Judge | None) -> BodyFit:
         """Ask a scan, if any, whether it is a person, unless too little is seen; return its body."""
         if self.belief is None:
