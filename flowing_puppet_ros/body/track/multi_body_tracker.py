@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -42,6 +42,7 @@ ROUGH_OTHER_WAY_RATIO = 1.25
 """The same where the tracked body is a rough one: nobody compared both ways then."""
 BODY_STRIDE = 8  # every so many vertices stand for a body
 MAX_FITS_AT_ONCE = 4  # new people in one cloud of a live stream who have a body in it
+MAX_LIVE_STEPS = 3  # Gauss-Newton steps a scan of a live stream: a scan that is answered late costs more than two steps
 MAX_LIVE_ASKED = 2
 """Bodies about which one scan of a live stream is asked, so that nobody waits for the others; one if all are shown."""
 
@@ -81,6 +82,7 @@ class MultiBodyTracker:
         self._tracks: list[PersonTrack] = []
         self._background_fit = BackgroundFit()
         self._stamp: int | None = None
+        self._hurries = False
 
     def reset(self) -> None:
         """Forget everybody; ids go on, so that none is used twice in a run."""
@@ -130,6 +132,7 @@ class MultiBodyTracker:
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
         self._stamp = stamp
+        self._hurries = executor is not None and judge is not None
         self._adopt_finished_fit()
         matched = self._associate(people, stamp)
         started: dict[int, BodyFit] = {}
@@ -160,7 +163,7 @@ class MultiBodyTracker:
             if fit is None:
                 new.append((track, cloud))
             if not self._background_fit.add(track.number, cloud) and (
-                track.wants_fit(fit, stamp, seldom=judge is not None and executor is not None)
+                track.wants_fit(fit, stamp, seldom=self._hurries)
             ):
                 waiting.append((track, cloud))
         self._report.counters["tracked people"] += len(bodies)
@@ -287,7 +290,9 @@ class MultiBodyTracker:
         return f"{self._prefix}{self._started}"
 
     def _start_track(self, middle: F64, stamp: int, proven: bool) -> PersonTrack:
-        name, tracker = self.make_id(), BodyTracker(self._fitter, self._settings)
+        steps = self._settings.gauss_newton_steps
+        steps = min(steps, MAX_LIVE_STEPS) if self._hurries else steps
+        name, tracker = self.make_id(), BodyTracker(self._fitter, replace(self._settings, gauss_newton_steps=steps))
         self._tracks.append(PersonTrack(name, self._started, middle, stamp, tracker, proven=proven))
         return self._tracks[-1]
 
