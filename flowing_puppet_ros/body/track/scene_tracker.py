@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -29,6 +29,7 @@ from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFi
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.process.threads import usable_threads
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings, nested, setting
 
@@ -226,6 +227,8 @@ class SceneTracker:
         rows = np.flatnonzero(near)
         if len(rows) > MAX_SCENE_POINTS:
             rows = rows[np.linspace(0, len(rows) - 1, MAX_SCENE_POINTS).astype(np.int64)]
+        elif len(rows) == len(near):
+            return rows, np.ascontiguousarray(cloud.points, dtype=np.float64)
         return rows, np.asarray(cloud.points[rows], dtype=np.float64)
 
     def _find(
@@ -249,7 +252,8 @@ class SceneTracker:
         only_known = live and is_tracked and self._since_search + 1 < SEARCH_EVERY and not self._finder.left_over
         self._since_search = self._since_search + 1 if only_known else 0
         come = self._seen_free.add(points, cloud.viewpoint) if remember and not only_known else None
-        found = self._finder.find(
+        search = partial(
+            self._finder.find,
             points,
             normals,
             cloud.viewpoint,
@@ -261,6 +265,13 @@ class SceneTracker:
             come,
             only_known,
         )
+        # Who is tracked will need the range image.
+        if live and is_tracked and usable_threads(self._fitter.settings.threads) > 1:
+            with ThreadPoolExecutor(1) as beside:
+                drawn = beside.submit(cloud.with_image)
+                found, cloud = search(), drawn.result()
+        else:
+            found = search()
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]

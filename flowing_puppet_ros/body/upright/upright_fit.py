@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
@@ -237,10 +238,16 @@ def keep_place_only(model: StitchedPuppet, fit: BodyFit, points: int) -> BodyFit
 
 def floor_term(vertices: np.ndarray, floor: float) -> VertexQuadratic:
     """Return the quadratic that puts the lowest of the vertices (V, 3) m on the floor, and all that are below it."""
-    chosen = np.zeros(len(vertices), dtype=bool)
-    chosen[np.argpartition(vertices[:, 2], SOLE_VERTICES)[:SOLE_VERTICES]] = True
-    chosen |= vertices[:, 2] < floor
-    weight = np.where(chosen, FLOOR_WEIGHT / SOLE_VERTICES, 0.0)
+    return VertexQuadratic(*_pull_to_floor(vertices, floor))
+
+
+@njit(cache=True, nogil=True)
+def _pull_to_floor(vertices, floor):  # type: ignore[no-untyped-def]
+    """Return the matrices (V, 3, 3) and vectors (V, 3) of `floor_term`."""
     matrix, vector = np.zeros((len(vertices), 3, 3)), np.zeros((len(vertices), 3))
-    matrix[:, 2, 2], vector[:, 2] = weight, weight * (vertices[:, 2] - floor)
-    return VertexQuadratic(matrix, vector)
+    lowest = np.partition(vertices[:, 2], SOLE_VERTICES - 1)[SOLE_VERTICES - 1]
+    weight = FLOOR_WEIGHT / SOLE_VERTICES
+    for k in range(len(vertices)):
+        if vertices[k, 2] <= lowest or vertices[k, 2] < floor:
+            matrix[k, 2, 2], vector[k, 2] = weight, weight * (vertices[k, 2] - floor)
+    return matrix, vector
