@@ -313,7 +313,7 @@ def _fit_rest_pose(model: StitchedPuppet) -> Array:
 
 @lru_cache(maxsize=4)
 def _measure_rest_heights(model: StitchedPuppet) -> tuple[Array, Array]:
-    """Return z (V,) m of the average body's vertices in the template pose, and by how much (V, 16 S) shapes change it."""
+    """Return z (V,) m of the average body's vertices in the template pose, and what (V, 16 S) shapes add to it."""
     mean = model.vertices(model.rest_state())[:, 2]
     units = np.eye(len(model.tree) * model.shape_count).reshape((-1, len(model.tree), model.shape_count))
     change = [model.vertices(model.rest_state(unit))[:, 2] - mean for unit in units]
