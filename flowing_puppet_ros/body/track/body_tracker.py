@@ -123,6 +123,7 @@ class BodyTracker:
         """
         made = copy(self)
         made._quick, made._only_upright = quick, upright
+        made._upright = UprightFitter(self._fitter, max_threads=1)  # the others are for who is tracked meanwhile
         made.counters = self.counters.copy()
         return made
 

@@ -28,7 +28,7 @@ from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.model import rotation as so3
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
-from flowing_puppet_ros.process.threads import parallel_map, usable_threads
+from flowing_puppet_ros.process.threads import MAX_THREADS, parallel_map, usable_threads
 
 STARTS = 8  # bodies of the bank that are refined
 FEW_POINTS = RefineWeights(pose=1e-5, shape=3e-5, pairwise=5e-7, sigma_start=0.12, sigma_end=0.05, iterations=8)
@@ -78,10 +78,11 @@ class _Refined(NamedTuple):
 class UprightFitter:
     """The upright first answer of one model."""
 
-    def __init__(self, fitter: BodyFitter) -> None:
+    def __init__(self, fitter: BodyFitter, max_threads: int = MAX_THREADS) -> None:
+        """Fit as `fitter` does, on its threads, but at most so many."""
         self._fitter = fitter
         self._none = JointTargets.none(fitter.model)
-        self._threads = usable_threads(fitter.settings.threads)
+        self._threads = usable_threads(min(fitter.settings.threads, max_threads))
 
     def warm_up(self) -> None:
         """Make the bank beforehand."""
