@@ -12,9 +12,12 @@ from scipy.spatial import cKDTree
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours, fit_normals
+from flowing_puppet_ros.evidence.cloud.one_sided import measure_stretch
 
 MIN_NEIGHBOURS, MAX_NEIGHBOURS = 9, 24  # points by which a normal is estimated
 POINTS_PER_NEIGHBOUR = 100  # points of a cloud for each of them
+NEIGHBOURS_PER_STRETCH = 3  # for the rings of a LiDAR: those of one ring lie on a line and say nothing about a plane
+MAX_RING_NEIGHBOURS = 40
 MIN_SPREAD = 1e-6  # of points across their widest plane, for one along it; they lie in that plane below it
 ORIENTATION_RADIUS_M = 0.12  # neighbourhood whose mean lies inside a limb
 
@@ -91,6 +94,8 @@ def estimate_normals(
     points = points - center
     # A neighbourhood must stay smaller than a limb, however few the points are.
     count = int(np.clip(len(points) // POINTS_PER_NEIGHBOUR, MIN_NEIGHBOURS, MAX_NEIGHBOURS))
+    if viewpoint is not None and (stretch := measure_stretch(points, viewpoint - center)) > 1:
+        count = max(count, min(round(NEIGHBOURS_PER_STRETCH * stretch), MAX_RING_NEIGHBOURS))
     normals = fit_normals(points, find_neighbours(points, count))
     if viewpoint is not None:
         return _turn_along(normals, viewpoint - center - points)

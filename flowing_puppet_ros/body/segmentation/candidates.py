@@ -75,10 +75,10 @@ class SceneHeights:
     wall: np.ndarray
 
     @classmethod
-    def of(cls, points: np.ndarray) -> SceneHeights:
-        """Find the floor of a scene with N > 0 finite points."""
+    def of(cls, points: np.ndarray, viewpoint: np.ndarray | None = None) -> SceneHeights:
+        """Find the floor of a scene with N > 0 finite points, seen from `viewpoint` (3,) m."""
         points = np.ascontiguousarray(points, dtype=np.float64)
-        floor = FloorGrid.find(points)
+        floor = FloorGrid.find(points, viewpoint)
         height = floor.height(points)
         return cls(points, height, floor, ColumnIndex.of(points), find_walls(points, height))
 

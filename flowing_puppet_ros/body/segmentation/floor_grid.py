@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The floor of a scene as a grid of heights: a plane, and how far pavements, ramps and thresholds differ from it."""
+"""The floor of a scene as a grid of heights: a plane, and how far pavements, ramps and thresholds differ from it.
+
+Near a LiDAR whose lowest ray looks little below the horizon no floor is seen. What that ray hits there only tells that
+the floor is not above it.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter
 
 from flowing_puppet_ros.body.segmentation.column_index import lay_grid, sort_into_cells
 
@@ -15,8 +19,15 @@ CELL_M, MAX_CELLS = 1.0, 200  # edge of a cell; cells a side, so that the grid e
 LOW_SHARE = 0.03
 """Share of a cell's points that may lie below its floor: reflections and noise."""
 MIN_CELL_POINTS = 3
-MAX_SLOPE = 0.05  # of the floor against the plane, so that cells on furniture and cars take their neighbours' floor
+MAX_SLOPE, MAX_RAMP_SLOPE = 0.05, 0.1
+"""Of the floor against the plane, so that cells on furniture and cars take their neighbours' floor; of cells in which
+nothing stands up."""
+MAX_KERB_M = 0.2
 MAX_BELOW_PLANE_M = 1.0  # a cell that is lower shows a reflection or a shaft
+AZIMUTH_BINS, MIN_RAY_GAP, LIMIT_GAPS = 360, 0.005, 0.6
+"""Bins of azimuth in which the lowest ray is looked up, slope between two rays one above the other at least, and gaps
+between these within which a ray counts as the lowest."""
+MIN_UPRIGHT_M = 0.35  # height of what stands in a cell; a floor is flat
 PLANE_STEPS, PLANE_WIDTH_M = 12, 0.12  # of the robust fit; above the plane, cells count less beyond this width
 MAX_PLANE_SLOPE = 0.25
 BLUR_CELLS = 0.7
@@ -33,19 +44,29 @@ class FloorGrid:
     low: np.ndarray
 
     @classmethod
-    def find(cls, points: np.ndarray) -> FloorGrid:
-        """Find the floor of a scene with points (N, 3) m, z up, N > 0; where none is seen, its neighbours' floor."""
+    def find(cls, points: np.ndarray, viewpoint: np.ndarray | None = None) -> FloorGrid:
+        """Find the floor of a scene with points (N, 3) m, z up, N > 0; where none is seen, its neighbours' floor.
+
+        Where the sensor at `viewpoint` (3,) m does not look down to the floor, what stands there says only that the
+        floor is not above it.
+        """
+        points = np.ascontiguousarray(points)
         low, shape, all_inside = lay_grid(points, CELL_M, MAX_CELLS)
-        lowest = _find_lowest(np.ascontiguousarray(points), low, shape, all_inside)
+        by_lowest_ray = np.zeros(len(points), dtype=bool) if viewpoint is None else _find_lowest_rays(points, viewpoint)
+        lowest, upright, cut = _find_lowest(points, by_lowest_ray, low, shape, all_inside)
         x, y = (low[k] + CELL_M * (np.arange(shape[k]) + 0.5) for k in (0, 1))
-        plane = _fit_plane(lowest, x, y, points)
+        plane = _fit_plane(lowest, cut, x, y, points)
         base = plane[0] + plane[1] * x[:, None] + plane[2] * y[None, :]
         above = lowest - base
-        above[np.isnan(above) | (above < -MAX_BELOW_PLANE_M)] = np.inf
+        above[np.isnan(above) | (above < -MAX_BELOW_PLANE_M) | (cut & (above > 0))] = np.inf
         if not np.isfinite(above).any():
             above[:] = 0.0
-        eroded = _limit_slope(above, MAX_SLOPE * CELL_M)
-        return cls(base + gaussian_filter(eroded, BLUR_CELLS, mode="nearest"), low)
+        eroded = _limit_slope(above, CELL_M * np.where(upright, MAX_SLOPE, MAX_RAMP_SLOPE))
+        nearest = distance_transform_edt(eroded < above, return_distances=False, return_indices=True)
+        floor = eroded[tuple(nearest)]
+        # What is higher than a kerb stands on the floor, which is as high there as where it is seen.
+        floor = np.where(above - floor > MAX_KERB_M, floor, eroded)
+        return cls(base + gaussian_filter(floor, BLUR_CELLS, mode="nearest"), low)
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Return the heights (N,) of points (N, 3) over the floor, metres."""
@@ -65,44 +86,86 @@ def looks_upside_down(points: np.ndarray) -> bool:
     return above > MIN_FLOOR_SHARE and below < MAX_CEILING_SHARE
 
 
-def _find_lowest(points: np.ndarray, low: np.ndarray, shape: np.ndarray, all_inside: bool) -> np.ndarray:
-    """Return a low percentile (W, D) of z in each cell, NaN where too few points are."""
-    inside = points
-    if not all_inside:
-        beyond = (points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1)
-        inside = points[~beyond]
-    lowest = _select_lowest(inside, *sort_into_cells(inside, low, shape, CELL_M))
-    return np.asarray(lowest.reshape(int(shape[0]), int(shape[1])))
+def _find_lowest_rays(points: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
+    """Return which (N,) of the points (N, 3) m are on the lowest rays of the sensor at their azimuth."""
+    slope, number, lowest, gaps = _find_slopes(points, viewpoint)
+    gaps = gaps[np.isfinite(gaps)]
+    margin = LIMIT_GAPS * float(np.median(gaps)) if len(gaps) else 0.0
+    return np.asarray(slope < lowest[number] + margin)
 
 
 @njit(cache=True, nogil=True)
-def _select_lowest(points, order, first):  # type: ignore[no-untyped-def]
+def _find_slopes(points, viewpoint):  # type: ignore[no-untyped-def]
+    """Return the slopes (N,) of the rays, their bins (N,), the lowest slope in each, and the gap to the next one."""
+    slope, number = np.empty(len(points)), np.empty(len(points), np.int64)
+    lowest = np.full(AZIMUTH_BINS, np.inf)
+    for row in range(len(points)):
+        x, y = points[row, 0] - viewpoint[0], points[row, 1] - viewpoint[1]
+        slope[row] = (points[row, 2] - viewpoint[2]) / max(np.sqrt(x * x + y * y), 1e-6)
+        # Round a square instead of a circle, which tells bins as well in a fraction of the time.
+        turn = y / max(abs(x) + abs(y), 1e-6)
+        turn = turn if x >= 0 else 2.0 - turn
+        number[row] = int((turn + 1.0) * (AZIMUTH_BINS / 4)) % AZIMUTH_BINS
+        lowest[number[row]] = min(lowest[number[row]], slope[row])
+    gaps = np.full(AZIMUTH_BINS, np.inf)
+    for row in range(len(points)):
+        gap = slope[row] - lowest[number[row]]
+        if gap > MIN_RAY_GAP:
+            gaps[number[row]] = min(gaps[number[row]], gap)
+    return slope, number, lowest, gaps
+
+
+def _find_lowest(
+    points: np.ndarray, by_lowest_ray: np.ndarray, low: np.ndarray, shape: np.ndarray, all_inside: bool
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return a low percentile (W, D) of z in each cell, NaN where too few points are, and where something stands.
+
+    And where its floor is lower, since its lowest point is `by_lowest_ray` (N,).
+    """
+    if not all_inside:
+        inside = ~((points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1))
+        points, by_lowest_ray = points[inside], by_lowest_ray[inside]
+    found = _select_lowest(points, by_lowest_ray, *sort_into_cells(points, low, shape, CELL_M))
+    lowest, upright, cut = (each.reshape(int(shape[0]), int(shape[1])) for each in found)
+    return lowest, upright, cut
+
+
+@njit(cache=True, nogil=True)
+def _select_lowest(points, by_lowest_ray, order, first):  # type: ignore[no-untyped-def]
     lowest = np.full(len(first) - 1, np.nan)
+    upright, cut = np.zeros((2, len(lowest)), np.bool_)
     for cell in range(len(lowest)):
         count = first[cell + 1] - first[cell]
         if count >= MIN_CELL_POINTS:
             z = np.empty(count)
             for k in range(count):
                 z[k] = points[order[first[cell] + k], 2]
+            least = order[first[cell] + z.argmin()]
+            upright[cell] = z.max() - z.min() > MIN_UPRIGHT_M
+            cut[cell] = upright[cell] and by_lowest_ray[least]
             rank = int(LOW_SHARE * count)
             lowest[cell] = np.partition(z, rank)[rank]
-    return lowest
+    return lowest, upright, cut
 
 
-def _fit_plane(lowest: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the plane z = a + b x + c y (3,) below the cells' lowest points: furniture above counts little."""
+def _fit_plane(lowest: np.ndarray, cut: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the plane z = a + b x + c y (3,) below the cells' lowest points: furniture above counts little.
+
+    Cells whose floor is lower (`cut`, W, D) count only where it would be above them.
+    """
     rows, columns = np.nonzero(np.isfinite(lowest))
     if not len(rows):
         return np.array([np.percentile(points[:, 2], 100 * LOW_SHARE), 0.0, 0.0])
-    z = lowest[rows, columns]
+    z, open_below = lowest[rows, columns], cut[rows, columns]
     middle = np.array([x[rows].mean(), y[columns].mean()])
     table = np.stack([np.ones(len(z)), x[rows] - middle[0], y[columns] - middle[1]], axis=1)
-    plane = np.array([np.percentile(z, 20), 0.0, 0.0])
+    plane = np.array([np.percentile(z, 20) if open_below.all() else np.percentile(z[~open_below], 20), 0.0, 0.0])
     # Flat at first: a slope only once the level is known. The ridge keeps few cells from tilting it.
     for step in range(PLANE_STEPS):
         gap = z - table @ plane
         width = PLANE_WIDTH_M * (4 if step < PLANE_STEPS // 2 else 1)
         weight = 1 / (1 + np.where(gap > 0, gap / width, gap / MAX_BELOW_PLANE_M) ** 2) ** 2
+        weight[open_below & (gap > 0)] = 0.0
         ridge = np.diag([1e-9, 20.0, 20.0])
         plane = np.linalg.solve((table * weight[:, None]).T @ table + ridge, (table * weight[:, None]).T @ z)
     slope = np.clip(plane[1:], -MAX_PLANE_SLOPE, MAX_PLANE_SLOPE)
@@ -110,8 +173,8 @@ def _fit_plane(lowest: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndar
 
 
 @njit(cache=True, nogil=True)
-def _limit_slope(heights: np.ndarray, step: float) -> np.ndarray:
-    """Lower each cell to what its neighbours allow at `step` m a cell; infinite cells are filled."""
+def _limit_slope(heights: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Lower each cell (W, D) to what its neighbours allow at its `step` (W, D) m a cell."""
     result = heights.copy()
     wide, deep = result.shape
     for turn in range(4):
@@ -123,7 +186,7 @@ def _limit_slope(heights: np.ndarray, step: float) -> np.ndarray:
                 for di in range(-1, 2):
                     for dj in range(-1, 2):
                         if 0 <= i + di < wide and 0 <= j + dj < deep:
-                            best = min(best, result[i + di, j + dj] + step * np.sqrt(float(di * di + dj * dj)))
+                            best = min(best, result[i + di, j + dj] + step[i, j] * np.sqrt(float(di * di + dj * dj)))
                 result[i, j] = best
     return result
 

@@ -211,7 +211,9 @@ class SceneTracker:
             return bool(self._single_view) and self._settings.view != "full"
         points = self._in_range(cloud)[1]
         candidates = (
-            find_candidates(SceneHeights.of(points), cloud.viewpoint, MIN_DECIDING_POINTS)[0] if len(points) else []
+            find_candidates(SceneHeights.of(points, cloud.viewpoint), cloud.viewpoint, MIN_DECIDING_POINTS)[0]
+            if len(points)
+            else []
         )
         if not candidates:
             return False

@@ -140,7 +140,7 @@ class PersonFinder:
         self._view = None
         if len(points) < self._settings.min_points:
             return []
-        scene = SceneHeights.of(points)
+        scene = SceneHeights.of(points, viewpoint)
         middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
         if expected:
             known = [body if each.claims else body[:0] for body, each in zip(known, expected, strict=True)]

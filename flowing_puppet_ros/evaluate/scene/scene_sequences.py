@@ -10,10 +10,10 @@ import numpy as np
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
 from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, Disc
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import (
-    MAX_BEARING_RAD,
-    SENSOR_HEIGHT_M,
     SyntheticScene,
     cover_people,
+    draw_height,
+    find_view,
     is_upright,
     make_place,
     place_people,
@@ -42,10 +42,9 @@ def draw_sequence(
     The others stand as people in motion capture do, who sway. `lookalikes` as in `draw_scene`, and of those who stand a
     share `covered`.
     """
-    height = float(rng.uniform(*SENSOR_HEIGHT_M[place]))
+    height = draw_height(rng, place, scanner)
     meshes, blocked = make_place(rng, place, lookalikes)
-    view = np.pi if scanner.startswith("spinning") else MAX_BEARING_RAD
-    standing = place_people(source, rng, place, people, blocked, view)
+    standing = place_people(source, rng, place, people, blocked, find_view(scanner))
     motions: list[list[TrueBody]] = []
     for body in standing:
         walked = _draw_walk(source, rng, place, body, blocked, scans) if rng.random() < WALKING_SHARE else None

@@ -18,7 +18,18 @@ from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, MAKERS, 
 from flowing_puppet_ros.extras import import_extra
 
 PLACES = ("room", "street", "hall")
-SCANNERS = ("spinning-32", "spinning-64", "solid-state", "depth")
+SCANNERS = ("spinning-32", "spinning-64", "solid-state", "spinning-16", "dome", "depth")
+ELEVATION_DEG = {
+    "spinning-16": (-15.0, 15.0),
+    "spinning-32": (-25.0, 15.0),
+    "spinning-64": (-24.0, 8.0),
+    "dome": (-7.0, 52.0),
+}
+"""Lowest and highest ray of scanners that see all around."""
+DOME_HEIGHT_M = (0.3, 1.0)
+"""Of a scanner that sees little below its horizon: it stands low, on any floor."""
+DOME_RAYS, DOME_TURNS, DOME_SWEEPS = 20_000, 10.07, 211.3
+"""Rays of a scan that never repeats itself, the turns of the mirror in it, and its sweeps up and down."""
 SENSOR_HEIGHT_M = {"room": (0.5, 2.2), "street": (1.5, 2.2), "hall": (0.6, 3.0)}
 DISTANCE_M = {"room": (2.0, 8.0), "street": (3.0, 20.0), "hall": (3.0, 16.0)}  # of the people
 MIN_PERSON_GAP_M = 0.55  # between the middles of two people
@@ -62,15 +73,24 @@ def draw_scene(
     Beside what every place has, `lookalikes` other things are in it that stand as people do, and something as high as a
     table or a car stands before a share of the people, who are `covered` by it.
     """
-    height = float(rng.uniform(*SENSOR_HEIGHT_M[place]))
+    height = draw_height(rng, place, scanner)
     meshes, blocked = make_place(rng, place, lookalikes)
-    view = np.pi if scanner.startswith("spinning") else MAX_BEARING_RAD
-    bodies = place_people(source, rng, place, people, blocked, view)
+    bodies = place_people(source, rng, place, people, blocked, find_view(scanner))
     if covered:
         meshes += cover_people(rng.spawn(1)[0], bodies, covered)
     points, owner = scan_scene(meshes, [(body.vertices, source.triangles) for body in bodies], rng, scanner, height)
     down = np.array([0.0, 0.0, -height])
     return SyntheticScene(points, owner, [body.translate(down) for body in bodies], -height)
+
+
+def draw_height(rng: np.random.Generator, place: str, scanner: str) -> float:
+    """Draw the height of a scanner over the floor of a place, metres."""
+    return float(rng.uniform(*(DOME_HEIGHT_M if scanner == "dome" else SENSOR_HEIGHT_M[place])))
+
+
+def find_view(scanner: str) -> float:
+    """Return how far a scanner sees to either side of x, radians; of one that looks ahead, where people are put."""
+    return float(np.pi) if scanner in ELEVATION_DEG else MAX_BEARING_RAD
 
 
 def make_place(rng: np.random.Generator, place: str, lookalikes: int) -> tuple[list[Mesh], list[Disc]]:
@@ -174,11 +194,15 @@ def scan_scene(
 def make_rays(rng: np.random.Generator, scanner: str) -> tuple[np.ndarray, float]:
     """Return the unit directions (N, 3) of a scanner's rays in the order of the scan, and its range noise in metres."""
     if scanner.startswith("spinning"):
-        rings = int(scanner.rpartition("-")[2])
-        low, high = (-25.0, 15.0) if rings == 32 else (-24.0, 8.0)
+        elevation = np.radians(np.linspace(*ELEVATION_DEG[scanner], int(scanner.rpartition("-")[2])))
         azimuth = np.radians(np.arange(0, 360, 0.2)) + rng.uniform(0, 0.003)
-        elevation = np.radians(np.linspace(low, high, rings))
         a, e = (grid.ravel() for grid in np.meshgrid(azimuth, elevation, indexing="ij"))
+        noise = 0.02
+    elif scanner == "dome":
+        turn = np.linspace(0, 2 * np.pi, DOME_RAYS) + rng.uniform(0, 2 * np.pi)
+        low, high = np.radians(ELEVATION_DEG[scanner])
+        a = DOME_TURNS * turn
+        e = low + (high - low) * np.arccos(np.cos(DOME_SWEEPS * turn)) / np.pi
         noise = 0.02
     elif scanner == "solid-state":
         # A rosette: two prisms turn at different speeds.

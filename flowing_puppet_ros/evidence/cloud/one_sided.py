@@ -3,8 +3,10 @@
 
 A point of the body may lie on the seen surface or anywhere behind it. It must not lie in front of it, nor beside the
 silhouette, because the sensor saw through there. The cloud is its own depth image: directions are looked up in a grid
-of the nearest seen directions, whose spacing (as between the rings of a LiDAR) comes from the cloud. Where the sensor's
-field says that nothing can be known, the cloud says nothing either.
+of the nearest seen directions, whose spacing comes from the cloud. The rings of a LiDAR may lie ten times as far apart
+as the points along them: then directions are compressed across the rings, so that the gaps between these are not taken
+for places where the sensor saw through. Where the sensor's field says that nothing can be known, the cloud says nothing
+either.
 """
 
 from __future__ import annotations
@@ -22,12 +24,21 @@ MAX_CELLS = 60_000  # of the grid of directions
 SPACING_NEIGHBOUR = 4  # the spacing of directions is the distance to this neighbour ...
 SPACING_PERCENTILE = 90  # ... at this percentile over the cloud, or so many points of it
 MAX_SPACING_POINTS = 1000
+MAX_GAP_PAIRS, MIN_STRETCH, MAX_STRETCH = 200_000, 2.0, 8.0
+"""Pairs of points of which the gaps down and across are measured, about, at most, and their ratio from which on, and up
+to which, it counts."""
 TOLERANCE_SPACINGS = 1.5
 """Spacings of the seen directions beyond which a direction is beside the silhouette."""
 MAX_DISTANCE_M = 0.15
 """Distance at which costs saturate."""
 OCCLUSION_DEPTH_M = 0.05
 """Depth behind the seen surface from which a point facing the sensor counts as occluded by another part."""
+
+
+# The fields of a `OneSidedView`, for compiled loops.
+ViewArrays = tuple[
+    np.ndarray, np.ndarray, float, np.ndarray, np.ndarray, float, np.ndarray, float, np.ndarray, FieldArrays
+]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +48,8 @@ class OneSidedView:
     Attributes:
         viewpoint: (3,) metres.
         axes: (3, 3), rows right, down and forward, forward towards the middle of the cloud.
-        directions: (N, 2) right and down over forward of the cloud's points.
+        stretch: gap between the cloud's points down over that to the right; 1 where they are much the same.
+        directions: (N, 2) right, and down over `stretch`, over forward of the cloud's points.
         depth: (N,) metres along forward; negative for directions in which nothing is known.
         tolerance: distance between directions beyond which one is beside the silhouette.
         low: (2,) centre of the first cell, as directions.
@@ -48,6 +60,7 @@ class OneSidedView:
 
     viewpoint: np.ndarray
     axes: np.ndarray
+    stretch: float
     directions: np.ndarray
     depth: np.ndarray
     tolerance: float
@@ -71,6 +84,9 @@ class OneSidedView:
         """
         axes = _axes(points.mean(axis=0) - viewpoint)
         directions, depth = _project(points, viewpoint, axes)
+        stretch = _measure_stretch(directions)
+        squeeze = np.array([1.0, 1.0 / stretch])
+        directions *= squeeze
         every = 1 + len(points) // MAX_SPACING_POINTS
         near = find_neighbours(np.pad(directions, ((0, 0), (0, 1))), SPACING_NEIGHBOUR + 1, every)
         apart = np.linalg.norm(directions[near] - directions[::every, None], axis=2).max(axis=1)
@@ -79,13 +95,14 @@ class OneSidedView:
         cell = max(spacing / 2, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
         shape = np.ceil((high - low) / cell).astype(np.int64) + 1
         if unknown is not None and len(unknown):
-            directions = np.concatenate([directions, _project(unknown, viewpoint, axes)[0]])
+            directions = np.concatenate([directions, _project(unknown, viewpoint, axes)[0] * squeeze])
             depth = np.concatenate([depth, np.full(len(unknown), -1.0)])
         inside = np.flatnonzero(((directions >= low) & (directions <= high)).all(axis=1))
         level = np.pad(directions[inside], ((0, 0), (0, 1)))
         nearest = inside[fill_nearest(level, np.append(low, 0.0), cell, np.append(shape, 1))[:, :, 0]].astype(np.int32)
         tolerance = TOLERANCE_SPACINGS * spacing
-        return cls(viewpoint, axes, directions, depth, tolerance, low, cell, np.ascontiguousarray(nearest), field)
+        nearest = np.ascontiguousarray(nearest)
+        return cls(viewpoint, axes, stretch, directions, depth, tolerance, low, cell, nearest, field)
 
     @property
     def viewpoints(self) -> np.ndarray:
@@ -129,12 +146,46 @@ class OneSidedView:
     @property
     def arrays(
         self,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, np.ndarray, float, np.ndarray, FieldArrays]:
+    ) -> ViewArrays:
         """What compiled loops need, see `compare_point`."""
         return (
-            self.viewpoint, self.axes, self.directions, self.depth, self.tolerance, self.low, self.cell, self.nearest,
-            NO_FIELD if self.field is None else self.field.arrays,
+            self.viewpoint, self.axes, self.stretch, self.directions, self.depth, self.tolerance, self.low, self.cell,
+            self.nearest, NO_FIELD if self.field is None else self.field.arrays,
         )  # fmt: skip
+
+
+def measure_stretch(points: np.ndarray, viewpoint: np.ndarray) -> float:
+    """Return the gap between the directions of `points` (N, 3) m from `viewpoint` (3,) m down over that to the right.
+
+    It is 1 where they are much the same, as in a depth image, and above 1 for the rings of a LiDAR.
+    """
+    directions = _project(points, viewpoint, _axes(points.mean(axis=0) - viewpoint))[0]
+    return _measure_stretch(directions)
+
+
+def _measure_stretch(directions: np.ndarray) -> float:
+    across, down = _find_gaps(directions, 1 + len(directions) ** 2 // MAX_GAP_PAIRS)
+    ratio = float(np.median(down) / max(float(np.median(across)), 1e-9))
+    ratio = 1.0 if not np.isfinite(ratio) or 1 / MIN_STRETCH < ratio < MIN_STRETCH else ratio
+    return float(np.clip(ratio, 1 / MAX_STRETCH, MAX_STRETCH))
+
+
+# No NaN is compared, so that the smallest of many is found several at a time.
+@njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})
+def _find_gaps(directions, every):  # type: ignore[no-untyped-def]
+    """Return the distances (M,) from every such direction to the next one to its sides, and to the next up or down."""
+    count = (len(directions) + every - 1) // every
+    across, down, none = np.empty(count), np.empty(count), np.inf
+    x, y = directions[:, 0].copy(), directions[:, 1].copy()
+    for number in range(count):
+        own_x, own_y, nearest_across, nearest_down = x[number * every], y[number * every], none, none
+        for k in range(len(x)):
+            dx, dy = abs(x[k] - own_x), abs(y[k] - own_y)
+            squared = dx * dx + dy * dy
+            nearest_across = min(nearest_across, squared if dx > dy else none)
+            nearest_down = min(nearest_down, none if dx > dy or dy == 0.0 else squared)
+        across[number], down[number] = np.sqrt(nearest_across), np.sqrt(nearest_down)
+    return across, down
 
 
 def distances(targets: np.ndarray, points: np.ndarray, allowed: np.ndarray) -> np.ndarray:
@@ -164,19 +215,19 @@ def _project(points: np.ndarray, viewpoint: np.ndarray, axes: np.ndarray) -> tup
 
 
 @njit(cache=True, inline="always")
-def _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
+def _look_up(x, y, z, viewpoint, axes, stretch, directions, tolerance, low, cell, nearest):  # type: ignore[no-untyped-def]
     """Return the index of the point seen nearest in direction, depth, and the offset (x, y) beside the silhouette."""
     x, y, z = x - viewpoint[0], y - viewpoint[1], z - viewpoint[2]
     depth = max(axes[2, 0] * x + axes[2, 1] * y + axes[2, 2] * z, 1e-6)
     right = (axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z) / depth
-    down = (axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z) / depth
+    down = (axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z) / (depth * stretch)
     i = min(max(int(np.floor((right - low[0]) / cell + 0.5)), 0), nearest.shape[0] - 1)
     j = min(max(int(np.floor((down - low[1]) / cell + 0.5)), 0), nearest.shape[1] - 1)
     found = nearest[i, j]
     dx, dy = right - directions[found, 0], down - directions[found, 1]
     apart = np.sqrt(dx * dx + dy * dy)
     share = (1 - tolerance / apart) * depth if apart > tolerance else 0.0
-    return found, depth, share * dx, share * dy
+    return found, depth, share * dx, share * dy * stretch
 
 
 @njit(cache=True, inline="always")
@@ -185,10 +236,10 @@ def compare_point(x, y, z, view):  # type: ignore[no-untyped-def]
 
     Metres beside the silhouette along the view's axes right and down, and metres behind the surface as in `compare`.
     """
-    viewpoint, axes, directions, seen, tolerance, low, cell, nearest, field = view
+    viewpoint, axes, stretch, directions, seen, tolerance, low, cell, nearest, field = view
     if is_unknown(x, y, z, field):
         return 0.0, 0.0, np.inf
-    found, depth, dx, dy = _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest)
+    found, depth, dx, dy = _look_up(x, y, z, viewpoint, axes, stretch, directions, tolerance, low, cell, nearest)
     if seen[found] < 0:
         return 0.0, 0.0, np.inf
     return dx, dy, depth - seen[found]
@@ -228,7 +279,7 @@ def _find_seen(points, normals, view):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, cell, nearest, field):  # type: ignore[no-untyped-def]
+def _misfit(points, normals, viewpoint, axes, stretch, directions, seen, tolerance, low, cell, nearest, field):  # type: ignore[no-untyped-def]
     cost, facing = np.zeros(len(points)), np.zeros(points.shape[:2], dtype=np.bool_)
     for p in range(len(points)):
         for k in range(points.shape[1]):
@@ -241,7 +292,9 @@ def _misfit(points, normals, viewpoint, axes, directions, seen, tolerance, low, 
                 # As what is hidden costs: a limb is no more probably out of sight than behind another.
                 cost[p] += OCCLUSION_DEPTH_M if facing[p, k] else 0.0
                 continue
-            found, depth, dx, dy = _look_up(x, y, z, viewpoint, axes, directions, tolerance, low, cell, nearest)
+            found, depth, dx, dy = _look_up(
+                x, y, z, viewpoint, axes, stretch, directions, tolerance, low, cell, nearest
+            )
             if seen[found] < 0:
                 continue
             behind = depth - seen[found]

@@ -120,7 +120,8 @@ class _SeenScan:
     def of(cls, points: np.ndarray, truth: LabelledScene) -> _SeenScan:
         points = points - truth.sensor
         points = points[np.linalg.norm(points, axis=1) < MAX_RANGE_M]
-        scene, viewpoint = SceneHeights.of(points), np.zeros(3)
+        viewpoint = np.zeros(3)
+        scene = SceneHeights.of(points, viewpoint)
         candidates, _ = find_candidates(scene, viewpoint, MIN_POINTS)
         own = np.array([_label(candidate, truth) for candidate in candidates], dtype=np.int64)
         shape = describe_candidates(candidates, scene, viewpoint)

@@ -160,6 +160,19 @@ def test_normals_do_not_depend_on_how_far_off_the_origin_is(man: tuple[np.ndarra
     assert ((estimate_normals(points, None) * normals).sum(axis=1) > 0.7).mean() > 0.9
 
 
+def test_normals_look_beyond_the_points_of_one_ring() -> None:
+    rng = np.random.default_rng(0)
+    elevation, azimuth = np.radians(np.arange(-15.0, 15.1, 2.0)), np.radians(np.arange(-3.0, 3.0, 0.2))
+    e, a = (grid.ravel() for grid in np.meshgrid(elevation, azimuth, indexing="ij"))
+    # A pillar of 0.3 m, 3.5 m ahead.
+    near = 3.5 * np.cos(a) - np.sqrt(0.3**2 - (3.5 * np.sin(a)) ** 2)
+    outward = np.stack([near * np.cos(a) - 3.5, near * np.sin(a), np.zeros(len(a))], axis=1) / 0.3
+    points = np.stack([near * np.cos(a), near * np.sin(a), near * np.tan(e)], axis=1)
+    points *= 1 + 0.01 * rng.standard_normal((len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    cosine = (estimate_normals(points, np.zeros(3)) * outward).sum(axis=1)
+    assert np.median(cosine) > 0.95 and (cosine > 0.8).mean() > 0.9
+
+
 def test_fit_verb_writes_the_contract_and_goes_on_after_a_bad_input(
     tmp_path: Path, man: tuple[np.ndarray, np.ndarray, Joints], capsys: pytest.CaptureFixture[str]
 ) -> None:

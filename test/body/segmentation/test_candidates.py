@@ -37,6 +37,28 @@ def test_the_floor_follows_slopes_and_pavements_and_not_cars() -> None:
     np.testing.assert_allclose(floor.height(np.array([[10.0, 0.0, 1.0]])), 1.2, atol=0.06)
 
 
+def test_under_what_stands_near_a_sensor_that_looks_ahead_the_floor_goes_on() -> None:
+    """With rings every two degrees down to -14, no floor is seen nearer than 5.5 m."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([ground(rng, 200_000), *(figure(x, 0.0, -0.02 * x, rng, 4000) for x in (2.5, 4.5, 9.0))])
+    ray = points - SENSOR
+    elevation = np.degrees(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1])))
+    seen = points[(np.abs(elevation - 2.0 * np.round(elevation / 2.0)) < 0.05) & (np.abs(elevation + 1) < 13.5)]
+    assert np.hypot(*seen[np.abs(seen[:, 2] + 0.02 * seen[:, 0]) < 0.05, :2].T).min() > 5.5
+    floor = FloorGrid.find(seen, SENSOR)
+    for x in (2.5, 4.5, 9.0):
+        assert abs(floor.locate(x, 0.0) + 0.02 * x) < 0.05
+
+
+def test_the_floor_follows_a_ramp_and_not_what_stands_on_it() -> None:
+    rng = np.random.default_rng(5)
+    xy = rng.uniform(-15, 15, (60_000, 2))
+    points = np.column_stack([xy, np.clip(0.08 * xy[:, 0] - 0.16, 0.0, 0.64) + rng.normal(0, 0.01, len(xy))])
+    floor = FloorGrid.find(np.concatenate([points, figure(5.0, 0.0, 0.24, rng)]), SENSOR)
+    for x in (-5.0, 5.0, 8.0, 12.0):
+        assert abs(floor.locate(x, 0.0) - np.clip(0.08 * x - 0.16, 0.0, 0.64)) < 0.09
+
+
 def test_a_floor_that_was_cut_away_is_where_the_legs_end() -> None:
     rng = np.random.default_rng(1)
     people = [figure(x, y, 0.0, rng) for x, y in ((3, 0), (5, 2), (6, -3), (8, 1))]
@@ -123,7 +145,7 @@ def test_the_pieces_of_somebody_half_hidden_are_one_candidate_and_a_chair_beside
     person = figure(6.0, 0.0, -0.12, rng, count=500)
     height = person[:, 2] + 0.12
     legs, upper = person[(height > 0.15) & (height < 0.35)], person[height > 0.95]
-    chair = rng.uniform([5.66, 2.9, 0.0], [5.72, 3.1, 0.5], (100, 3))
+    chair = rng.uniform([5.6, 2.9, 0.0], [5.66, 3.1, 0.5], (100, 3))
     whole = figure(6.0, 3.0, -0.12, rng)
     start = 60_000
     scene = SceneHeights.of(np.concatenate([ground(rng), legs, upper, whole, chair]))

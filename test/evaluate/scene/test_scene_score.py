@@ -79,7 +79,7 @@ def test_labels_that_cannot_be_read_are_one_sentence(tmp_path: Path) -> None:
         label_scene([{"middle": 3}], np.zeros((1, 3)), "street")
 
 
-@pytest.mark.parametrize("scanner", ["spinning-32", "solid-state", "depth"])
+@pytest.mark.parametrize("scanner", ["spinning-16", "spinning-32", "solid-state", "dome", "depth"])
 def test_scanners_see_the_near_side_of_what_stands_before_them(scanner: str) -> None:
     post, wall = make_prism((4.0, 0.0), 0.3, 0, 2.0, 64), make_prism((0.0, 0.0), 7.0, 0, 3.0, 64)
     points, owner = scan_scene([wall], [post], np.random.default_rng(0), scanner, 1.2)

@@ -6,6 +6,7 @@ import pytest
 
 from flowing_puppet_ros.evidence.cloud.one_sided import (
     MAX_DISTANCE_M,
+    MAX_STRETCH,
     OCCLUSION_DEPTH_M,
     OneSidedView,
     distances,
@@ -82,3 +83,32 @@ def test_nearest_distances_are_those_of_plain_loops() -> None:
     np.testing.assert_allclose(
         mean_distance(points, targets), np.minimum(gaps.min(axis=1), MAX_DISTANCE_M).mean(axis=1)
     )
+
+
+def scan_with_rings(gap_deg: float, step_deg: float) -> np.ndarray:
+    """Scan the wall of 1 m by 1 m, two metres ahead along x, with rings of a LiDAR; (N, 3) m from the sensor."""
+    elevation, azimuth = np.radians(np.arange(-14.0, 14.1, gap_deg)), np.radians(np.arange(-14.0, 14.1, step_deg))
+    e, a = (grid.ravel() for grid in np.meshgrid(elevation, azimuth, indexing="ij"))
+    points = np.stack([np.full(e.size, 2.0), 2 * np.tan(a), 2 * np.tan(e) / np.cos(a)], axis=1)
+    return points[(np.abs(points[:, 1:]) <= 0.5).all(axis=1)]
+
+
+@pytest.mark.parametrize(("gap", "step"), [(2.0, 0.2), (1.3, 0.2), (0.2, 1.6)])
+def test_what_lies_between_rings_is_not_beside_the_silhouette(gap: float, step: float) -> None:
+    points = scan_with_rings(gap, step)
+    view = OneSidedView.build(points + SENSOR, SENSOR)
+    assert view.stretch == pytest.approx(np.clip(gap / step, 1 / MAX_STRETCH, MAX_STRETCH), rel=0.25)
+    between = scan_with_rings(0.31, 0.47)
+    between = between[np.abs(between[:, 1:]).max(axis=1) < np.abs(points[:, 1:]).max(axis=0).min()]
+    beside, behind = view.compare(between + SENSOR)
+    assert len(between) > 1000 and not beside.any()
+    np.testing.assert_allclose(behind, 0.0, atol=1e-3)
+    # Farther outside than from ring to ring: as far beside the silhouette as it is, and in that direction.
+    beside, _ = view.compare(np.array([[2.0, 0.8, 0.0], [2.0, 0.0, -0.9]]) + SENSOR)
+    slack = 2.0 * np.tan(np.radians(1.2 * max(gap, step)))
+    np.testing.assert_allclose(beside, [[0, 0.3, 0], [0, 0, -0.4]], atol=slack + 0.07)
+    assert (np.abs(beside).max(axis=1) > 0.1).all()
+
+
+def test_gaps_of_a_depth_image_are_the_same_down_and_across(wall: OneSidedView) -> None:
+    assert wall.stretch == 1.0

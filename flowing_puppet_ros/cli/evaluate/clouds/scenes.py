@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--count", type=int, default=12, help="synthetic scenes [%(default)s]")
     parser.add_argument("--places", nargs="+", choices=PLACES, default=PLACES, help="of synthetic scenes [all]")
-    parser.add_argument("--scanners", nargs="+", choices=SCANNERS, default=SCANNERS[:3], help="[all but depth]")
+    parser.add_argument("--scanners", nargs="+", choices=SCANNERS, default=SCANNERS[:3], help="[the first three]")
     parser.add_argument("--people", type=int, default=4, help="people in a synthetic scene [%(default)s]")
     parser.add_argument(
         "--lookalikes", type=int, default=0, help="more things that stand as people do, a scene [%(default)s]"
