@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes live over loopback DDS, timed: a drawn person, clouds of one and three bodies, RGB-D of two people."""
+"""The nodes live over loopback DDS, timed.
+
+A drawn person, clouds of one and three bodies, scans of a hall with five, RGB-D of two people.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks import scenes
 from benchmarks.drawn_person import DrawnPerson
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
@@ -32,11 +36,13 @@ APART_M = 1.5  # between the ways of people
 RGBD = "puppet_tracker, body_fitter"
 RGBD_COUNT = 45  # moments, played back and forth
 CLOUD_PEOPLE = (1, 3)  # in a cloud
+SCAN_HZ = 1e9 / scenes.SCAN_NS
 TARGETS = {
     (RGBD, 2): "15 Hz, median 120 ms, first body 0.6 s",
     ("puppet_tracker", 1): "15 Hz, median 150 ms, lock-on 10 s",
     ("body_fitter", 1): "20 Hz, lock-on 10 s",
     ("body_fitter", 3): "10 Hz, lock-on 10 s",
+    ("body_fitter", scenes.PEOPLE): "10 Hz, first bodies 0.5 s",
 }
 # The networks find no drawn person, our own detector does.
 _TRACKER_ARGUMENTS = ("-p", "flow.preset:=fast", "-p", "detection.source:=own")
@@ -110,15 +116,28 @@ def run(seconds: float, seed: int = 0) -> list[dict[str, Any]]:
         for people in CLOUD_PEOPLE:
             np.savez(file, clouds=make_clouds(seed, people))
             rows.append(_measure_node("body_fitter", file, seconds, ("-p", "track:=true"), people))
+        walk = scenes.draw_walk(StitchedPuppet.load(), seed, scenes.ROUND)
+        np.savez(file, clouds=stack_scans(walk), round=True)
+        arguments = ("-p", "track:=true", "-p", "view:=single")
+        rows.append(_measure_node("body_fitter", file, seconds, arguments, scenes.PEOPLE, SCAN_HZ))
         np.savez(file, **make_rgbd(seed))
         command = ["benchmarks.live_rgbd", str(file), "--rate", str(RATE_HZ), "--seconds", str(seconds)]
         rows.append({"node": RGBD} | _measure(command) | {"target": TARGETS[RGBD, 2]})
     return rows
 
 
-def _measure_node(node: str, file: Path, seconds: float, given: Sequence[str], people: int) -> dict[str, Any]:
+def stack_scans(scans: Sequence[np.ndarray]) -> np.ndarray:
+    """Return scans (N, P, 3) m of as many points each as the one with the fewest has, evenly taken."""
+    points = min(len(scan) for scan in scans)
+    evenly = [scan[np.linspace(0, len(scan) - 1, points).astype(np.int64)] for scan in scans]
+    return np.stack(evenly).astype(np.float32)
+
+
+def _measure_node(
+    node: str, file: Path, seconds: float, given: Sequence[str], people: int, rate: float = RATE_HZ
+) -> dict[str, Any]:
     """Measure a node with parameters `given` on input that shows so many people."""
-    command = ["benchmarks.live_node", node, str(file), "--rate", str(RATE_HZ), "--seconds", str(seconds)]
+    command = ["benchmarks.live_node", node, str(file), "--rate", str(rate), "--seconds", str(seconds)]
     figures = _measure([*command, "--people", str(people), "--", *given])
     return figures | {"target": TARGETS[node, people]}
 

@@ -170,7 +170,8 @@ class StitchedPuppet:
 
     def measure_height(self, shape: Array) -> float:
         """Return the height in metres of the person of a `shape` (16, S), standing in the template pose."""
-        return float(np.ptp(self.vertices(self.rest_state(shape))[:, 2]))
+        mean, change = _measure_rest_heights(self)
+        return float(np.ptp(mean + change @ np.ravel(shape)))
 
     def local_vertices(self, i: int, d: Array, s: Array) -> Array:
         """Return the vertices (..., N_i, 3) of part `i` in its own frame (Eqs. 45 and 46).
@@ -308,6 +309,15 @@ def _fit_rest_pose(model: StitchedPuppet) -> Array:
         basis = model.pose_basis[i].reshape((-1, model.pose_count(i)))
         pose[i, : basis.shape[1]] = np.linalg.lstsq(basis, -model.mean_pose[i].ravel(), rcond=None)[0]
     return pose
+
+
+@lru_cache(maxsize=4)
+def _measure_rest_heights(model: StitchedPuppet) -> tuple[Array, Array]:
+    """Return z (V,) m of the average body's vertices in the template pose, and what (V, 16 S) shapes add to it."""
+    mean = model.vertices(model.rest_state())[:, 2]
+    units = np.eye(len(model.tree) * model.shape_count).reshape((-1, len(model.tree), model.shape_count))
+    change = [model.vertices(model.rest_state(unit))[:, 2] - mean for unit in units]
+    return mean, np.ascontiguousarray(np.transpose(change))
 
 
 @lru_cache(maxsize=3)

@@ -31,7 +31,8 @@ def parallel_map[Item, Result](work: Callable[[Item], Result], items: Iterable[I
 
     The results and their order do not depend on the number of threads.
     """
-    if threads == 1:
+    items = list(items)
+    if threads == 1 or len(items) < 2:
         return [work(item) for item in items]
     with ThreadPoolExecutor(threads) as pool:
         return list(pool.map(work, items))

@@ -242,3 +242,11 @@ def test_men_are_taller_than_women() -> None:
     stature = [np.ptp(m.vertices(m.rest_state())[:, 2]) for m in (woman, man)]
     assert stature[1] > stature[0] + 0.05
     np.testing.assert_array_equal(woman.faces, man.faces)
+
+
+def test_height_is_that_of_the_template_pose(model: StitchedPuppet) -> None:
+    rng = np.random.default_rng(3)
+    for scale in (0.0, 1.0, 3.0):
+        shape = scale * rng.standard_normal((len(model.tree), model.shape_count))
+        z = model.vertices(model.rest_state(shape))[:, 2]
+        assert model.measure_height(shape) == pytest.approx(z.max() - z.min(), abs=1e-9)

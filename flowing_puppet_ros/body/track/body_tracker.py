@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,7 +26,14 @@ from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.settings import BodyTrackerSettings
-from flowing_puppet_ros.body.track.tracked_body import BodyObservation, align, extrapolate, translate
+from flowing_puppet_ros.body.track.tracked_body import (
+    BodyObservation,
+    TrackState,
+    align,
+    extrapolate,
+    is_far,
+    translate,
+)
 from flowing_puppet_ros.body.upright.upright_fit import (
     FEW_POINTS,
     MANY_POINTS,
@@ -53,25 +60,9 @@ MAX_TURNED_RATIO = 1.25
 few points hardly tell front from back, and hardly anybody walks backwards."""
 MAX_TRACKED_POINTS = 2500
 """Of one side of a person whose joints somebody sees: the shape comes from many clouds, and no full fit from these."""
+LONG_GAP_NS = 250_000_000  # time between clouds from which on the middle of the cloud tells better where somebody went
 ALIGN_GAP_NS = 100_000_000
 """Time between clouds from which on a body is first moved to the joints that somebody sees."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _TrackState:
-    """What is known of the person after a cloud.
-
-    `best` two-way distance in metres since the last full fit, `frames` whose shape was learned, `visible` surface that
-    is normally seen (points times squared metres of distance), `lost`: the body is not where the person is.
-    """
-
-    before: BodyObservation | None = None
-    last: BodyObservation | None = None
-    best: float = np.inf
-    frames: int = 0
-    visible: float = 0.0
-    hidden: bool = False
-    lost: bool = True
 
 
 class _Prepared(NamedTuple):
@@ -107,13 +98,13 @@ class BodyTracker:
         self._no_joints = JointTargets.none(fitter.model)
         self._upright = UprightFitter(fitter)
         self.counters: Counter[str] = Counter()
-        self._quick = False
+        self._quick = self._only_upright = False
         self.cloud: Cloud | None = None
         self.reset()
 
     def reset(self) -> None:
         """Forget the person."""
-        self._state = _TrackState()
+        self._state = TrackState()
 
     @property
     def last(self) -> BodyFit | None:
@@ -125,17 +116,23 @@ class BodyTracker:
         """Whether the last body is not where the person is."""
         return self._state.lost
 
-    def fork(self, quick: bool) -> BodyTracker:
-        """Return a tracker that knows the same person and goes its own way from here; `quick`: in its full fits too."""
+    def fork(self, quick: bool, upright: bool) -> BodyTracker:
+        """Return a tracker that knows the same person and goes its own way from here.
+
+        Its full fits are `quick`, or, where the floor is known, of `upright` bodies only.
+        """
         made = copy(self)
-        made._quick = quick
+        made._quick, made._only_upright = quick, upright
+        made._upright = UprightFitter(self._fitter, max_threads=1)  # the others are for who is tracked meanwhile
         made.counters = self.counters.copy()
         return made
 
     def start(self, person: PersonCloud, fit: BodyFit) -> None:
         """Start from a body that was found in the person's cloud."""
-        seen = BodyObservation(fit, person.stamp, person.points.mean(axis=0))
-        self._state = _TrackState(last=seen, best=fit.two_way_distance, frames=1, lost=False)
+        seen = BodyObservation(fit, person.stamp, person.points.mean(axis=0), len(person.points))
+        self._state = TrackState(
+            last=seen, best=fit.two_way_distance, best_points=len(person.points), frames=1, lost=False
+        )
 
     def correct(self, fit: BodyFit, parts: Sequence[int]) -> None:
         """Take another body for the last cloud, of which `parts` are elsewhere; they are not taken to have moved."""
@@ -183,8 +180,9 @@ class BodyTracker:
 
     def accept(self) -> None:
         """Take the last body for the best there is: a full fit has found none that is closer."""
-        if self._state.last is not None:
-            self._state = replace(self._state, best=self._state.last.fit.two_way_distance, lost=False)
+        last = self._state.last
+        if last is not None:
+            self._state = replace(self._state, best=last.fit.two_way_distance, best_points=last.points, lost=False)
 
     def track_or_refit(self, person: PersonCloud, seed: int | None = None, progress: Progress | None = None) -> BodyFit:
         """Fit the next cloud of the person, by a full fit when there is no track or it is lost.
@@ -274,16 +272,18 @@ class BodyTracker:
         if start is None:
             start = self._predict(last, cloud.points.mean(axis=0), prepared.stamp)
         fit = self._step(start, prepared)
-        return fit, self._is_lost(fit)
+        return fit, self._is_lost(fit, prepared)
 
     def _record(self, fit: BodyFit, lost: bool, prepared: _Prepared) -> BodyFit:
         state = self._state
         if prepared.few:
             fit = keep_place_only(self._fitter.model, fit, len(prepared.cloud.points))
-        seen = BodyObservation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0))
-        best = state.best if lost or prepared.occluded else min(state.best, fit.two_way_distance)
+        points = len(prepared.cloud.points)
+        seen = BodyObservation(fit, prepared.stamp, prepared.cloud.points.mean(axis=0), points)
+        if not lost and not prepared.occluded and fit.two_way_distance < state.best:
+            state = replace(state, best=fit.two_way_distance, best_points=points)
         frames = state.frames + (not prepared.occluded)
-        self._state = replace(state, before=state.last, last=seen, best=best, frames=frames, lost=lost)
+        self._state = replace(state, before=state.last, last=seen, frames=frames, lost=lost)
         return fit
 
     def _step(self, start: BodyState, prepared: _Prepared) -> BodyFit:
@@ -292,7 +292,7 @@ class BodyTracker:
         if places is not None and last is not None and prepared.stamp - last.stamp >= ALIGN_GAP_NS:
             start = align(self._fitter.gauss_newton, start, places)
         fit = self._refine(start, prepared, NARROW_WIDTHS_M, steps)
-        if not self._is_lost(fit):
+        if not self._is_lost(fit, prepared) or self._was_as_lost(fit):
             self.counters["tracked"] += 1
             return fit
         self.counters["widened"] += 1
@@ -308,9 +308,10 @@ class BodyTracker:
         """Return the full fit, unless the tracked body is closer to the cloud; its distance is the new best."""
         self.counters["searched"] += 1
         cloud = prepared.cloud
-        if prepared.few and prepared.floor is not None and isinstance(cloud, SingleViewCloud):
+        upright = prepared.few or self._only_upright
+        if upright and prepared.floor is not None and isinstance(cloud, SingleViewCloud):
             fit = self._upright.fit(cloud, prepared.floor).fit
-            return self._keep_closer(tracked, fit)
+            return self._keep_closer(tracked, fit, len(cloud.points))
         # Normals that were turned by a body that is lost would mislead the search.
         normals = None if prepared.oriented else cloud.normals
         # On the model's surface: vertices refined beyond it would come and go with the full fits.
@@ -324,24 +325,28 @@ class BodyTracker:
             nonrigid=False,
             quick=self._quick,
         )
-        return self._keep_closer(tracked, fit)
+        return self._keep_closer(tracked, fit, len(cloud.points))
 
-    def _keep_closer(self, tracked: BodyFit | None, fit: BodyFit) -> BodyFit:
+    def _keep_closer(self, tracked: BodyFit | None, fit: BodyFit, points: int) -> BodyFit:
         if tracked is not None and tracked.two_way_distance <= fit.two_way_distance:
-            self._state = replace(self._state, best=tracked.two_way_distance)
+            self._state = replace(self._state, best=tracked.two_way_distance, best_points=points)
             return tracked
         # How much of the person is normally seen does not depend on the body.
-        self._state = _TrackState(best=fit.two_way_distance, visible=self._state.visible)
+        self._state = TrackState(best=fit.two_way_distance, best_points=points, visible=self._state.visible)
         return fit
 
     def _predict(self, last: BodyObservation, middle: F64, stamp: int) -> BodyState:
         """Return the last body, moved on by its last motion in proportion to the time.
 
-        After a long gap, which a full fit leaves in a live stream too, it moves as the middle of the cloud did.
+        Without one, and after a long gap, which a full fit leaves in a live stream too, it moves as the middle of the
+        cloud did; after a shorter one, it turns by its last motion.
         """
-        if stamp - last.stamp > 1e9 * self._settings.max_time_gap:
+        if stamp - last.stamp > 1e9 * self._settings.max_time_gap or is_far(self._state.before, last, stamp):
             return replace(last.fit.state, center=last.fit.state.center + middle - last.middle)
-        return extrapolate(self._state.before, last, stamp)
+        moved = extrapolate(self._state.before, last, stamp)
+        if stamp - last.stamp <= LONG_GAP_NS:
+            return moved
+        return replace(moved, center=moved.center + middle - last.middle - (moved.center[0] - last.fit.state.center[0]))
 
     def _update_visible(self, points: F64, stamp: int, viewpoint: F64, min_visible: float) -> bool:
         """Return whether less than a share of the person is seen than normally; what is normal follows what is seen."""
@@ -377,5 +382,16 @@ class BodyTracker:
         body = hang_unseen_parts(self._fitter.model, (last, body), cloud, prepared.targets)
         return self._fitter.assess(body, cloud)
 
-    def _is_lost(self, fit: BodyFit) -> bool:
-        return fit.two_way_distance > self._settings.lost_ratio * self._state.best + self._settings.lost_distance
+    def _was_as_lost(self, fit: BodyFit) -> bool:
+        """Return whether more steps with a wider kernel left the body before as far from its cloud."""
+        last = self._state.last
+        if last is None or not self._state.lost:
+            return False
+        return fit.two_way_distance <= self._settings.lost_ratio * last.fit.two_way_distance
+
+    def _is_lost(self, fit: BodyFit, prepared: _Prepared) -> bool:
+        best, points = self._state.best, len(prepared.cloud.points)
+        if prepared.floor is not None and points < self._state.best_points:
+            # The farther somebody walks away, the farther are the points from each other, and a body from them.
+            best *= float(np.sqrt(self._state.best_points / points))
+        return fit.two_way_distance > self._settings.lost_ratio * best + self._settings.lost_distance

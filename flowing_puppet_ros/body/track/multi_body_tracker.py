@@ -9,9 +9,9 @@ first.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -23,11 +23,9 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.settings import BodyTrackerSettings
 from flowing_puppet_ros.body.track.background_fit import BackgroundFit, SeededCloud
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
-from flowing_puppet_ros.body.track.person_belief import PersonBelief
-from flowing_puppet_ros.body.track.rig_scene import shows_person
-from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
-from flowing_puppet_ros.body.upright.found_body import JudgedFit
-from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
+from flowing_puppet_ros.body.track.person_track import AT_ONCE_INTERVAL_NS, Judge, PersonTrack, track_person
+from flowing_puppet_ros.body.track.tracked_body import TrackedBody
+from flowing_puppet_ros.body.upright.found_body import ExpectedPerson
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.process.threads import parallel_map, usable_threads
@@ -38,18 +36,18 @@ MATCH_DISTANCE_M = 0.6  # between the middle of a person's cloud and where it is
 MATCH_SPEED_M_PER_S, MAX_MATCH_DISTANCE_M = 2.0, 2.5  # by which that grows while unseen, and up to which
 NO_BODY_PENALTY_M = 0.6  # for tracks without a body, which are often fragments of a neighbour
 OWNED_FACTOR = 0.3  # of the distance where the track's body lies in the cloud
-VELOCITY_GAIN = 0.5  # fraction of a new velocity that is taken
-MAX_VELOCITY_GAP_NS = 1_000_000_000  # between clouds that give a velocity
-REFIT_INTERVAL_NS = 5_000_000_000  # from one full fit of an unreliable body to the next
-TURN_INTERVAL_NS = 1_000_000_000  # between attempts to turn a body round that walks backwards
 MAX_OTHER_WAY_RATIO = 0.8
 """Two-way distance of a full fit that faces the other way, relative to the tracked body's, up to which it is taken."""
+ROUGH_OTHER_WAY_RATIO = 1.25
+"""The same where the tracked body is a rough one: nobody compared both ways then."""
 BODY_STRIDE = 8  # every so many vertices stand for a body
-AT_ONCE_INTERVAL_NS = 1_000_000_000  # between attempts at one: people soon stand otherwise
 MAX_FITS_AT_ONCE = 4  # new people in one cloud of a live stream who have a body in it
+MAX_LIVE_STEPS = 3  # Gauss-Newton steps a scan of a live stream: a scan that is answered late costs more than two steps
+MAX_LIVE_ASKED = 2
+"""Bodies about which one scan of a live stream is asked, so that nobody waits for the others; one if all are shown."""
 
-Judge = Callable[[PersonCloud, BodyFit, bool], JudgedFit]
-"""What a scan says about a body, or about a better one that it has instead; if wanted, also about one turned round."""
+Fitted = BodyFit | InputError | None
+"""What came of a person's cloud: a body, why there is none, or nothing yet."""
 
 
 @dataclass(frozen=True)
@@ -57,86 +55,6 @@ class MultiBodyTrackerSettings(BodyTrackerSettings):
     """Settings of `MultiBodyTracker`."""
 
     hold: float = setting(2.0, "time for which a person out of sight keeps the id", unit="s", low=0.0, high=60.0)
-
-
-@dataclass(slots=True, eq=False)
-class _BodyTrack:
-    """One person.
-
-    The middle (3,) m of their cloud at `stamp` ns, its `velocity` m/s, what tracks the body, its `motion`, the number
-    of full fits and the stamp of the last, those of the last attempts to turn it round and at a body at once, whether
-    it is `proven` to be a person, and what scans said about that.
-    """
-
-    id: str
-    number: int
-    middle: F64
-    stamp: int
-    tracker: BodyTracker
-    velocity: F64 = field(default_factory=lambda: np.zeros(3))
-    motion: TorsoMotion = field(default_factory=TorsoMotion)
-    fits: int = 0
-    fitted: int = 0
-    turned: int = -TURN_INTERVAL_NS
-    tried: int = -AT_ONCE_INTERVAL_NS
-    proven: bool = True
-    belief: PersonBelief | None = None
-
-    @property
-    def shows_reliable(self) -> bool:
-        """Whether the last body is reliable."""
-        return self.tracker.last is not None and self.tracker.last.reliable
-
-    def predict_middle(self, stamp: int) -> F64:
-        """Return where the middle should be at a later time in nanoseconds."""
-        return np.asarray(self.middle + self.velocity * 1e-9 * (stamp - self.stamp))
-
-    def prove(self, person: PersonCloud, fit: BodyFit) -> bool:
-        """Return whether it is known to be a person, as a body of theirs may show from then on."""
-        self.proven = self.proven or shows_person(person, fit)
-        return self.proven and (self.belief is None or self.belief.decide())
-
-    def start(self, person: PersonCloud, fit: BodyFit) -> None:
-        """Start with a body that was found in the person's cloud, and what was said about it there."""
-        self.tracker.start(person, fit)
-        # Many points tell more than an upright body shows: a full fit may follow at once.
-        doubtful = not fit.reliable and len(person.points) >= MIN_MANY_POINTS
-        self.fitted = person.stamp - REFIT_INTERVAL_NS if doubtful else person.stamp
-        if person.proven:
-            self.belief = PersonBelief(person.middle[:2])
-            self.belief.add(person.score, fit.confidence, self.stamp, len(person.points))
-
-    def weigh(self, person: PersonCloud, fit: BodyFit, judge: Judge) -> BodyFit:
-        """Ask a scan whether it is a person, unless that was asked lately or too little is seen; return its body."""
-        if self.belief is None:
-            self.belief = PersonBelief(person.middle[:2])
-        self.belief.visit(person.points, self.stamp)
-        if self.belief.is_due(self.stamp) and not self.tracker.hidden:
-            judged = judge(person, fit, self.belief.asks_facing(len(person.points)))
-            self.belief.add(judged.probability, judged.confidence, self.stamp, len(person.points))
-            if judged.turned is not None and self.belief.turns(judged.turned[1]):
-                self.tracker.start(person, judged.turned[0])
-                self.motion.allow_turn()
-                return judged.turned[0]
-            if judged.fit is not fit:
-                self.tracker.start(person, judged.fit)
-            return judged.fit
-        return fit
-
-    def show(self, fit: BodyFit) -> TrackedBody:
-        """Return its body at the time of the last cloud, with what is known of its motion."""
-        if self.belief is not None and self.belief.confidence is not None:
-            fit = replace(fit, confidence=self.belief.confidence)
-        return self.motion.add(self.id, self.stamp, fit, self.tracker.hidden)
-
-    def update(self, middle: F64, stamp: int) -> None:
-        """Take where the person is now."""
-        if 0 < stamp - self.stamp <= MAX_VELOCITY_GAP_NS:
-            measured = (middle - self.middle) / (1e-9 * (stamp - self.stamp))
-            self.velocity = self.velocity + VELOCITY_GAIN * (measured - self.velocity)
-        else:
-            self.velocity = np.zeros(3)
-        self.middle, self.stamp = middle, stamp
 
 
 class MultiBodyTracker:
@@ -161,9 +79,10 @@ class MultiBodyTracker:
         self._threads = usable_threads(fitter.settings.threads)
         self._prefix = "b" + (letters_of_seed(seed) if seed else "")
         self._started = 0
-        self._tracks: list[_BodyTrack] = []
+        self._tracks: list[PersonTrack] = []
         self._background_fit = BackgroundFit()
         self._stamp: int | None = None
+        self._hurries = False
 
     def reset(self) -> None:
         """Forget everybody; ids go on, so that none is used twice in a run."""
@@ -183,6 +102,10 @@ class MultiBodyTracker:
             moved, fit = track.predict_middle(stamp) - track.middle, track.tracker.last
             found.append(fit.vertices[::BODY_STRIDE] + moved if fit else np.empty((0, 3)))
         return found
+
+    def expect_people(self, stamp: int) -> list[ExpectedPerson]:
+        """Return where everybody may be at a time in ns, in the order of `predict_bodies`."""
+        return [track.expect(stamp) for track in self._tracks]
 
     def step(
         self,
@@ -209,35 +132,39 @@ class MultiBodyTracker:
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
         self._stamp = stamp
+        self._hurries = executor is not None and judge is not None
         self._adopt_finished_fit()
         matched = self._associate(people, stamp)
         started: dict[int, BodyFit] = {}
         for track, person in matched:
             known = next((fit for index, fit in first.items() if people[index] is person), None)
             if known is not None and track.tracker.last is None:
-                track.start(person, known)
+                track.start(person, known, rough=executor is not None)
                 started[track.number] = known
         followed = [pair for pair in matched if pair[0].number not in started]
-        tracked = iter(parallel_map(_track, followed, self._threads))
+        tracked = iter(parallel_map(track_person, followed, self._threads))
         fitted = [started[track.number] if track.number in started else next(tracked) for track, _ in matched]
+        if judge is not None:
+            fitted = self._drop_doubles(matched, fitted)
+            matched = [pair for pair in matched if pair[0] in self._tracks]
+        due = self._choose_asked(matched, stamp, live=executor is not None)
         bodies: list[TrackedBody] = []
-        new: list[tuple[_BodyTrack, SeededCloud]] = []
-        waiting: list[tuple[_BodyTrack, SeededCloud]] = []
+        new: list[tuple[PersonTrack, SeededCloud]] = []
+        waiting: list[tuple[PersonTrack, SeededCloud]] = []
         for (track, person), fit in zip(matched, fitted, strict=True):
             if isinstance(fit, InputError):
                 self._report.count_unusable(fit)
                 continue
             if judge is not None and fit is not None and track.number not in started:
-                fit = track.weigh(person, fit, judge)
+                fit = track.weigh(person, fit, judge if track.number in due else None)
             if fit is not None and track.prove(person, fit):
                 bodies.append(track.show(fit))
-            # A full fit to the little that is seen of a hidden person would bend the body.
-            unreliable = fit is not None and not fit.reliable and not track.tracker.hidden
-            unreliable = unreliable and stamp - track.fitted >= REFIT_INTERVAL_NS
             cloud = SeededCloud(person, _person_seed(seed, track.number))
             if fit is None:
                 new.append((track, cloud))
-            if not self._background_fit.add(track.number, cloud) and (track.tracker.lost or unreliable):
+            if not self._background_fit.add(track.number, cloud) and (
+                track.wants_fit(fit, stamp, seldom=self._hurries)
+            ):
                 waiting.append((track, cloud))
         self._report.counters["tracked people"] += len(bodies)
         self._drop_lost(stamp)
@@ -262,7 +189,7 @@ class MultiBodyTracker:
         self._drop_lost(stamp)
         return named
 
-    def _fit_at_once(self, new: list[tuple[_BodyTrack, SeededCloud]]) -> list[TrackedBody]:
+    def _fit_at_once(self, new: list[tuple[PersonTrack, SeededCloud]]) -> list[TrackedBody]:
         """Return the bodies of new people who are seen from all sides and to whom one comes close in no time.
 
         Whose full fit runs beside the clouds is tried too: it takes seconds while clouds come fast.
@@ -279,13 +206,15 @@ class MultiBodyTracker:
                 bodies += [track.show(fit)] if track.prove(cloud.person, fit) else []
         return bodies
 
-    def _try_at_once(self, pair: tuple[_BodyTrack, SeededCloud]) -> BodyFit | None:
+    def _try_at_once(self, pair: tuple[PersonTrack, SeededCloud]) -> BodyFit | None:
         try:
             return self._fitter.fit_at_once(pair[1].person.points, pair[1].person.normals)
         except InputError:
             return None
 
-    def _start_fit(self, waiting: list[tuple[_BodyTrack, SeededCloud]], executor: Executor | None) -> list[TrackedBody]:
+    def _start_fit(
+        self, waiting: list[tuple[PersonTrack, SeededCloud]], executor: Executor | None
+    ) -> list[TrackedBody]:
         """Start a full fit of the person who needs it most; in line finish it, or those of all who are new."""
         if not waiting or self._background_fit.busy:
             return []
@@ -294,14 +223,16 @@ class MultiBodyTracker:
         new = [] if executor is not None else [pair for pair in waiting if not pair[0].fits]
         return [body for pair in new or waiting[:1] for body in self._start_one_fit(*pair, executor)]
 
-    def _start_one_fit(self, track: _BodyTrack, cloud: SeededCloud, executor: Executor | None) -> list[TrackedBody]:
+    def _start_one_fit(self, track: PersonTrack, cloud: SeededCloud, executor: Executor | None) -> list[TrackedBody]:
         """Start a full fit; return the body if it is finished and the first of this person."""
         track.fits, track.fitted = track.fits + 1, cloud.person.stamp
         self._report.counters["searches"] += 1
         known = track.tracker.last
         # Live, a body that may have a limb wrong is shown and tracked while a better one is searched.
         quick = executor is not None and known is None
-        self._background_fit.start(track.number, track.tracker.fork(quick), cloud, executor)
+        upright = executor is not None and track.uprights > 0
+        track.uprights -= upright
+        self._background_fit.start(track.number, track.tracker.fork(quick, upright), cloud, executor)
         self._adopt_finished_fit()
         fit = track.tracker.last
         return [track.show(fit)] if known is None and fit is not None and track.prove(cloud.person, fit) else []
@@ -313,13 +244,25 @@ class MultiBodyTracker:
             return
         number, tracker = finished
         for track in self._tracks:
-            if track.number == number and tracker.last is not None:
-                if _is_better(tracker.last, track.tracker.last):
-                    track.tracker = tracker
-                else:
-                    track.tracker.accept()
+            if track.number != number:
+                continue
+            if tracker.last is not None and _is_better(
+                tracker.last, track.tracker.last, ROUGH_OTHER_WAY_RATIO if track.rough else MAX_OTHER_WAY_RATIO
+            ):
+                track.adopt(tracker)
+            elif tracker.last is not None:
+                track.tracker.accept()
+            track.rough = False
 
-    def _associate(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[_BodyTrack, PersonCloud]]:
+    def _choose_asked(self, seen: Sequence[tuple[PersonTrack, PersonCloud]], stamp: int, live: bool) -> set[int]:
+        """Return the numbers of the tracks about which a scan is asked; live, of few who were asked least, in turns."""
+        due = sorted((track for track, _ in seen if track.is_due(stamp)), key=PersonTrack.rank_asked)
+        if live:
+            waiting = sum(not track.is_shown for track in due)
+            due = due[: min(max(waiting, 1), MAX_LIVE_ASKED)]
+        return {track.number for track in due}
+
+    def _associate(self, people: Sequence[PersonCloud], stamp: int) -> list[tuple[PersonTrack, PersonCloud]]:
         """Match the people to the tracks at minimum total cost; the others start tracks."""
         middles = [person.middle for person in people]
         cost = np.full((len(self._tracks), len(people)), np.inf)
@@ -346,10 +289,21 @@ class MultiBodyTracker:
         self._started += 1
         return f"{self._prefix}{self._started}"
 
-    def _start_track(self, middle: F64, stamp: int, proven: bool) -> _BodyTrack:
-        name, tracker = self.make_id(), BodyTracker(self._fitter, self._settings)
-        self._tracks.append(_BodyTrack(name, self._started, middle, stamp, tracker, proven=proven))
+    def _start_track(self, middle: F64, stamp: int, proven: bool) -> PersonTrack:
+        steps = self._settings.gauss_newton_steps
+        steps = min(steps, MAX_LIVE_STEPS) if self._hurries else steps
+        name, tracker = self.make_id(), BodyTracker(self._fitter, replace(self._settings, gauss_newton_steps=steps))
+        self._tracks.append(PersonTrack(name, self._started, middle, stamp, tracker, proven=proven))
         return self._tracks[-1]
+
+    def _drop_doubles(
+        self, matched: Sequence[tuple[PersonTrack, PersonCloud]], fitted: Sequence[Fitted]
+    ) -> list[Fitted]:
+        """Drop who is another person of the same cloud, and return what was fitted to the others."""
+        seen = [track for track, _ in matched]
+        doubles = [track for track in seen if any(track.is_double_of(other) for other in seen)]
+        self._tracks = [track for track in self._tracks if track not in doubles]
+        return [fit for track, fit in zip(seen, fitted, strict=True) if track not in doubles]
 
     def _drop_lost(self, stamp: int) -> None:
         kept = [track for track in self._tracks if stamp - track.stamp <= 1e9 * self._settings.hold]
@@ -359,26 +313,12 @@ class MultiBodyTracker:
         self._tracks = [track for track in kept if track.belief is None or not track.belief.is_hopeless]
 
 
-def _track(pair: tuple[_BodyTrack, PersonCloud]) -> BodyFit | InputError | None:
-    track, person = pair
-    try:
-        if person.stamp - track.turned >= TURN_INTERVAL_NS and track.motion.walks_backwards():
-            track.turned = person.stamp
-            turned = track.tracker.turn_round(person)
-            if turned is not None:
-                track.motion.allow_turn()
-                return turned
-        return track.tracker.track(person)
-    except InputError as error:
-        return error
-
-
-def _is_better(full: BodyFit, own: BodyFit | None) -> bool:
-    """Return whether a full fit is closer than the tracked body, and much closer where it faces the other way."""
+def _is_better(full: BodyFit, own: BodyFit | None, other_way: float) -> bool:
+    """Return whether a full fit is closer than the tracked body, by the ratio `other_way` where it faces another."""
     if own is None:
         return True
     same = own.state.rotation[0, :2, 0] @ full.state.rotation[0, :2, 0] > 0
-    return full.two_way_distance < (1.0 if same else MAX_OTHER_WAY_RATIO) * own.two_way_distance
+    return full.two_way_distance < (1.0 if same else other_way) * own.two_way_distance
 
 
 def _person_seed(seed: int, number: int) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ def crop_to_region(points: F64, region: RegionSettings) -> Bools:
     return inside
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class SceneCloud:
     """A cloud with z up.
 
@@ -80,7 +81,7 @@ class SceneCloud:
         normals = None if self.normals is None else self.normals[rows]
         return replace(self, points=self.points[rows], normals=normals, image=self.image and self.image.take(rows))
 
-    @property
+    @cached_property
     def distance(self) -> F64:
         """Distance (N,) m of the points from the sensor."""
         x, y, z = (self.points - self.viewpoint).T  # faster than rows of three
@@ -90,8 +91,14 @@ class SceneCloud:
         """Return its range image; a scan without order is drawn into one as its sensor is held."""
         if self.image is not None:
             return self.image
+        if np.array_equal(self.to_sensor, np.eye(3)):  # held level, which saves a third of the time
+            return RangeImage.of_scan(self.points, self.viewpoint)
         drawn = RangeImage.of_scan((self.points - self.viewpoint) @ self.to_sensor.T, np.zeros(3))
         return drawn.turn(self.to_sensor.T).move(self.viewpoint)
+
+    def with_image(self) -> SceneCloud:
+        """Return the same cloud with its range image."""
+        return replace(self, image=self.draw_image())
 
     def with_fields(self, people: Sequence[PersonCloud]) -> list[PersonCloud]:
         """Return people seen from the viewpoint with what the sensor can know of each.

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -17,17 +18,18 @@ from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_c
 from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.segmentation.people import segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
+from flowing_puppet_ros.body.segmentation.seen_free import SeenFree
 from flowing_puppet_ros.body.settings import SegmentationSettings
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
-from flowing_puppet_ros.body.track.seen_free import SeenFree
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
-from flowing_puppet_ros.body.upright.found_body import FoundBody, JudgedFit
+from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget, FoundBody, JudgedFit
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.process.threads import usable_threads
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings, nested, setting
 
@@ -36,9 +38,9 @@ MAX_HEIGHT_M = 2.6
 _NOBODY = "there is nobody in the cloud of {} points; turn scene off to fit it all"
 MAX_MISSES = 8
 """Candidates in a row that have to be nobody until no more are fitted in a scan of a recording, the likeliest first."""
-MAX_LIVE_FITS = 4
-"""Candidates to which bodies are fitted in a scan of a live stream, so that the first body does not wait for others,
-which come with the next."""
+MAX_FIRST_FITS, MAX_LIVE_FITS = 8, 2
+"""Candidates to which a quick body is fitted in a scan of a live stream, while nobody is tracked and afterwards, so
+that the first bodies do not wait for others, which come with the next."""
 SEARCH_EVERY = 3  # scans of a live stream in which somebody is tracked: the others are not searched for new people
 MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
 _UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
@@ -137,14 +139,17 @@ class SceneTracker:
             return self._tracker.step_one(person, seed, executor), []
         known = self._tracker.predict_bodies(cloud.stamp) if settings.track else ()
         if self._is_one_sided(cloud, remember=True):
-            found = self._find(cloud, known, settings.track, live=executor is not None)
+            live = executor is not None and settings.track
+            expected = self._tracker.expect_people(cloud.stamp) if live else ()
+            found = self._find(cloud, known, expected, settings.track, live)
             if not settings.track:
                 fits = {id(body.person): body.fit for body in found}
                 named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
                 return [TrackedBody(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
             first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
             seen = [body.person for body in found]
-            bodies = self._tracker.step(seen, cloud.stamp, seed, executor, first, self._judge)
+            judge = partial(self._judge, quick=live)
+            bodies = self._tracker.step(seen, cloud.stamp, seed, executor, first, judge)
             return bodies, self._tracker.occluded_ids
         people = self._with_viewpoint(cloud, self._segment(cloud, known, self._planes))
         if settings.track:
@@ -184,7 +189,7 @@ class SceneTracker:
 
     def find_once(self, cloud: SceneCloud) -> list[FoundBody]:
         """Find the people in a one-sided scene that belongs to no stream, the likeliest first."""
-        return self._find(cloud, (), remember=False)
+        return self._find(cloud)
 
     def fit_found(self, found: Sequence[FoundBody], seed: int, progress: Progress | None = None) -> list[BodyFit]:
         """Return the bodies of people found in a scene, fitted again where that may help, without the doubtful."""
@@ -224,10 +229,19 @@ class SceneTracker:
         rows = np.flatnonzero(near)
         if len(rows) > MAX_SCENE_POINTS:
             rows = rows[np.linspace(0, len(rows) - 1, MAX_SCENE_POINTS).astype(np.int64)]
+        elif len(rows) == len(near):
+            return rows, np.ascontiguousarray(cloud.points, dtype=np.float64)
         return rows, np.asarray(cloud.points[rows], dtype=np.float64)
 
-    def _find(self, cloud: SceneCloud, known: Sequence[F64], remember: bool, live: bool = False) -> list[FoundBody]:
-        """Find the people of a single view; the known ones first. All, or of a tracked stream the likeliest."""
+    def _find(
+        self,
+        cloud: SceneCloud,
+        known: Sequence[F64] = (),
+        expected: Sequence[ExpectedPerson] = (),
+        remember: bool = False,
+        live: bool = False,
+    ) -> list[FoundBody]:
+        """Find the people of a single view; the known ones first. All, or of a live stream the likeliest."""
         rows, points = self._in_range(cloud)
         self._searched = rows
         if not self._was_searched and len(points):
@@ -236,29 +250,44 @@ class SceneTracker:
                 self._report.warn(_UPSIDE_DOWN)
         normals = None if cloud.normals is None else cloud.normals[rows]
         # Who is tracked needs no search, and who comes can wait for a few scans.
-        only_known = live and any(len(body) for body in known) and self._since_search + 1 < SEARCH_EVERY
+        is_tracked = any(len(body) for body in known)
+        only_known = live and is_tracked and self._since_search + 1 < SEARCH_EVERY and not self._finder.left_over
         self._since_search = self._since_search + 1 if only_known else 0
         come = self._seen_free.add(points, cloud.viewpoint) if remember and not only_known else None
-        found = self._finder.find(
+        search = partial(
+            self._finder.find,
             points,
             normals,
             cloud.viewpoint,
             cloud.stamp,
             known,
-            MAX_LIVE_FITS if live else None,
-            MAX_MISSES if remember else None,
+            expected,
+            self._make_budget(remember, live, is_tracked),
             remember,
             come,
             only_known,
         )
+        # Who is tracked will need the range image.
+        if live and is_tracked and usable_threads(self._fitter.settings.threads) > 1:
+            with ThreadPoolExecutor(1) as beside:
+                drawn = beside.submit(cloud.with_image)
+                found, cloud = search(), drawn.result()
+        else:
+            found = search()
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
 
-    def _judge(self, person: PersonCloud, fit: BodyFit, turn: bool) -> JudgedFit:
+    def _make_budget(self, is_stream: bool, is_live: bool, is_tracked: bool) -> FitBudget:
+        """Return how many bodies are fitted in a scan."""
+        if is_live:
+            return FitBudget(MAX_LIVE_FITS if is_tracked else MAX_FIRST_FITS, quick=True)
+        return FitBudget(self._settings.people.max_fits, MAX_MISSES if is_stream else None)
+
+    def _judge(self, person: PersonCloud, fit: BodyFit, turn: bool, quick: bool) -> JudgedFit:
         """Return what the cloud that was searched last says about a body: see `PersonFinder.judge`."""
         assert person.rows is not None
-        return self._finder.judge(person, np.searchsorted(self._searched, np.sort(person.rows)), fit, turn)
+        return self._finder.judge(person, np.searchsorted(self._searched, np.sort(person.rows)), fit, turn, quick)
 
     def _improve(
         self, person: PersonCloud, fit: BodyFit | None, seed: int, progress: Progress | None = None

@@ -17,6 +17,7 @@ from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import BodyState
 
 MAX_STRETCH = 2.0  # frames by which a motion is extrapolated at most
+FIRST_GAP_NS = 150_000_000  # time after the first frame up to which somebody is taken to be where they were
 ALIGNED = RefineWeights(stitch=1.0, pose=1e-5, shape=1e-2, pairwise=1e-5, sigma_start=0.4, sigma_end=0.08, iterations=6)
 """To joints alone, the shape being known."""
 
@@ -128,11 +129,37 @@ def _is_jump(before: BodyFit, after: BodyFit, nanoseconds: int) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyObservation:
-    """A fit, the time of its cloud in nanoseconds, and the mean (3,) of the cloud's points, metres."""
+    """A fit, the time of its cloud in nanoseconds, the mean (3,) of the cloud's points, metres, and their number."""
 
     fit: BodyFit
     stamp: int
     middle: F64
+    points: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackState:
+    """What is known of the person after a cloud.
+
+    `best` two-way distance in metres since the last full fit, of a cloud of `best_points`, `frames` whose shape was
+    learned, `visible` surface that is normally seen (points times squared metres of distance), `lost`: the body is not
+    where the person is.
+    """
+
+    before: BodyObservation | None = None
+    last: BodyObservation | None = None
+    best: float = np.inf
+    best_points: int = 0
+    frames: int = 0
+    visible: float = 0.0
+    hidden: bool = False
+    lost: bool = True
+
+
+def is_far(before: BodyObservation | None, last: BodyObservation, stamp: int) -> bool:
+    """Return whether a time in nanoseconds is farther from the last one than the last motion, if any, tells about."""
+    known = FIRST_GAP_NS if before is None else MAX_STRETCH * (last.stamp - before.stamp)
+    return stamp - last.stamp > known
 
 
 def extrapolate(before: BodyObservation | None, last: BodyObservation, stamp: int) -> BodyState:

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +26,18 @@ class FoundBody:
 
     person: PersonCloud
     fit: BodyFit | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExpectedPerson:
+    """Somebody who is known: expected at a `place` (2,) m, within `reach` m of which they may be in a scan.
+
+    `claims`: whether the body there tells which points are theirs, so that only who has none is looked for.
+    """
+
+    place: np.ndarray
+    reach: float
+    claims: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,10 +93,19 @@ class ScanView:
 
 @dataclass(slots=True, eq=False)
 class FitBudget:
-    """How many bodies may still be fitted in a scan, and how many of them in a row may be nobody; None: any number."""
+    """How many bodies may still be fitted in a scan.
+
+    Attributes:
+        fits: candidates to which bodies are fitted.
+        max_misses: so many of them in a row that are nobody end it; None: none does.
+        quick: whether the bank's best body alone is fitted to a candidate that it proves to be a person, and its other
+            bodies to one of those that it does not prove, where it proves nobody.
+        misses: how many in a row were nobody so far.
+    """
 
     fits: int
-    max_misses: int | None
+    max_misses: int | None = None
+    quick: bool = False
     misses: int = 0
 
     def spend(self) -> bool:
@@ -106,3 +128,36 @@ def take_apart(
             taken.append(middle)
             kept.append((judged, candidate))
     return kept
+
+
+def find_only_reached(
+    offered: Sequence[tuple[Candidate, float]], unseen: Collection[int], expected: Sequence[ExpectedPerson]
+) -> dict[int, int]:
+    """Return which of the candidates can only be one of the people who are not seen, and can only be there.
+
+    Args:
+        offered: candidates, each with a probability.
+        unseen: indices into `expected`.
+        expected: where people may be; nobody is found where it is empty.
+    """
+    near = {
+        owner: [
+            number
+            for number, (candidate, _) in enumerate(offered)
+            if np.hypot(*(candidate.middle - expected[owner].place)) < expected[owner].reach
+        ]
+        for owner in unseen
+        if expected
+    }
+    wanted = Counter(number for numbers in near.values() for number in numbers)
+    return {numbers[0]: owner for owner, numbers in near.items() if len(numbers) == 1 and wanted[numbers[0]] == 1}
+
+
+def pop_nearest(middles: dict[int, np.ndarray], place: np.ndarray) -> int | None:
+    """Return whose middle (2,) m is so near to a place that they are one person, and take it out; None for nobody."""
+    away = {owner: float(np.hypot(*(middle - place))) for owner, middle in middles.items()}
+    nearest = min(away, key=away.__getitem__, default=None)
+    if nearest is None or away[nearest] > SAME_PERSON_M:
+        return None
+    del middles[nearest]
+    return nearest

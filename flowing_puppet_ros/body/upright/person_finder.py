@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,10 +18,13 @@ from flowing_puppet_ros.body.segmentation.people import person_score
 from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
 from flowing_puppet_ros.body.upright.found_body import (
     SAME_PERSON_M,
+    ExpectedPerson,
     FitBudget,
     FoundBody,
     JudgedFit,
     ScanView,
+    find_only_reached,
+    pop_nearest,
     take_apart,
 )
 from flowing_puppet_ros.body.upright.person_model import PersonModel
@@ -30,7 +34,8 @@ from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS, Upright
 from flowing_puppet_ros.body.upright.verification import weigh_fit
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import find_beside
-from flowing_puppet_ros.process.threads import one_blas_thread
+from flowing_puppet_ros.model.sp import BodyState
+from flowing_puppet_ros.process.threads import one_blas_thread, parallel_map, usable_threads
 from flowing_puppet_ros.settings import Settings, setting
 
 MIN_BENT_POINTS, MIN_BENT_PROBABILITY, MIN_BENT_SCORE = 1000, 0.4, 0.5
@@ -44,6 +49,7 @@ COME_ODDS, COME_FILTER = 1.5, 0.3
 """Log odds by which something that stands where the sensor once saw through is a person, and the share of the filter's
 limit that is asked of it. Cars and doors move too."""
 COLUMN_FILTER = 0.7  # the same of a column of a larger cluster: who stands close to others has a part of their shape
+MIN_QUICK_BESIDE = 0.5  # probability of who is found beside a quick body
 BESIDE_M, CONTEXT_M, OWN_M = 1.0, 1.0, 0.10
 """Distance from a person within which others are looked for in what that person leaves, of their surroundings beyond,
 and from a body, up to which points are its own."""
@@ -70,15 +76,23 @@ class PersonFinderSettings(Settings):
 
 
 class PersonFinder:
-    """Finds the people in the scans of one sensor, and remembers what was none."""
+    """Finds the people in the scans of one sensor, and remembers what was none.
+
+    Attributes:
+        upright: fits the bodies.
+        last_rejected: what was no person in the last scan.
+        left_over: whether candidates of the last scan were left to the next one.
+    """
 
     def __init__(self, fitter: BodyFitter, settings: PersonFinderSettings) -> None:
         """Fit with the model of `fitter`."""
         self._fitter = fitter
         self._settings = settings
         self.upright = UprightFitter(fitter)
+        self._threads = usable_threads(fitter.settings.threads)
         self._rejected = RejectedPlaces(settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
+        self.left_over = False
         self._view: ScanView | None = None
         self._owned = np.empty(0, dtype=bool)
 
@@ -100,8 +114,8 @@ class PersonFinder:
         viewpoint: np.ndarray,
         stamp: int,
         known: Sequence[np.ndarray] = (),
-        max_fits: int | None = None,
-        max_misses: int | None = None,
+        expected: Sequence[ExpectedPerson] = (),
+        budget: FitBudget | None = None,
         remember: bool = True,
         come: np.ndarray | None = None,
         only_known: bool = False,
@@ -114,17 +128,23 @@ class PersonFinder:
             viewpoint: (3,) position of the sensor, metres.
             stamp: of the scan in nanoseconds.
             known: points (K, 3) in metres on each body that is expected in the scan, at its predicted position.
-            max_fits: bodies that are fitted at most, the likeliest first; None: as set.
-            max_misses: so many fits in a row of which none is a person end it; None: none does.
+            expected: where these may be who are not seen there: a candidate that only one of them can have reached is
+                theirs, and needs no fit. Nobody is where it is empty.
+            budget: of fits, to the likeliest candidates first; None: as many as are set.
             remember: whether what is no person is remembered, and what was none is left out.
             come: which (N,) points lie where the scans before saw through; None where nothing is known.
             only_known: nobody else is looked for, unless one of those who are expected is not there.
         """
         self.last_rejected = []
+        self.left_over = False
         self._view = None
         if len(points) < self._settings.min_points:
             return []
         scene = SceneHeights.of(points, viewpoint)
+        middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
+        if expected:
+            known = [body if each.claims else body[:0] for body, each in zip(known, expected, strict=True)]
+            only_known = only_known and all(each.claims for each in expected)
         candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known)
         if only_known and len(owned) < sum(len(body) > 0 for body in known):
             candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
@@ -137,13 +157,17 @@ class PersonFinder:
         self._owned = np.zeros(len(points), dtype=bool)
         for body in people:
             self._owned[body.person.rows] = True
-        view = self._view = ScanView(scene, ScanRays.of(points, viewpoint), stamp, remember, come)
+        view = self._view = ScanView(scene, ScanRays(points, viewpoint), stamp, remember, come)
         seen = {body.person.owner for body in people}
-        middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
         unseen = {owner: middle for owner, middle in enumerate(middles) if owner not in seen}
         taken = [middle for owner, middle in enumerate(middles) if owner in seen]
-        budget = FitBudget(self._settings.max_fits if max_fits is None else max_fits, max_misses)
-        found, bent = self._fit_offered(self._choose(candidates, view), view, budget)
+        budget = FitBudget(self._settings.max_fits) if budget is None else budget
+        offered = self._choose(candidates, view)
+        for number, owner in sorted(find_only_reached(offered, unseen, expected).items(), reverse=True):
+            people.append(FoundBody(make(offered.pop(number)[0].rows, owner=owner), None))
+            self._owned[people[-1].person.rows] = True
+            taken.append(unseen.pop(owner))
+        found, bent = self._fit_offered(offered, view, budget)
         accepted: list[tuple[JudgedFit, Candidate]] = []
         fresh = take_apart(found, taken)
         while fresh:
@@ -152,8 +176,8 @@ class PersonFinder:
             fresh = take_apart(self._look_beside(fresh, view, budget), taken)
         for judged, candidate in accepted:
             # Who stands at a wall may have no points by the prediction: the candidate there is that person.
-            owner = _pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
-            person = make(candidate.rows, score=judged.probability, owner=owner)
+            near = pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
+            person = make(candidate.rows, score=judged.probability, owner=near)
             people.append(FoundBody(person, replace(judged.fit, confidence=judged.confidence)))
         for candidate in bent:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
@@ -166,13 +190,29 @@ class PersonFinder:
     ) -> tuple[list[tuple[JudgedFit, Candidate]], list[Candidate]]:
         """Fit candidates with their probabilities by shape, and return who is a person, and who may be a bent one."""
         found, bent = [], []
-        for candidate, probability in offered:
+        started: dict[int, _FirstFit | None] = {}
+        if budget.quick:
+            some = [candidate for candidate, _ in offered[: budget.fits]]
+            start = partial(self._start, view=view, quick=True)
+            started = dict(enumerate(parallel_map(start, some, self._threads)))
+        # In a live stream, who is found at once does not wait for what may be nobody.
+        likely = sum(each is not None and self._is_proven(each.judged) for each in started.values())
+        for number, (candidate, probability) in enumerate(offered):
             if not budget.spend():
+                self.left_over = True
                 break
-            judged = self._judge(candidate, probability, view)
-            if judged is None:
+            first = started[number] if budget.quick else self._start(candidate, view)
+            if first is None:
                 continue
-            if judged.probability >= self._settings.min_probability:
+            judged = first.judged
+            worthwhile = judged.probability >= MIN_WORTHWHILE or probability >= MIN_SHAPELY
+            if worthwhile and not (budget.quick and self._is_proven(judged)):
+                if likely:
+                    self.left_over = True
+                    continue
+                likely += budget.quick
+                judged = self._try_others(first, candidate, view)
+            if self._is_proven(judged):
                 found.append((judged, candidate))
                 budget.misses = 0
                 continue
@@ -212,16 +252,20 @@ class PersonFinder:
             if any(np.hypot(*(candidate.middle - middle)) < BESIDE_M for middle in middles)
         ]
         found, _ = self._fit_offered(self._choose(fresh, left), left, budget)
+        if budget.quick:  # such a body leaves points of its own person, too
+            found = [each for each in found if each[0].probability >= MIN_QUICK_BESIDE]
         return [(judged, replace(candidate, rows=rows[candidate.rows])) for judged, candidate in found]
 
     @one_blas_thread()
-    def judge(self, person: PersonCloud, rows: np.ndarray, fit: BodyFit, turn: bool = False) -> JudgedFit:
+    def judge(
+        self, person: PersonCloud, rows: np.ndarray, fit: BodyFit, turn: bool = False, quick: bool = False
+    ) -> JudgedFit:
         """Return what the last scan says about the body of a person who is seen in its `rows` (N,).
 
         With `turn` also about one that faces the other way.
 
-        Points of other people count neither for nor against it. Where it explains few points badly, a new upright body
-        may be better, and is returned instead. What is rejected is remembered as by `find`.
+        Points of other people count neither for nor against it. Where it explains few points badly, a new upright body,
+        a `quick` one or the best, may be better, and is returned instead. What is rejected is remembered as by `find`.
         """
         if self._view is None or not len(rows):
             return JudgedFit(0.0, 0.0, fit)
@@ -234,7 +278,7 @@ class PersonFinder:
             return JudgedFit(0.0, 0.0, fit)
         judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, view, window)
         if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
-            other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0])
+            other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0], quick)
             again = self._weigh(other, cloud, candidate, view, window)
             judged = max(judged, again, key=lambda each: each.probability)
         if judged.probability < self._settings.min_probability / 2:
@@ -290,8 +334,11 @@ class PersonFinder:
                 chosen.append((candidate, likely))
         return chosen
 
-    def _judge(self, candidate: Candidate, probability: float, view: ScanView) -> JudgedFit | None:
-        """Return the body and how likely it is a person; None where no body can be fitted."""
+    def _is_proven(self, judged: JudgedFit) -> bool:
+        return judged.probability >= self._settings.min_probability
+
+    def _start(self, candidate: Candidate, view: ScanView, quick: bool = False) -> _FirstFit | None:
+        """Fit the bank's best body, and judge it; None where no body can be fitted."""
         rays, points = view.rays, view.scene.points[candidate.rows]
         window = rays.find_window(points)
         try:
@@ -299,31 +346,31 @@ class PersonFinder:
         except InputError:  # the sensor stands in it
             return None
 
-        def weigh(found: UprightFit) -> JudgedFit:
-            return self._weigh(found, cloud, candidate, view, window)
+        starts = self.upright.find_rough(cloud, candidate.floor, quick=quick)
+        found = self.upright.refine(starts[:1], cloud, candidate.floor)
+        return _FirstFit(cloud, window, starts[1:], found, self._weigh(found, cloud, candidate, view, window))
 
-        starts = self.upright.find_rough(cloud, candidate.floor)
-        first = self.upright.refine(starts[:1], cloud, candidate.floor)
-        judged = weigh(first)
-        worthwhile = judged.probability >= MIN_WORTHWHILE or probability >= MIN_SHAPELY
-        if worthwhile and len(starts) > 1:
-            others = self.upright.refine(starts[1:], cloud, candidate.floor)
-            if others.score < first.score:
-                other = weigh(others)
-                # Who is a person by one of both is one.
-                if other.probability >= min(judged.probability, self._settings.min_probability):
-                    judged = other
-        return judged
+    def _try_others(self, first: _FirstFit, candidate: Candidate, view: ScanView) -> JudgedFit:
+        """Return the best of the bank's other bodies where it is better than the first, else the first."""
+        if not first.others:
+            return first.judged
+        others = self.upright.refine(first.others, first.cloud, candidate.floor)
+        if others.score < first.found.score:
+            other = self._weigh(others, first.cloud, candidate, view, first.window)
+            # Who is a person by one of both is one.
+            if other.probability >= min(first.judged.probability, self._settings.min_probability):
+                return other
+        return first.judged
 
 
-def _pop_nearest(middles: dict[int, np.ndarray], place: np.ndarray) -> int | None:
-    """Return whose middle (2,) m is so near to a place that they are one person, and take it out; None for nobody."""
-    away = {owner: float(np.hypot(*(middle - place))) for owner, middle in middles.items()}
-    nearest = min(away, key=away.__getitem__, default=None)
-    if nearest is None or away[nearest] > SAME_PERSON_M:
-        return None
-    del middles[nearest]
-    return nearest
+class _FirstFit(NamedTuple):
+    """The bank's best body on a candidate: its cloud, the rays about it, other bodies to start from, and the result."""
+
+    cloud: SingleViewCloud
+    window: np.ndarray
+    others: list[tuple[float, BodyState]]
+    found: UprightFit
+    judged: JudgedFit
 
 
 def _make_person(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -36,39 +37,52 @@ class RayCount(NamedTuple):
     beside: np.ndarray
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class ScanRays:
-    """The rays of a scan as seen from its sensor.
+    """The rays of a scan as seen from its sensor; their directions are computed when they are first asked for.
 
     Attributes:
-        points: (N, 3) metres.
+        points: (N, 3) metres, N > 0, finite.
         viewpoint: (3,) metres.
-        azimuth, elevation: (N,) radians.
-        range: (N,) metres.
-        lowest: (BINS,) radians, elevation of the lowest ray by azimuth, NaN where there is none.
-        highest: radians, elevation of the highest ray.
     """
 
     points: np.ndarray
     viewpoint: np.ndarray
-    azimuth: np.ndarray
-    elevation: np.ndarray
-    range: np.ndarray
-    lowest: np.ndarray
-    highest: float
 
-    @classmethod
-    def of(cls, points: np.ndarray, viewpoint: np.ndarray) -> ScanRays:
-        """Look at the rays of a scan with N > 0 finite points."""
-        local = points - viewpoint
+    @property
+    def azimuth(self) -> np.ndarray:
+        """Azimuth (N,) radians."""
+        return self._directions[0]
+
+    @property
+    def elevation(self) -> np.ndarray:
+        """Elevation (N,) radians."""
+        return self._directions[1]
+
+    @property
+    def range(self) -> np.ndarray:
+        """Range (N,) metres."""
+        return self._directions[2]
+
+    @cached_property
+    def lowest(self) -> np.ndarray:
+        """Elevation (BINS,) radians of the lowest ray by azimuth, NaN where there is none."""
+        lowest = np.full(BINS, np.inf)
+        np.minimum.at(lowest, _bin_of(self.azimuth), self.elevation)
+        lowest[np.isinf(lowest)] = np.nan
+        return lowest
+
+    @cached_property
+    def highest(self) -> float:
+        """Elevation of the highest ray, radians."""
+        return float(self.elevation.max())
+
+    @cached_property
+    def _directions(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        local = self.points - self.viewpoint
         flat = np.hypot(local[:, 0], local[:, 1])
         azimuth, elevation = np.arctan2(local[:, 1], local[:, 0]), np.arctan2(local[:, 2], flat)
-        number = _bin_of(azimuth)
-        lowest = np.full(BINS, np.inf)
-        np.minimum.at(lowest, number, elevation)
-        lowest[np.isinf(lowest)] = np.nan
-        reach = np.hypot(flat, local[:, 2])
-        return cls(points, viewpoint, azimuth, elevation, reach, lowest, float(elevation.max()))
+        return azimuth, elevation, np.hypot(flat, local[:, 2])
 
     def find_window(self, points: np.ndarray) -> np.ndarray:
         """Return the indices (M,) of the rays around a candidate with points (K, 3) m."""

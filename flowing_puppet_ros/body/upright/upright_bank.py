@@ -56,17 +56,22 @@ class UprightBank:
     stature: np.ndarray
 
     def find_best(
-        self, cloud: SingleViewCloud, floor: float, count: int, facing: np.ndarray | None = None
+        self,
+        cloud: SingleViewCloud,
+        floor: float,
+        count: int,
+        facing: np.ndarray | None = None,
+        every: int = 1,
     ) -> list[tuple[float, BodyState]]:
         """Return the best bodies on a cloud with their costs in metres, at most two of a yaw and `count` of all.
 
         A few of them face the other way than the best: few points hardly tell front from back, and only the refined
         bodies show which it is. `floor` is z of the floor, metres. Where it is known to which side, `facing` (2,), all
-        face there.
+        face there. Of the poses and of the yaws, one out of `every` so many is compared.
         """
-        rows = np.arange(len(self.points))
+        rows = np.arange(len(self.points)).reshape(YAWS, POSES)[::every, ::every].ravel()
         if facing is not None:
-            rows = rows[np.repeat(self.turns[:, :2, 0] @ facing > 0, POSES)]
+            rows = rows[(self.turns[:, :2, 0] @ facing > 0)[rows // POSES]]
         targets = cloud.points[farthest_points(cloud.points, FINE_TARGETS)]
         rough, _ = self._judge(cloud, floor, rows, targets[:ROUGH_TARGETS], ROUGH_POINTS)
         rows = rows[np.argsort(rough, kind="stable")[:FINE_BODIES]]

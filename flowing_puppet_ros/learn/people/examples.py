@@ -125,7 +125,7 @@ class _SeenScan:
         candidates, _ = find_candidates(scene, viewpoint, MIN_POINTS)
         own = np.array([_label(candidate, truth) for candidate in candidates], dtype=np.int64)
         shape = describe_candidates(candidates, scene, viewpoint)
-        return cls(scene, ScanRays.of(points, viewpoint), truth, candidates, own, shape)
+        return cls(scene, ScanRays(points, viewpoint), truth, candidates, own, shape)
 
     def weigh(self, upright: UprightFitter, fitter: BodyFitter, number: int) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the evidence of a candidate's fit, that of its body as if tracked, and the mean error of its joints.

@@ -11,7 +11,7 @@ from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
-from flowing_puppet_ros.body.track.scene_tracker import MAX_LIVE_FITS, SceneSettings, SceneTracker
+from flowing_puppet_ros.body.track.scene_tracker import MAX_FIRST_FITS, SceneSettings, SceneTracker
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank
 from flowing_puppet_ros.evaluate.body.synthetic_scans import make_box
@@ -85,7 +85,7 @@ def test_in_a_recording_everybody_has_a_body_in_the_first_scan() -> None:
     assert sorted(nearest.argmin(axis=1)) == [0, 1, 2, 3, 4] and nearest.min(axis=1).max() < 0.15
     tracker.reset()
     with ThreadPoolExecutor(1) as beside:
-        assert len(tracker.step(SceneCloud(points, None, 100_000_000), 0, beside)[0]) == min(5, MAX_LIVE_FITS)
+        assert len(tracker.step(SceneCloud(points, None, 100_000_000), 0, beside)[0]) == min(5, MAX_FIRST_FITS)
 
 
 @LEARN

@@ -19,13 +19,13 @@ def sheet(x: float, y: tuple[float, float], z: tuple[float, float], step: float 
 def test_rays_end_on_before_and_behind_a_body() -> None:
     body = sheet(5.0, (-0.3, 0.3), (-1, 0.6))
     scan = np.concatenate([sheet(5.05, (-0.3, 0.0), (-1, 0.6)), sheet(8.0, (0.05, 1.0), (-1.6, 0.9))])
-    rays = ScanRays.of(scan, np.zeros(3))
+    rays = ScanRays(scan, np.zeros(3))
     count = rays.compare(np.arange(len(scan)), body, np.tile([-1.0, 0, 0], (len(body), 1)))
     on, behind, before, free, beside = (each.sum() for each in count)
     assert on > 0.95 * 15 * 80 and behind > 0.3 * on and before == 0
     assert free == beside > 50  # to the right, where the sheet behind goes on
     np.testing.assert_allclose(count.on / on, [0.45, 0.35, 0.2], atol=0.03)  # the bands' shares of the height
-    nearer = ScanRays.of(sheet(3.0, (-0.3, 0.3), (-1, 0.6)), np.zeros(3))
+    nearer = ScanRays(sheet(3.0, (-0.3, 0.3), (-1, 0.6)), np.zeros(3))
     window = np.arange(len(nearer.points))
     count = nearer.compare(window, body, np.tile([-1.0, 0, 0], (len(body), 1)))
     assert count.on.sum() == count.behind.sum() == 0 and count.before.sum() > 100
@@ -35,7 +35,7 @@ def test_rays_end_on_before_and_behind_a_body() -> None:
 def test_what_stands_before_a_candidate_and_below_all_rays_is_unknown() -> None:
     person = sheet(5.0, (-0.25, 0.25), (-0.2, 0.5))
     car = sheet(3.0, (-1.0, 1.0), (-0.5, -0.15))
-    rays = ScanRays.of(np.concatenate([person, car]), np.zeros(3))
+    rays = ScanRays(np.concatenate([person, car]), np.zeros(3))
     window = rays.find_window(person)
     unknown = rays.find_unknown(person, window)
     view = OneSidedView.build(person, np.zeros(3), unknown)

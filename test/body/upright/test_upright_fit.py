@@ -8,7 +8,13 @@ from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.body.settings import FitterSettings
-from flowing_puppet_ros.body.upright.upright_fit import UprightFitter, keep_place_only
+from flowing_puppet_ros.body.upright.upright_fit import (
+    FLOOR_WEIGHT,
+    SOLE_VERTICES,
+    UprightFitter,
+    floor_term,
+    keep_place_only,
+)
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 SENSOR = np.array([-6.0, 0.0, 1.6])
@@ -57,3 +63,16 @@ def test_a_body_is_turned_round_where_it_stands(fitter: BodyFitter) -> None:
     for name, other in (("left_shoulder", "right_shoulder"), ("right_hip", "left_hip"), ("left_wrist", "right_wrist")):
         assert np.linalg.norm(places[name] - rest[other]) < 0.2
     assert abs(after.vertices[:, 2].min() - floor) < 0.05
+
+
+def test_the_floor_pulls_at_the_lowest_vertices_and_at_all_below_it() -> None:
+    vertices = np.zeros((200, 3))
+    vertices[:, 2] = np.random.default_rng(0).permutation(200) / 100 - 0.4  # 40 of them below 0
+    for floor in (0.0, -0.5):
+        order = np.argsort(vertices[:, 2])[: 40 if floor == 0.0 else SOLE_VERTICES]
+        term = floor_term(vertices, floor)
+        matrix, vector = np.zeros((200, 3, 3)), np.zeros((200, 3))
+        matrix[order, 2, 2] = FLOOR_WEIGHT / SOLE_VERTICES
+        vector[order, 2] = FLOOR_WEIGHT / SOLE_VERTICES * (vertices[order, 2] - floor)
+        np.testing.assert_allclose(term.matrix, matrix)
+        np.testing.assert_allclose(term.vector, vector)

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from flowing_puppet_ros.body.track.seen_free import SeenFree
+from flowing_puppet_ros.body.segmentation.seen_free import SeenFree
 
 
 def scan_wall(person_y: float | None, sensor: np.ndarray, noise: int) -> tuple[np.ndarray, np.ndarray]:
