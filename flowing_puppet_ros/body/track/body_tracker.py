@@ -176,7 +176,7 @@ class BodyTracker:
         last = self._state.last
         if last is None or not 0 < stamp - last.stamp <= 1e9 * self._settings.max_time_gap:
             return None
-        return self._predict(last, last.middle, stamp)
+        return extrapolate(self._state.before, last, stamp)
 
     def accept(self) -> None:
         """Take the last body for the best there is: a full fit has found none that is closer."""
