@@ -24,7 +24,7 @@ MAX_CELLS = 60_000  # of the grid of directions
 SPACING_NEIGHBOUR = 4  # the spacing of directions is the distance to this neighbour ...
 SPACING_PERCENTILE = 90  # ... at this percentile over the cloud, or so many points of it
 MAX_SPACING_POINTS = 1000
-MAX_GAP_PAIRS, MIN_STRETCH, MAX_STRETCH = 200_000, 2.0, 8.0
+MAX_GAP_PAIRS, MIN_STRETCH, MAX_STRETCH = 200_000, 3.0, 8.0
 """Pairs of points of which the gaps down and across are measured, about, at most, and their ratio from which on, and up
 to which, it counts."""
 TOLERANCE_SPACINGS = 1.5
