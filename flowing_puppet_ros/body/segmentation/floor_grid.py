@@ -22,7 +22,7 @@ MIN_CELL_POINTS = 3
 MAX_SLOPE, MAX_RAMP_SLOPE = 0.05, 0.1
 """Of the floor against the plane, so that cells on furniture and cars take their neighbours' floor; of cells in which
 nothing stands up."""
-MAX_KERB_M = 0.2
+MAX_KERB_M = 0.2  # above the floor that is seen nearby: what is higher stands on it
 MAX_BELOW_PLANE_M = 1.0  # a cell that is lower shows a reflection or a shaft
 AZIMUTH_BINS, MIN_RAY_GAP, LIMIT_GAPS = 360, 0.005, 0.6
 """Bins of azimuth in which the lowest ray is looked up, slope between two rays one above the other at least, and gaps
@@ -118,9 +118,10 @@ def _find_slopes(points, viewpoint):  # type: ignore[no-untyped-def]
 def _find_lowest(
     points: np.ndarray, by_lowest_ray: np.ndarray, low: np.ndarray, shape: np.ndarray, all_inside: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a low percentile (W, D) of z in each cell, NaN where too few points are, and where something stands.
+    """Return a low percentile (W, D) of z in each cell, and where something stands, and where its floor may be lower.
 
-    And where its floor is lower, since its lowest point is `by_lowest_ray` (N,).
+    The percentile is NaN where too few points are. The floor may be lower where something stands whose lowest point is
+    `by_lowest_ray` (N,).
     """
     if not all_inside:
         inside = ~((points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1))

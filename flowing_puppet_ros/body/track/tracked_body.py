@@ -134,7 +134,7 @@ class BodyObservation:
     fit: BodyFit
     stamp: int
     middle: F64
-    points: int = 0
+    points: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)

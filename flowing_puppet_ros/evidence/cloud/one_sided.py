@@ -144,9 +144,7 @@ class OneSidedView:
         return _misfit(np.ascontiguousarray(points), np.ascontiguousarray(normals), *self.arrays)
 
     @property
-    def arrays(
-        self,
-    ) -> ViewArrays:
+    def arrays(self) -> ViewArrays:
         """What compiled loops need, see `compare_point`."""
         return (
             self.viewpoint, self.axes, self.stretch, self.directions, self.depth, self.tolerance, self.low, self.cell,

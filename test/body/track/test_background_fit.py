@@ -4,6 +4,7 @@
 from typing import Any, cast
 
 import numpy as np
+from kept_tasks import KeptTasks  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.track.background_fit import (
@@ -37,15 +38,8 @@ def _cloud(stamp: int) -> SeededCloud:
     return SeededCloud(PersonCloud(np.zeros((1, 3)), None, stamp), 0)
 
 
-class _Later:
-    """An executor that runs its task when it is told to."""
-
-    def submit(self, task: Any) -> None:
-        self.task = task
-
-
 def _led(clouds: int) -> list[int]:
-    background, later = BackgroundFit(), _Later()
+    background, later = BackgroundFit(), KeptTasks()
 
     def meanwhile() -> None:
         for number in range(1, clouds + 1):
@@ -53,7 +47,7 @@ def _led(clouds: int) -> list[int]:
 
     notes = _Notes(meanwhile)
     background.start(1, cast(BodyTracker, notes), _cloud(0), cast(Any, later))
-    later.task()
+    later.run()
     finished = background.take_finished()
     assert finished is not None and finished[1] is cast(Any, notes) and not background.busy
     return notes.stamps

@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from kept_tasks import KeptTasks  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.segmentation.candidates import Candidate
@@ -29,22 +30,6 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 LEARN = pytest.mark.skipif(not (find_spec("anny") and find_spec("body_models")), reason="needs the extra learn")
 HEIGHT = 1.8  # of the sensor
 TENTH = 100_000_000
-
-
-class _Later:
-    """An executor that keeps its tasks until it is told to run them."""
-
-    def __init__(self) -> None:
-        self.tasks: list[Any] = []
-
-    def submit(self, task: Any) -> None:
-        self.tasks.append(task)
-
-    def run(self) -> int:
-        tasks, self.tasks = self.tasks, []
-        for task in tasks:
-            task()
-        return len(tasks)
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +72,7 @@ def test_walkers_keep_their_ids_when_scans_are_left_out(
     monkeypatch.setattr(PersonFinder, "_start", lambda *given, **named: fitted.append(1) or start(*given, **named))  # type: ignore[func-returns-value]
     starts = np.array([[5.0, -3.0], [6.0, 0.5], [5.0, 4.0]])
     walks = np.array([[0.0, 1.0], [-1.0, 0.0], [0.7, -0.7]])
-    tracker, later = _make_tracker(), _Later()
+    tracker, later = _make_tracker(), KeptTasks()
     ids: dict[int, str] = {}
     for tenths in (0, 6, 8, 13):
         places = starts + 0.1 * tenths * walks
@@ -107,7 +92,7 @@ def test_who_comes_into_a_live_stream_has_a_quick_body_soon_and_a_better_one_bes
     person: tuple[np.ndarray, np.ndarray],
 ) -> None:
     first, others = np.array([[5.0, 0.0]]), np.array([[5.0, 2.5], [6.0, -2.5], [7.0, 5.0]])
-    tracker, later = _make_tracker(), _Later()
+    tracker, later = _make_tracker(), KeptTasks()
     for number in range(1, 3):
         bodies, _ = tracker.step(_scan(person, list(first), number * TENTH), 0, cast(Any, later))
         assert [body.id for body in bodies] == ["b1"]

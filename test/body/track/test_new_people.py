@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from kept_tasks import KeptTasks  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
@@ -14,16 +15,6 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.process.threads import one_blas_thread
 
 TENTH = 100_000_000
-
-
-class _Never:
-    """An executor that keeps its tasks and runs none."""
-
-    def __init__(self) -> None:
-        self.tasks: list[Any] = []
-
-    def submit(self, task: Any) -> None:
-        self.tasks.append(task)
 
 
 def _make_clouds(fitter: BodyFitter, stamp: int) -> tuple[list[PersonCloud], list[np.ndarray]]:
@@ -40,7 +31,7 @@ def _make_clouds(fitter: BodyFitter, stamp: int) -> tuple[list[PersonCloud], lis
 @pytest.mark.slow
 def test_new_people_have_a_body_in_their_first_cloud_where_it_is_reliable() -> None:
     fitter = BodyFitter(StitchedPuppet.load("neutral"), FitterSettings(threads=1))
-    tracker, never = MultiBodyTracker(fitter, MultiBodyTrackerSettings(), 0), _Never()
+    tracker, never = MultiBodyTracker(fitter, MultiBodyTrackerSettings(), 0), KeptTasks()
     clouds, truth = _make_clouds(fitter, TENTH)
     with one_blas_thread():
         bodies = tracker.step(clouds, TENTH, 0, cast(Any, never))
@@ -54,7 +45,7 @@ def test_new_people_have_a_body_in_their_first_cloud_where_it_is_reliable() -> N
 @pytest.mark.slow
 def test_what_no_body_is_close_to_is_fitted_beside_the_clouds_and_tried_at_once_every_second() -> None:
     fitter = BodyFitter(StitchedPuppet.load("neutral"), FitterSettings(threads=1))
-    tracker, never = MultiBodyTracker(fitter, MultiBodyTrackerSettings(), 0), _Never()
+    tracker, never = MultiBodyTracker(fitter, MultiBodyTrackerSettings(), 0), KeptTasks()
     ball = np.random.default_rng(0).standard_normal((1000, 3))
     ball = 0.6 * ball / np.linalg.norm(ball, axis=1, keepdims=True)
     tries: list[int] = []
