@@ -136,6 +136,7 @@ class ComponentNode[C: Component[Any]](LifecycleNode):
         kind: Any = COMPONENTS[self._component]
         component: C = kind(self._settings, RosMessageFactory())
         component.node = self.get_fully_qualified_name()
+        self.get_logger().info("loads models and kernels, which takes minutes at the first start after an installation")
         component.warm_up()
         return_start_memory()
         settings = self._node_settings

@@ -145,9 +145,12 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         """Do beforehand what the first clouds of a live stream would wait for: fit somebody made up, too."""
         self._people.scene.warm_up()
         self._outputs.warm_up()
-        alone = replace(self.settings, up="auto", fixed_frame="", sensor_frame="", rig=DepthRigSettings())
-        other = type(self)(alone, self.factory)
-        warm_up.run(other, warm_up.make_fitter_input(self.factory, self._model))
+        alone = replace(
+            self.settings, up="auto", fixed_frame="", sensor_frame="", rig=DepthRigSettings(), region=RegionSettings()
+        )
+        warm_up.run(type(self)(alone, self.factory), warm_up.make_fitter_input(self.factory, self._model))
+        one_sided = replace(alone, view="single")
+        warm_up.run(type(self)(one_sided, self.factory), warm_up.make_scan_input(self.factory, self._model))
 
     def reset(self) -> None:
         """Forget what waits, whom the silhouettes showed and who was tracked; ids of tracked people go on."""

@@ -16,6 +16,7 @@ from flowing_puppet_ros.image.tracking.tracker import FlowingPuppetTracker, Trac
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.component import Component
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, PUPPETS, TRANSFORMS, MessageFactory
@@ -27,6 +28,7 @@ IMAGE_SIZE = (192, 160)  # px, height and width
 SCALE_PX_PER_M, FOCAL_PX, DISTANCE_M = 80.0, 200.0, 2.5  # scale = focal length / distance
 PERIOD_NS = 100_000_000  # between two images
 FRAMES = 3  # images per camera
+SIDE_BY_SIDE_M = np.array([0.4, 0.0, 0.0])
 WORLD_FRAME = "warm_up"
 
 
@@ -81,11 +83,7 @@ def make_hull_input(factory: MessageFactory, names: tuple[str, ...]) -> Messages
 
 def make_fitter_input(factory: MessageFactory, model: StitchedPuppet) -> Messages:
     """Return the input of a body fitter: depth images of somebody on a floor before a wall, and the puppets."""
-    vertices = model.vertices(model.rest_state())
-    joints = model.joints(vertices)
-    to_camera = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    vertices, joints = ((points - middle) @ to_camera.T + [0.0, 0.0, DISTANCE_M] for points in (vertices, joints))
+    vertices, joints = _place_before_camera(model)
     depth = _draw_depth(vertices)
     puppets = [
         factory.make("flowing_puppet_msgs/msg/PuppetJoint", name=name, x=x, y=y, confidence=0.9)
@@ -100,6 +98,29 @@ def make_fitter_input(factory: MessageFactory, model: StitchedPuppet) -> Message
         found += [("puppets", factory.make(PUPPETS, header=header, puppets=[puppet]))]
         found += [("depth", make_image(factory, header, depth, "16UC1"))]
     return found
+
+
+def make_scan_input(factory: MessageFactory, model: StitchedPuppet) -> Messages:
+    """Return scans of two people who touch, before a wall, as a LiDAR publishes them: points in no order, z up."""
+    vertices = _place_before_camera(model)[0]
+    depth = 1e-3 * _draw_depth(np.concatenate([vertices - SIDE_BY_SIDE_M / 2, vertices + SIDE_BY_SIDE_M / 2]))
+    rows, columns = np.indices(IMAGE_SIZE)
+    right = (columns - (IMAGE_SIZE[1] - 1) / 2) / FOCAL_PX * depth
+    down = (rows - (IMAGE_SIZE[0] - 1) / 2) / FOCAL_PX * depth
+    points = np.stack([depth, -right, -down], axis=2).reshape(-1, 3)
+    headers = [make_header(factory, number * PERIOD_NS, WORLD_FRAME) for number in range(1, FRAMES + 1)]
+    return [("points", make_cloud(factory, header, points)) for header in headers]
+
+
+def _place_before_camera(model: StitchedPuppet) -> tuple[F64, F64]:
+    """Return the vertices and joints of the mean person who stands before a camera, metres in its optical frame."""
+    vertices = model.vertices(model.rest_state())
+    to_camera = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    placed, joints = (
+        (points - middle) @ to_camera.T + [0.0, 0.0, DISTANCE_M] for points in (vertices, model.joints(vertices))
+    )
+    return placed, joints
 
 
 def _draw_depth(vertices: F64) -> Array:

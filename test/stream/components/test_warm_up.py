@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,26 +17,29 @@ from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
 pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).resolve().parents[3]
-SCRIPT = """
+KERNELS = """
 import json, sys
-from pathlib import Path
 from numba.core.dispatcher import Dispatcher
-from flowing_puppet_ros.bag.reader import open_bag
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
-from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
-from flowing_puppet_ros.model import weights
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent
-from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
-from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
-from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
 
 def state():
     loaded = [(name, module) for name, module in sys.modules.items() if name.startswith("flowing_puppet_ros")]
     kernels = {f"{m}.{n}": f for m, module in loaded for n, f in vars(module).items() if isinstance(f, Dispatcher)}
     return {name: [str(one) for one in kernel.signatures] for name, kernel in kernels.items()}
 
-OWN = LiveDetectionSettings(source="own")
 factory = BagMessageFactory()
+"""
+RECORDING = """
+from pathlib import Path
+from flowing_puppet_ros.bag.reader import open_bag
+from flowing_puppet_ros.image.video.settings import LiveDetectionSettings
+from flowing_puppet_ros.model import weights
+from flowing_puppet_ros.stream.components.optical_flow import OpticalFlowComponent
+from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent
+from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent
+
+OWN = LiveDetectionSettings(source="own")
 components = {}
 for name, kind, settings in (
     ("flow", OpticalFlowComponent, {}), ("told", PuppetTrackerComponent, {"detection": OWN}),
@@ -80,17 +84,43 @@ late = {name: kinds for name, kinds in after.items() if kinds != before.get(name
 done = {name: dict(component.counters) for name, component in components.items()}
 print(json.dumps({"late": late, "known": sum(map(bool, before.values())), "traces": traces, "done": done}))
 """
+SCANS = """
+from benchmarks.scenes import draw_walk
+from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.geometry import make_header
+
+component = BodyFitterComponent(BodyFitterComponent.settings_type(), factory)
+component.warm_up()
+scans = draw_walk(StitchedPuppet.load(), 1, 3)
+before = state()
+for number, points in enumerate(scans, start=1):
+    header = make_header(factory, number * 100_000_000, "lidar")
+    component.handle("points", make_cloud(factory, header, points))
+late = {name: kinds for name, kinds in state().items() if kinds != before.get(name)}
+print(json.dumps({"late": late, "done": dict(component.counters)}))
+"""
+
+
+def run_script(script: str) -> Any:
+    run = subprocess.run([sys.executable, "-c", KERNELS + script], cwd=ROOT, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    return json.loads(run.stdout.splitlines()[-1])
 
 
 def test_the_first_messages_wait_for_nothing() -> None:
-    run = subprocess.run([sys.executable, "-c", SCRIPT], cwd=ROOT, capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
-    told = json.loads(run.stdout.splitlines()[-1])
+    told = run_script(RECORDING)
     assert told["late"] == {}
     assert told["known"] > 10
     assert not any(told["traces"].values())
     assert told["done"]["hull"]["hulls"] > 0 and told["done"]["hull"]["silhouettes"] > 0
     assert told["done"]["flow"]["flows"] == 7 and told["done"]["told"]["images"] == 8
+
+
+def test_the_first_scans_of_a_lidar_wait_for_nothing() -> None:
+    told = run_script(SCANS)
+    assert told["late"] == {}
+    assert told["done"]["tracked people"] > 0
 
 
 def test_a_body_fitter_warms_up_by_tracking_somebody() -> None:
