@@ -36,7 +36,11 @@ from flowing_puppet_ros.process.threads import one_blas_thread
 REST = "everything else"
 REFINEMENT: dict[str, list[tuple[Any, str]]] = {
     "downsampling": [(body_tracker, "downsample"), (fitting, "downsample")],
-    "normals": [(body_tracker, "estimate_normals"), (fitting, "estimate_normals")],
+    "normals": [
+        (body_tracker, "estimate_normals"),
+        (fitting, "estimate_normals"),
+        (single_view, "estimate_view_normals"),
+    ],
     "nearest points: indices": [(NearestPoints, "__init__")],
     "nearest points: queries": [(NearestPoints, "query")],
     "single view": [

@@ -15,7 +15,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.cloud.correspondence import Cloud
-from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.normals import downsample
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
@@ -112,7 +112,7 @@ class JointFitter:
             return RigCloud.seen_by(points, field)
         points = downsample(points, None, MAX_FIT_POINTS)[0]
         viewpoint = np.zeros(3) if viewpoint is None else viewpoint
-        return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, field=field)
+        return SingleViewCloud.seen_from(points, None, viewpoint, field=field)
 
     def take_cloud(self, person: PersonCloud, known: Cloud | None) -> SingleViewCloud:
         """Return a person's cloud, as it is `known` already where that is one of a single view."""

@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours, fit_normals
-from flowing_puppet_ros.evidence.cloud.one_sided import measure_stretch
 
 MIN_NEIGHBOURS, MAX_NEIGHBOURS = 9, 24  # points by which a normal is estimated
 POINTS_PER_NEIGHBOUR = 100  # points of a cloud for each of them
@@ -77,28 +76,31 @@ def _merge_cells(values: np.ndarray, weight: np.ndarray, size: float) -> tuple[n
     return means[: last + 1], total[: last + 1]
 
 
-def estimate_normals(
-    points: np.ndarray, viewpoint: np.ndarray | None, surface: tuple[np.ndarray, np.ndarray] | None = None
-) -> np.ndarray:
+def estimate_view_normals(points: np.ndarray, viewpoint: np.ndarray, stretch: float) -> np.ndarray:
+    """Estimate the unit normals (N, 3), towards `viewpoint` (3,), of a cloud (N, 3) in metres that was seen from there.
+
+    `stretch` is that of `OneSidedView`.
+    """
+    center = points.mean(axis=0)
+    points, count = points - center, _count_neighbours(points)  # covariances lose precision far from the origin
+    if stretch > 1:
+        count = max(count, min(round(NEIGHBOURS_PER_STRETCH * stretch), MAX_RING_NEIGHBOURS))
+    return _turn_along(fit_normals(points, find_neighbours(points, count)), viewpoint - center - points)
+
+
+def estimate_normals(points: np.ndarray, surface: tuple[np.ndarray, np.ndarray] | None = None) -> np.ndarray:
     """Estimate the outward unit normals (N, 3) of a cloud (N, 3) in metres, by the planes through the nearest points.
 
-    Normals of a single view are oriented towards `viewpoint` (3,). Near a known `surface`, its points (M, 3) and
-    outward normals (M, 3), they are oriented as those of its nearest points, in a fraction of the time. Otherwise they
-    are made consistent over tangent planes (Hoppe et al. 1992), and all are flipped when most point into the body.
+    Near a known `surface`, its points (M, 3) and outward normals (M, 3), they are oriented as those of its nearest
+    points, in a fraction of the time. Otherwise they are made consistent over tangent planes (Hoppe et al. 1992), and
+    all are flipped when most point into the body.
 
     Raises:
         InputError: when the points lie in a plane or on a line, where no side is outside.
     """
-    # Covariances lose precision far from the origin.
     center = points.mean(axis=0)
-    points = points - center
-    # A neighbourhood must stay smaller than a limb, however few the points are.
-    count = int(np.clip(len(points) // POINTS_PER_NEIGHBOUR, MIN_NEIGHBOURS, MAX_NEIGHBOURS))
-    if viewpoint is not None and (stretch := measure_stretch(points, viewpoint - center)) > 1:
-        count = max(count, min(round(NEIGHBOURS_PER_STRETCH * stretch), MAX_RING_NEIGHBOURS))
+    points, count = points - center, _count_neighbours(points)  # covariances lose precision far from the origin
     normals = fit_normals(points, find_neighbours(points, count))
-    if viewpoint is not None:
-        return _turn_along(normals, viewpoint - center - points)
     if surface is not None:
         surface_points, surface_normals = surface
         return _turn_along(normals, surface_normals[NearestPoints(surface_points - center).query(points)[1]])
@@ -110,6 +112,11 @@ def estimate_normals(
         for index, rows in zip(range(0, len(points), max(1, len(points) // 500)), near, strict=True)
     ]
     return normals if np.sum(outward) >= 0 else -normals
+
+
+def _count_neighbours(points: np.ndarray) -> int:
+    """Return by how many points a normal is estimated: a neighbourhood must stay smaller than a limb."""
+    return int(np.clip(len(points) // POINTS_PER_NEIGHBOUR, MIN_NEIGHBOURS, MAX_NEIGHBOURS))
 
 
 def _turn_along(normals: np.ndarray, directions: np.ndarray) -> np.ndarray:

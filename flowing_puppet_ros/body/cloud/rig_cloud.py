@@ -9,7 +9,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
-from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.normals import downsample
 from flowing_puppet_ros.body.cloud.single_view import MAX_VIEW_POINTS, SingleViewCloud
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
@@ -68,7 +68,7 @@ class RigCloud(SingleViewCloud):
             own = points[rig.owner == number]
             if len(own) >= MIN_VIEW_POINTS:
                 own = downsample(own, None, most)[0]
-                parts.append(SingleViewCloud.seen_from(own, estimate_normals(own, viewpoint), viewpoint, field=field))
+                parts.append(SingleViewCloud.seen_from(own, None, viewpoint, field=field))
                 numbers.append(np.full(len(own), number))
         if not parts:
             raise InputError(f"none of the sensors saw {MIN_VIEW_POINTS} points of the {len(points)} of a person")

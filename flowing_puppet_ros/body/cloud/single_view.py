@@ -9,6 +9,7 @@ import numpy as np
 from numba import njit
 
 from flowing_puppet_ros.body.cloud.correspondence import Cloud, VertexQuadratic, geman_mcclure
+from flowing_puppet_ros.body.cloud.normals import estimate_view_normals
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.neighbours import find_neighbours
@@ -52,12 +53,14 @@ class SingleViewCloud(Cloud):
     def seen_from(
         cls,
         points: np.ndarray,
-        normals: np.ndarray,
+        normals: np.ndarray | None,
         viewpoint: np.ndarray,
         unknown: np.ndarray | None = None,
         field: SensorField | None = None,
     ) -> SingleViewCloud:
         """Index a cloud; the arguments are those of `Cloud`, `unknown` that of `OneSidedView.build`.
+
+        Without `normals` they are estimated.
 
         Raises:
             InputError: when part of the cloud lies behind the sensor.
@@ -68,11 +71,13 @@ class SingleViewCloud(Cloud):
                 f"the sensor at {np.round(viewpoint, 2).tolist()} m stands within the cloud and cannot have seen one"
                 " side of it; check the frame or fit it as a whole cloud"
             )
+        view = OneSidedView.build(points, viewpoint, unknown, field)
+        if normals is None:
+            normals = estimate_view_normals(points, viewpoint, view.stretch)
         every = 1 + len(points) // MAX_NOISE_POINTS
         near, own = find_neighbours(points, NOISE_NEIGHBOURS, every), np.arange(0, len(points), every)
         apart = np.abs(((points[near] - points[own, None]) * normals[own, None]).sum(axis=2))
         noise = float(np.median(apart[near != own[:, None]]))
-        view = OneSidedView.build(points, viewpoint, unknown, field)
         return cls(points, normals, NearestPoints(points), viewpoint, field, view, noise)
 
     def sees(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:

@@ -166,10 +166,8 @@ class BodyFitter:
             self.prepare_points(points, None, viewpoint)
             return RigCloud.seen_by(points, field)
         points, normals = self.prepare_points(points, normals, viewpoint)
-        if normals is None:
-            normals = estimate_normals(points, viewpoint)
         if viewpoint is None:
-            return Cloud.of(points, normals)
+            return Cloud.of(points, estimate_normals(points) if normals is None else normals)
         return SingleViewCloud.seen_from(points, normals, viewpoint, field=field)
 
     def prepare_points(

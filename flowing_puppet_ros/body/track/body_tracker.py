@@ -248,7 +248,7 @@ class BodyTracker:
         oriented = normals is None and viewpoint is None and last is not None
         if oriented and last is not None:
             vertices = self._fitter.model.vertices(self._predict(last, points.mean(axis=0), stamp))
-            normals = estimate_normals(points, None, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
+            normals = estimate_normals(points, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
         if targets is not None and viewpoint is not None and person.field is not None:
             points, normals = downsample(points, normals, MAX_TRACKED_POINTS)
         if few and viewpoint is not None:

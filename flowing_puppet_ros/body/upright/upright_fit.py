@@ -11,7 +11,7 @@ from numba import njit
 
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
-from flowing_puppet_ros.body.cloud.normals import downsample, estimate_normals
+from flowing_puppet_ros.body.cloud.normals import downsample
 from flowing_puppet_ros.body.cloud.rig_cloud import RigCloud
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
@@ -106,7 +106,7 @@ class UprightFitter:
         if isinstance(field, SensorRig):
             return RigCloud.seen_by(points, field)
         points = downsample(points, None, MAX_FIT_POINTS)[0]
-        return SingleViewCloud.seen_from(points, estimate_normals(points, viewpoint), viewpoint, unknown, field)
+        return SingleViewCloud.seen_from(points, None, viewpoint, unknown, field)
 
     def find_rough(
         self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False

@@ -152,16 +152,11 @@ class OneSidedView:
         )  # fmt: skip
 
 
-def measure_stretch(points: np.ndarray, viewpoint: np.ndarray) -> float:
-    """Return the gap between the directions of `points` (N, 3) m from `viewpoint` (3,) m down over that to the right.
+def _measure_stretch(directions: np.ndarray) -> float:
+    """Return the gap between `directions` (N, 2) down over that to the right.
 
     It is 1 where they are much the same, as in a depth image, and above 1 for the rings of a LiDAR.
     """
-    directions = _project(points, viewpoint, _axes(points.mean(axis=0) - viewpoint))[0]
-    return _measure_stretch(directions)
-
-
-def _measure_stretch(directions: np.ndarray) -> float:
     across, down = _find_gaps(directions, 1 + len(directions) ** 2 // MAX_GAP_PAIRS)
     ratio = float(np.median(down) / max(float(np.median(across)), 1e-9))
     ratio = 1.0 if not np.isfinite(ratio) or 1 / MIN_STRETCH < ratio < MIN_STRETCH else ratio

@@ -12,6 +12,7 @@ import pytest
 from capsule_man import Joints, cloud_of, dog, joints_of  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.body.cloud.normals import estimate_normals
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, check_cloud
 from flowing_puppet_ros.body.scans.scan import write_ply
 from flowing_puppet_ros.body.settings import FitterSettings
@@ -152,12 +153,16 @@ def test_unusable_clouds_are_refused_in_one_sentence(fitter: BodyFitter) -> None
 
 def test_normals_do_not_depend_on_how_far_off_the_origin_is(man: tuple[np.ndarray, np.ndarray, Joints]) -> None:
     points, normals, _ = man
-    for viewpoint in (None, np.array([3.0, 0.5, 0.2])):
-        here = estimate_normals(points, viewpoint)
-        map_origin = np.array([5e5, 5.5e6, 300.0])
-        there = estimate_normals(points + map_origin, None if viewpoint is None else viewpoint + map_origin)
+    viewpoint, map_origin = np.array([3.0, 0.5, 0.2]), np.array([5e5, 5.5e6, 300.0])
+    for here, there in (
+        (estimate_normals(points), estimate_normals(points + map_origin)),
+        (
+            SingleViewCloud.seen_from(points, None, viewpoint).normals,
+            SingleViewCloud.seen_from(points + map_origin, None, viewpoint + map_origin).normals,
+        ),
+    ):
         assert ((here * there).sum(axis=1) > 0.999).mean() > 0.98
-    assert ((estimate_normals(points, None) * normals).sum(axis=1) > 0.7).mean() > 0.9
+    assert ((estimate_normals(points) * normals).sum(axis=1) > 0.7).mean() > 0.9
 
 
 def test_normals_look_beyond_the_points_of_one_ring() -> None:
@@ -169,7 +174,7 @@ def test_normals_look_beyond_the_points_of_one_ring() -> None:
     outward = np.stack([near * np.cos(a) - 3.5, near * np.sin(a), np.zeros(len(a))], axis=1) / 0.3
     points = np.stack([near * np.cos(a), near * np.sin(a), near * np.tan(e)], axis=1)
     points *= 1 + 0.01 * rng.standard_normal((len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
-    cosine = (estimate_normals(points, np.zeros(3)) * outward).sum(axis=1)
+    cosine = (SingleViewCloud.seen_from(points, None, np.zeros(3)).normals * outward).sum(axis=1)
     assert np.median(cosine) > 0.95 and (cosine > 0.8).mean() > 0.9
 
 
