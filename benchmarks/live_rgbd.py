@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
-from benchmarks.live_node import NAMESPACE, START_TIMEOUT_S, print_figures
+from benchmarks.live_node import NAMESPACE, START_TIMEOUT_S, print_figures, send_evenly
 from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS
 from flowing_puppet_ros.node.factory import RosMessageFactory, message_type
 from flowing_puppet_ros.stream.messages.geometry import header_ns, make_camera_info, make_header
@@ -134,21 +135,10 @@ def measure(arrays: Any, rate: float, seconds: float) -> dict[str, Any]:
                 raise RuntimeError("a node did not start")
             executor.spin_once(timeout_sec=0.1)
         time.sleep(1.0)  # until everybody has found everybody
-        _feed(feeder, executor, rate, EMPTY_S, with_people=False)
+        send_evenly(partial(feeder.send, with_people=False), executor, rate, EMPTY_S)
         start = time.monotonic()
-        _feed(feeder, executor, rate, seconds, with_people=True)
+        send_evenly(partial(feeder.send, with_people=True), executor, rate, seconds)
         return summarise(feeder, start, seconds) | {"input_hz": rate}
-
-
-def _feed(feeder: RgbdFeeder, executor: SingleThreadedExecutor, rate: float, seconds: float, with_people: bool) -> None:
-    """Publish moments for so long and take in what comes back."""
-    start, sent = time.monotonic(), 0
-    while (now := time.monotonic()) < start + seconds:
-        due = start + sent / rate
-        if now >= due:
-            feeder.send(with_people)
-            sent += 1
-        executor.spin_once(timeout_sec=max(0.0, min(due - now, 0.05)))
 
 
 def summarise(feeder: RgbdFeeder, start: float, seconds: float) -> dict[str, Any]:
