@@ -90,7 +90,11 @@ class BodyTrackerSettings(Settings):
         high=200000,
         advanced=True,
     )
-    gauss_newton_steps: int = setting(5, "Gauss-Newton steps per cloud", low=1, high=100, advanced=True)
+    gauss_newton_steps: int = setting(
+        5,
+        "Gauss-Newton steps per cloud; at most 3 where a camera's puppets show the joints, and in live scans",
+        low=1, high=100, advanced=True,
+    )  # fmt: skip
     lost_ratio: float = setting(
         1.3,
         "two-way distance, relative to the best since the last search, beyond which the track is lost",

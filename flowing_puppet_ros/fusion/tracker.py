@@ -42,6 +42,8 @@ BETTER_SHARE = 0.95
 """Two-way distance of a new fit, relative to the tracked body's, below which it is better."""
 MAX_PLANE_CLOUDS = 40
 """Clouds after which floor and walls are searched again though they are still there."""
+MAX_STEPS = 3
+"""Gauss-Newton steps a cloud: the joints say where the limbs are, and more steps bring a body no closer."""
 MAX_SAME_PERSON_M = 0.6
 """Between the trunks of a puppet without an id and of the known body that it is."""
 
@@ -110,7 +112,7 @@ class FusedTracker:
         """
         self._people = people
         self._publish_id = publish_id
-        self._settings = settings
+        self._settings = replace(settings, gauss_newton_steps=min(settings.gauss_newton_steps, MAX_STEPS))
         self._hold_ns = round(1e9 * hold)
         self._report = report or Report()
         self._named = 0
