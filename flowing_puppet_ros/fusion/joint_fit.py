@@ -79,7 +79,7 @@ class JointFitter:
         """Return the body that the joints describe, after so many steps; InputError when they describe none."""
         floor = np.where(self._is_limb, 0.0, MIN_START_CONFIDENCE)
         weight = np.where(joints.found, np.sqrt(np.maximum(joints.confidence, floor)), 0.0)
-        certain = np.where(joints.hidden, HIDDEN_SHARE * weight, weight)
+        certain = np.where(joints.guessed, HIDDEN_SHARE * weight, weight)
         named = self._name(joints, certain)
         if not any(name in named for name in LOWER_TRUNK):
             named = _add_trunk(self.model, named, self._name(joints, weight))
@@ -123,10 +123,11 @@ class JointFitter:
     def fit(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
         """Fit a body to the person's points, from `start`.
 
-        Joints of which the person has no points may be wrong: should the body be, the fit without them may be better.
+        Joints of which the person has no points may be wrong, unless the sensor is blind there: should the body be, the
+        fit without them may be better.
         """
         fit = self._fit_either_way(cloud, start, joints)
-        on_surface = find_on_surface(joints) | ~self._is_limb
+        on_surface = find_on_surface(joints) | joints.blank | ~self._is_limb
         if fit.confidence >= MIN_GOOD_CONFIDENCE or not (joints.found & ~on_surface).any():
             return fit
         sure = replace(joints, points=np.where(on_surface[:, None], joints.points, np.nan))
@@ -188,13 +189,13 @@ class JointFitter:
         return None if found is body else self.fitter.assess(found, cloud)
 
     def hold(self, joints: LiftedJoints, targets: JointTargets, unknown: float) -> JointTargets:
-        """Return the pull of joints in the last steps: of the hidden ones, and of all where the ends are out of sight.
+        """Return the pull of joints in the last steps: of those that are not seen, and of all where ends are out of sight.
 
-        Nothing else would hold the hidden ones. Of a body that is cut off, the cloud holds no limb along its axis, and
+        Nothing else would hold the former. Of a body that is cut off, the cloud holds no limb along its axis, and
         of a few centimetres there the shape would make many of the stature. `unknown` is the body's share out of sight.
         """
         share = HELD_SHARE * float(np.clip(unknown / HELD_UNKNOWN, 0.0, 1.0))
-        return replace(targets, weight=np.where(joints.hidden, 1.0, share) * targets.weight)
+        return replace(targets, weight=np.where(joints.guessed, 1.0, share) * targets.weight)
 
 
 def swap_lifted(model: StitchedPuppet, joints: LiftedJoints) -> LiftedJoints:
@@ -206,6 +207,7 @@ def swap_lifted(model: StitchedPuppet, joints: LiftedJoints) -> LiftedJoints:
         rays=joints.rays[other],
         confidence=joints.confidence[other],
         hidden=joints.hidden[other],
+        blank=joints.blank[other],
         choices={other[joint]: choices for joint, choices in joints.choices.items()},
     )
 

@@ -6,6 +6,7 @@ import pytest
 from capsule_man import joints_of  # type: ignore[import-not-found]
 from watched_people import (  # type: ignore[import-not-found]
     Standing,
+    Watched,
     find_puppet,
     make_colour_camera,
     stand_at,
@@ -65,6 +66,24 @@ def test_an_arm_that_points_at_the_camera_is_where_its_depth_is(model: StitchedP
     ((_, fit),) = people.fit_people(seen.seen_by(camera), [find_puppet(model, person, camera, "a1", 3.0)], seen.image)
     wrist = fit.joints[model.joint_names.index("right_wrist")]
     assert np.linalg.norm(wrist - person.joints["right_wrist"]) < 0.09
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.1, 0.0), (-0.05, 0.45)])
+def test_trousers_or_a_shirt_without_depth_do_not_bend_the_body(
+    model: StitchedPuppet, people: PeopleFitter, low: float, high: float
+) -> None:
+    """Black cloth gives no depth; the wall around it has some. `low` and `high` m are its ends above the camera."""
+    person = stand_at(joints_of(), 2.4)
+    seen, camera = watch([person]), make_colour_camera()
+    row, column = np.nonzero(np.isfinite(seen.depth))
+    black = (seen.owner == 0) & (seen.points[:, 2] > low) & (seen.points[:, 2] < high)
+    depth = seen.depth.copy()
+    depth[row[black], column[black]] = np.nan
+    dark = Watched(depth, seen.people, seen.owner[~black])
+    ((_, fit),) = people.fit_people(dark.seen_by(camera), [find_puppet(model, person, camera, "a1", 3.0)], dark.image)
+    error = errors(model, fit, person)
+    assert error.mean() < 0.07
+    assert error.max() < 0.2
 
 
 def test_the_result_does_not_depend_on_threads_and_nobody_is_where_no_points_are(
