@@ -293,8 +293,8 @@ def make_person(
 ) -> PersonCloud:
     """Return a person's `own` (N,) points with what the sensor can know of the person.
 
-    The floor (N,) hides nobody: who stood below it would be hidden by it, and longer legs would cost nothing. Around the
-    bones `blanks` (K, 2, 3) m nothing is known.
+    The floor (N,) hides nobody: who stood below it would be hidden by it, and longer legs would cost nothing. Nothing
+    is known around the bones `blanks` (K, 2, 3) m.
     """
     if image is None:
         return PersonCloud(cloud.points[own], None, stamp, cloud.viewpoint, np.flatnonzero(own))

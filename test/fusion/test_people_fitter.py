@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bodies of capsule men, whose surfaces owe nothing to the body model, from depth and joints with noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from capsule_man import joints_of  # type: ignore[import-not-found]
@@ -66,6 +68,22 @@ def test_an_arm_that_points_at_the_camera_is_where_its_depth_is(model: StitchedP
     ((_, fit),) = people.fit_people(seen.seen_by(camera), [find_puppet(model, person, camera, "a1", 3.0)], seen.image)
     wrist = fit.joints[model.joint_names.index("right_wrist")]
     assert np.linalg.norm(wrist - person.joints["right_wrist"]) < 0.09
+
+
+@pytest.mark.parametrize("kinds", [("knee", "ankle"), ("elbow", "wrist")])
+def test_limbs_that_a_network_takes_for_the_other_sides_are_exchanged(
+    model: StitchedPuppet, people: PeopleFitter, kinds: tuple[str, ...]
+) -> None:
+    person = stand_at(joints_of(0.2, 0.2, 0.2), 2.4)
+    seen, camera = watch([person]), make_colour_camera()
+    puppet = find_puppet(model, person, camera, "a1", 3.0)
+    left, right = ([model.joint_names.index(f"{side}_{kind}") for kind in kinds] for side in ("left", "right"))
+    pixels = puppet.pixels.copy()
+    pixels[left], pixels[right] = puppet.pixels[right], puppet.pixels[left]
+    ((_, fit),) = people.fit_people(seen.seen_by(camera), [replace(puppet, pixels=pixels)], seen.image)
+    error = errors(model, fit, person)
+    assert error.mean() < 0.035
+    assert error.max() < 0.09
 
 
 @pytest.mark.parametrize(("low", "high"), [(-1.1, 0.0), (-0.05, 0.45)])

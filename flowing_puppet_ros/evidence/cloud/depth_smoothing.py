@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of depth images averaged over neighbouring pixels of one person, as far as it is larger than the body's detail.
+"""Noise of depth images averaged over neighbouring pixels of one person, where it is larger than a fit bears.
 
-The error of stereo and of projected patterns grows with the square of the depth: 1 cm at 2 m is 9 cm at 6 m, more than a
-limb is thick and several times the distance between points. Normals of such points point anywhere, and what a surface
+The error of stereo and of projected patterns grows with the square of the depth: 1 cm at 2 m is 9 cm at 6 m, more than
+a limb is thick and several times the distance between points. Normals of such points point anywhere, and what a surface
 hides is decided by chance. It is an error along the ray, so depth is fitted over the image, not a plane through points.
 """
 
