@@ -2,8 +2,8 @@
 """The fit of one body to a person's own points, started in place by the joints that a camera sees.
 
 The joints pull across their rays only, weakly, and not at all in the last steps: they say which limb is which, and
-the cloud says where it is. A body with left and right exchanged is fitted too, since a network may exchange them, and
-the one that the cloud contradicts less is kept.
+the cloud says where it is. A body with left and right exchanged is fitted too, since a network may exchange them, of
+the whole person or of limbs that would cross; the one that the cloud contradicts least is kept.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 from flowing_puppet_ros.fusion.lift import LiftedJoints
+from flowing_puppet_ros.fusion.limb_depths import CHAINS
 from flowing_puppet_ros.fusion.limb_search import LimbSearcher, find_on_surface
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
@@ -79,7 +80,7 @@ class JointFitter:
         """Return the body that the joints describe, after so many steps; InputError when they describe none."""
         floor = np.where(self._is_limb, 0.0, MIN_START_CONFIDENCE)
         weight = np.where(joints.found, np.sqrt(np.maximum(joints.confidence, floor)), 0.0)
-        certain = np.where(joints.hidden, HIDDEN_SHARE * weight, weight)
+        certain = np.where(joints.guessed, HIDDEN_SHARE * weight, weight)
         named = self._name(joints, certain)
         if not any(name in named for name in LOWER_TRUNK):
             named = _add_trunk(self.model, named, self._name(joints, weight))
@@ -123,10 +124,11 @@ class JointFitter:
     def fit(self, cloud: SingleViewCloud, start: BodyState, joints: LiftedJoints) -> BodyFit:
         """Fit a body to the person's points, from `start`.
 
-        Joints of which the person has no points may be wrong: should the body be, the fit without them may be better.
+        Joints of which the person has no points may be wrong, unless the sensor is blind there: should the body be, the
+        fit without them may be better.
         """
         fit = self._fit_either_way(cloud, start, joints)
-        on_surface = find_on_surface(joints) | ~self._is_limb
+        on_surface = find_on_surface(joints) | joints.blank | ~self._is_limb
         if fit.confidence >= MIN_GOOD_CONFIDENCE or not (joints.found & ~on_surface).any():
             return fit
         sure = replace(joints, points=np.where(on_surface[:, None], joints.points, np.nan))
@@ -144,11 +146,13 @@ class JointFitter:
         terms, run = [cloud.free_space_term], self.fitter.gauss_newton.run
         targets, bank = self.make_targets(joints), self.fitter.hypotheses.pose_bank
         body = run(start, cloud, targets, pulled, terms)
-        other = swap_lifted(self.model, joints)
-        other_targets, few = self.make_targets(other), strengthen_priors(EXCHANGED, unknown)
-        exchanged = run(self.start(other, FEW_STEPS), cloud, other_targets, few, terms)
-        if bank.cost(exchanged, coarse) < MAX_SWAP_RATIO * bank.cost(body, coarse):
-            body, joints, targets = exchanged, other, other_targets
+        few, limit, given = strengthen_priors(EXCHANGED, unknown), MAX_SWAP_RATIO * bank.cost(body, coarse), joints
+        for other in (swap_lifted(self.model, given), *swap_crossed(self.model, body, given)):
+            other_targets = self.make_targets(other)
+            exchanged = run(self.start(other, FEW_STEPS), cloud, other_targets, few, terms)
+            if (cost := bank.cost(exchanged, coarse)) < limit:
+                body, joints, targets, limit = exchanged, other, other_targets, cost
+        if joints is not given:
             body = run(body, cloud, targets, pulled, terms)
         body = self.limbs.improve(
             body, coarse, joints, self.limbs.find_doubtful(body, joints),
@@ -188,24 +192,45 @@ class JointFitter:
         return None if found is body else self.fitter.assess(found, cloud)
 
     def hold(self, joints: LiftedJoints, targets: JointTargets, unknown: float) -> JointTargets:
-        """Return the pull of joints in the last steps: of the hidden ones, and of all where the ends are out of sight.
+        """Return the pull of joints in the last steps: of those not seen, and of all where ends are out of sight.
 
-        Nothing else would hold the hidden ones. Of a body that is cut off, the cloud holds no limb along its axis, and
+        Nothing else would hold the former. Of a body that is cut off, the cloud holds no limb along its axis, and
         of a few centimetres there the shape would make many of the stature. `unknown` is the body's share out of sight.
         """
         share = HELD_SHARE * float(np.clip(unknown / HELD_UNKNOWN, 0.0, 1.0))
-        return replace(targets, weight=np.where(joints.hidden, 1.0, share) * targets.weight)
+        return replace(targets, weight=np.where(joints.guessed, 1.0, share) * targets.weight)
 
 
-def swap_lifted(model: StitchedPuppet, joints: LiftedJoints) -> LiftedJoints:
-    """Return the joints with left called right."""
+def swap_crossed(model: StitchedPuppet, body: BodyState, joints: LiftedJoints) -> list[LiftedJoints]:
+    """Return the joints with left called right of limbs that cross from a body's trunk on, arms and legs by themselves.
+
+    A network may be sure of the hips and take one knee for the other. The cloud contradicts the legs of those who do
+    cross them less as they are.
+    """
+    found, places = [], model.joints(model.vertices(body))
+    for near, far, *rest in CHAINS:
+        aside = [
+            points[model.joint_names.index(f"left_{name}")] - points[model.joint_names.index(f"right_{name}")]
+            for points, name in ((places, near), (joints.points, far))
+        ]
+        if float(aside[0] @ aside[1]) < 0:  # not so where one has no depth
+            found.append(swap_lifted(model, joints, (far, *rest)))
+    return found
+
+
+def swap_lifted(model: StitchedPuppet, joints: LiftedJoints, kinds: Sequence[str] | None = None) -> LiftedJoints:
+    """Return the joints with left called right, of all or of some `kinds`, such as knees."""
     other = list(find_other_sides(model.joint_names))
+    if kinds is not None:
+        swapped = [name.partition("_")[2] in kinds for name in model.joint_names]
+        other = [pair if swap else own for own, (pair, swap) in enumerate(zip(other, swapped, strict=True))]
     return replace(
         joints,
         points=joints.points[other],
         rays=joints.rays[other],
         confidence=joints.confidence[other],
         hidden=joints.hidden[other],
+        blank=joints.blank[other],
         choices={other[joint]: choices for joint, choices in joints.choices.items()},
     )
 

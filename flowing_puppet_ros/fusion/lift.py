@@ -26,7 +26,7 @@ from flowing_puppet_ros.fusion.limb_depths import (
     list_choices,
     measure_seen_share,
 )
-from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, measure_distance_by_size, trunk_rows
+from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, list_bones, measure_distance_by_size, trunk_rows
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -43,6 +43,9 @@ MISSED_FACTOR = 2.0
 thin limb. Of somebody new it takes too much for a limb."""
 SURFACE_GAP_M, MIN_SURFACE_SHARE, MAX_SURFACES = 0.08, 0.15, 3
 """Between the depths of two surfaces, share of a surface in the points around a joint, and how many there may be."""
+MIN_EXPECTED_POINTS, BLANK_SHARES = 9.0, (0.05, 0.5)
+"""Points along a bone, if as dense as in the whole image, from which on it may be blank, and the shares of them below
+which it is: of the person's own, and of all."""
 CHOSEN = {name for chain in CHAINS for name in chain}
 """Joints whose depth is chosen among several."""
 MAX_JUMP_M, MAX_EXPECTED_GAP_M, MIN_EXPECTED = 0.12, 0.3, 3
@@ -67,6 +70,7 @@ class LiftedJoints:
         rays: (J, 3) unit vectors from the camera to the joints, NaN where unknown.
         confidence: (J,) 0 to 1, that of the puppet, 0 without a depth.
         hidden: (J,) whether the joint is probably not on the surface that is seen at its pixel.
+        blank: (J,) whether the puppet is sure of the joint and the sensor has no value around it, as on black clothes.
         depth: median depth of the trunk in metres along the camera's axis, NaN without any.
         centre: (3,) metres, where the camera is.
         choices: of the limbs' joints, the places that each may have, by its number.
@@ -76,6 +80,7 @@ class LiftedJoints:
     rays: F64
     confidence: F64
     hidden: Bools
+    blank: Bools
     depth: float
     centre: F64
     choices: Mapping[int, DepthChoices]
@@ -84,6 +89,11 @@ class LiftedJoints:
     def found(self) -> Bools:
         """Which joints (J,) have a depth."""
         return np.isfinite(self.points).all(axis=1)
+
+    @property
+    def guessed(self) -> Bools:
+        """Which joints (J,) have a depth that no surface at their pixel tells."""
+        return self.hidden | self.blank
 
 
 def lift_joints(
@@ -106,8 +116,10 @@ def lift_joints(
     should = _expect_depths(expected, rays, cloud)
     likely = float("nan") if expected is not None else _find_likely_depth(model, puppet, samples, rays, axis)
     depth = _find_trunk_depth(puppet, samples, trunk, should[trunk], likely)
+    missed = _find_missed(samples, depth)
+    blank = _find_blank(list_bones(model), puppet, cloud, usable, missed, depth) & ~outside
     if expected is not None:
-        missed = _find_missed(puppet, samples, depth)
+        missed = missed[puppet.confidence[missed] >= HALF_SEEN_CONFIDENCE]
         samples.update(_collect_samples(puppet, cloud, usable, missed, MISSED_FACTOR)[0])
     points = np.full((len(offsets), 3), np.nan)
     hidden = puppet.hidden.copy()
@@ -115,8 +127,11 @@ def lift_joints(
     for joint, values in samples.items():
         near_trunk = joint in trunk
         near = values[np.abs(values - depth) < (MAX_TRUNK_DEPTH_M if near_trunk else MAX_LIMB_DEPTH_M)]
+        near = near[:0] if blank[joint] else near
         chosen = _kind(model.joint_names[joint]) in CHOSEN
-        if len(near) < MIN_POINTS and not (chosen and _may_be_there(values, beyond[joint], outside[joint], depth)):
+        if len(near) < MIN_POINTS and not (
+            chosen and _may_be_there(values, beyond[joint], bool(outside[joint] | blank[joint]), depth)
+        ):
             continue
         if not chosen:
             along = np.median(near) / (rays[joint] @ axis) + offsets[joint]
@@ -131,10 +146,10 @@ def lift_joints(
             choices[joint] = expect_depth(choices[joint], float(should[joint]))
     for joint, choice in choose_depths(model, choices).items():
         points[joint] = choices[joint].points[choice]
-        hidden[joint] |= not choices[joint].seen[choice]
+        hidden[joint] |= not (choices[joint].seen[choice] or blank[joint])
     found = np.isfinite(points).all(axis=1)
     confidence = np.where(found, puppet.confidence, 0.0)
-    return LiftedJoints(points, rays, confidence, hidden, depth, cloud.camera.centre, choices)
+    return LiftedJoints(points, rays, confidence, hidden, blank, depth, cloud.camera.centre, choices)
 
 
 def find_lifted_onto_others(people: Sequence[LiftedJoints], axis: F64) -> list[Bools]:
@@ -176,21 +191,67 @@ def _find_outside(puppet: PuppetJoints, cloud: SeenCloud) -> Bools:
         return np.asarray(((puppet.pixels < low) | (puppet.pixels > high)).any(axis=1))
 
 
-def _may_be_there(own: F64, others: F64, outside: bool, depth: float) -> bool:
+def _find_blank(
+    bones: Sequence[tuple[int, int]], puppet: PuppetJoints, cloud: SeenCloud, usable: Bools, missed: I64, depth: float
+) -> Bools:
+    """Return which joints (J,) end a bone of which the sensor has no values, though a puppet is sure of one end.
+
+    Black clothes and hair swallow the light of depth sensors, and the sun outshines it.
+
+    Args:
+        bones: the rows of the joints at the ends of each.
+        puppet: the puppet.
+        cloud: the cloud with pixels.
+        usable: (N,) which points may be the person's.
+        missed: joints without points of the person.
+        depth: of the trunk, metres, NaN where unknown.
+    """
+    blank = np.zeros(len(puppet.confidence), dtype=bool)
+    if not len(missed) or not np.isfinite(depth):
+        return blank
+    low, high = cloud.rectangle
+    density = np.count_nonzero(cloud.seen) / max(float(np.prod(high - low)), 1.0)
+    own = usable & (np.abs(cloud.depth - depth) < MAX_LIMB_DEPTH_M)
+    radius, sure = RADIUS_M * cloud.camera.focal / depth, puppet.confidence >= HALF_SEEN_CONFIDENCE
+    for ends in bones:
+        if not (puppet.known[list(ends)].all() and sure[list(ends)].any() and np.isin(ends, missed).any()):
+            continue
+        line = puppet.pixels[list(ends)]
+        rows = _find_along(line, cloud.pixels, radius)
+        expected = density * 2 * radius * float(np.linalg.norm(line[1] - line[0]))
+        few = len(rows) < BLANK_SHARES[1] * expected and np.count_nonzero(own[rows]) < BLANK_SHARES[0] * expected
+        if expected >= MIN_EXPECTED_POINTS and few:
+            blank[[joint for joint in ends if joint in missed]] = True
+    return blank
+
+
+def _find_along(line: F64, pixels: F64, radius: float) -> I64:
+    """Return the rows of `pixels` (N, 2) that are within a `radius` in pixels from a `line` (2, 2) between its ends."""
+    with np.errstate(invalid="ignore"):
+        low, high = line.min(axis=0) - radius, line.max(axis=0) + radius
+        x, y = pixels[:, 0], pixels[:, 1]
+        rows = np.flatnonzero((x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]))
+    along = (line[1] - line[0]) / max(float(np.linalg.norm(line[1] - line[0])), 1e-9)
+    place = pixels[rows] - line[0]
+    inside = (place @ along >= 0) & ((pixels[rows] - line[1]) @ along <= 0)
+    return rows[inside & (np.abs(place @ np.array([-along[1], along[0]])) < radius)]
+
+
+def _may_be_there(own: F64, others: F64, unseen: bool, depth: float) -> bool:
     """Return whether a joint without points of the person around it may be at its pixel all the same.
 
-    It may `outside` of what the sensor shows, or where the person's points are mistaken for somebody else's, as feet
-    for the floor. Where the sensor sees the wall, there is no limb; where it has no value, the puppet may be wrong.
+    It may where the sensor shows nothing, and where the person's points are mistaken for somebody else's, as feet for
+    the floor. Where the sensor sees the wall, there is no limb.
 
     Args:
         own: (N,) metres, depths of points around the joint that may be the person's.
         others: (M,) metres, those of all others.
-        outside: whether the pixel lies outside of the cloud's.
+        unseen: whether the pixel lies outside of the cloud's, or the puppet is sure where these are blank.
         depth: of the trunk, metres, NaN where unknown.
     """
     if not np.isfinite(depth):
         return False
-    if outside:
+    if unseen:
         return True
     seen = np.concatenate([own, others])
     return len(seen) >= MIN_POINTS and bool(seen.max() < depth + MAX_LIMB_DEPTH_M)
@@ -214,14 +275,13 @@ def _find_surfaces(depth: F64) -> F64:
     return found
 
 
-def _find_missed(puppet: PuppetJoints, samples: Mapping[int, F64], depth: float) -> I64:
-    """Return the sure joints that have too few points around them near the trunk's `depth`."""
+def _find_missed(samples: Mapping[int, F64], depth: float) -> I64:
+    """Return the joints that have too few points around them near the trunk's `depth`."""
     return np.array(
         [
             joint
             for joint, values in samples.items()
-            if puppet.confidence[joint] >= HALF_SEEN_CONFIDENCE
-            and np.count_nonzero(np.abs(values - depth) < MAX_LIMB_DEPTH_M) < MIN_POINTS
+            if np.count_nonzero(np.abs(values - depth) < MAX_LIMB_DEPTH_M) < MIN_POINTS
         ],
         dtype=np.int64,
     )

@@ -261,7 +261,7 @@ def _is_doubtful(row: int, joints: LiftedJoints) -> bool:
     choices = joints.choices.get(row)
     several = choices is not None and np.count_nonzero(choices.seen) > 1
     sure = measure_seen_share(joints.confidence[row], False) >= MIN_SEEN_SHARE
-    return bool(joints.hidden[row] or several or not sure)
+    return bool(joints.guessed[row] or several or not sure)
 
 
 def find_on_surface(joints: LiftedJoints) -> Bools:

@@ -16,11 +16,12 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache, find_planes, is_clear_of_planes, subsample
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.depth_smoothing import smooth_depth
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.fusion.joint_fit import FEW_STEPS, HIDDEN_SHARE, MIN_LIMB_CONFIDENCE, JointFitter
 from flowing_puppet_ros.fusion.lift import LiftedJoints, find_lifted_onto_others, lift_joints
 from flowing_puppet_ros.fusion.ownership import assign_points
-from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, trunk_rows
+from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, list_bones, trunk_rows
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.process.threads import one_blas_thread, parallel_map, usable_threads
@@ -32,6 +33,9 @@ JOINT_RADIUS_M = 0.04
 """Of a limb at a sure joint, which takes points though the next joint towards the trunk is not known."""
 MIN_PLACES, PLACE_WEIGHT = 4, 0.1
 """Joints by whose places a body is moved, at least, and the weight of a certain one."""
+BLANK_RADIUS_M = 0.2
+"""Around a bone that the sensor has no values of, within which it knows nothing but the person's points."""
+NO_BONES = np.empty((0, 2, 3))
 CLAIM_ROUNDS = 2
 """In the first, joints that a neighbour hides are lifted onto the neighbour."""
 
@@ -93,6 +97,7 @@ class PeopleFitter:
         self.min_points = settings.min_points
         self.threads = usable_threads(fitter.settings.threads)
         self._trunk = trunk_rows(fitter.model)
+        self._bones = list_bones(fitter.model)
 
     def fit_people(
         self, cloud: SeenCloud, puppets: Sequence[PuppetJoints], image: RangeImage | None
@@ -104,7 +109,9 @@ class PeopleFitter:
         with one_blas_thread():
             clear, floor = self.find_clear(cloud.points, None, cloud.viewpoint)
             claims, _ = self.claim(cloud, puppets, clear)
-            people = [make_person(cloud, image, claim.own, floor, 0) for claim in claims]
+            people = [
+                make_person(cloud, image, claim.own, floor, 0, self.find_blanks(claim.joints)) for claim in claims
+            ]
             found = parallel_map(
                 lambda pair: self.fit_claim(*pair), list(zip(claims, people, strict=True)), self.threads
             )
@@ -254,11 +261,17 @@ class PeopleFitter:
     def find_places(self, claim: Claim) -> JointTargets | None:
         """Return where the joints that are surely seen are, with their depths; None where they are too few."""
         joints = claim.joints
-        seen = joints.found & ~joints.hidden & (joints.confidence >= MIN_LIMB_CONFIDENCE)
+        seen = joints.found & ~joints.guessed & (joints.confidence >= MIN_LIMB_CONFIDENCE)
         if np.count_nonzero(seen) < MIN_PLACES:
             return None
         weight = np.where(seen, PLACE_WEIGHT * joints.confidence, 0.0)
         return JointTargets(np.nan_to_num(joints.points), weight)
+
+    def find_blanks(self, joints: LiftedJoints) -> F64:
+        """Return the bones (K, 2, 3) m whose ends the puppet surely sees where the sensor has no values."""
+        bones = [[first, last] for first, last in self._bones if joints.blank[first] or joints.blank[last]]
+        ends = joints.points[np.array(bones, dtype=np.int64).reshape(-1, 2)]
+        return np.asarray(ends[np.isfinite(ends).all(axis=(1, 2))])
 
     def is_proven(self, fit: BodyFit) -> bool:
         """Return whether a body shows that the puppet is a person: a reliable one, or one that is not all wrong."""
@@ -275,10 +288,18 @@ class PeopleFitter:
         return np.asarray(places.mean(axis=0)) if len(places) else np.full(2, np.nan)
 
 
-def make_person(cloud: SeenCloud, image: RangeImage | None, own: Bools, floor: Bools, stamp: int) -> PersonCloud:
+def make_person(
+    cloud: SeenCloud, image: RangeImage | None, own: Bools, floor: Bools, stamp: int, blanks: F64 = NO_BONES
+) -> PersonCloud:
     """Return a person's `own` (N,) points with what the sensor can know of the person.
 
-    The floor (N,) hides nobody: who stood below it would be hidden by it, and longer legs would cost nothing.
+    The floor (N,) hides nobody: who stood below it would be hidden by it, and longer legs would cost nothing. Nothing
+    is known around the bones `blanks` (K, 2, 3) m.
     """
-    field = None if image is None else image.make_field(own | floor)
-    return PersonCloud(cloud.points[own], None, stamp, cloud.viewpoint, np.flatnonzero(own), field=field)
+    if image is None:
+        return PersonCloud(cloud.points[own], None, stamp, cloud.viewpoint, np.flatnonzero(own))
+    field = image.make_field(own | floor)
+    if len(blanks):
+        field = field.doubt_around(blanks, BLANK_RADIUS_M, cloud.points[own])
+    points = smooth_depth(image, cloud.points, own)
+    return PersonCloud(points, None, stamp, cloud.viewpoint, np.flatnonzero(own), field=field)

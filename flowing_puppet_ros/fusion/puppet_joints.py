@@ -129,6 +129,14 @@ def trunk_rows(model: StitchedPuppet) -> list[int]:
     return [model.joint_names.index(name) for name in _TRUNK]
 
 
+def list_bones(model: StitchedPuppet) -> list[tuple[int, int]]:
+    """Return the rows of the two joints of every bone of the limbs, and of the lines along and across the trunk."""
+    sides = [f"{side}_" for side in ("left", "right")]
+    pairs = [(side + above, side + below) for side in sides for above, below in LONG_BONES]
+    pairs += [("left_" + name, "right_" + name) for name in ("shoulder", "hip")]
+    return [(model.joint_names.index(first), model.joint_names.index(last)) for first, last in pairs]
+
+
 @lru_cache(maxsize=1)
 def _load_flat_model() -> DeformableStructures:
     return DeformableStructures.load("neutral", 14)

@@ -193,7 +193,9 @@ class FusedTracker:
         jobs = []
         for claim in claims:
             track = self._tracks.get(claim.puppet.id) or self._start_track(claim.puppet.id, stamp)
-            jobs.append(_TrackJob(track, make_person(cloud, image, claim.own, floor, stamp), claim))
+            blanks = self._people.find_blanks(claim.joints)
+            person = make_person(cloud, image, claim.own, floor, stamp, blanks)
+            jobs.append(_TrackJob(track, person, claim))
         for identity, own in zip(alone, unclaimed, strict=True):
             if np.count_nonzero(own) >= self._people.min_points:
                 person = make_person(cloud, image, own, floor, stamp)

@@ -27,7 +27,7 @@ def lift(model: StitchedPuppet, given: dict[str, tuple[float, float, float, floa
         row = model.joint_names.index(name)
         points[row], confidence[row], hidden[row] = (x, y, z), sure, behind
     rays = points / np.linalg.norm(points, axis=1, keepdims=True)
-    return LiftedJoints(points, rays, confidence, hidden, 3.0, np.zeros(3), {})
+    return LiftedJoints(points, rays, confidence, hidden, np.zeros(count, dtype=bool), 3.0, np.zeros(3), {})
 
 
 @pytest.fixture(scope="module")

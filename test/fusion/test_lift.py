@@ -68,7 +68,8 @@ def test_who_stands_behind_a_counter_is_not_lifted_onto_it(model: StitchedPuppet
 
 
 def test_a_joint_in_a_hole_of_the_depth_has_no_depth_and_no_confidence(model: StitchedPuppet) -> None:
-    points = np.concatenate([wall(2.5, -1.5, 0.3), wall(2.5, 0.5, 1.5)])  # the wrist is at x = 0.4
+    points = wall(2.5)
+    points = points[np.abs(points[:, :2] - (0.4, 0.15)).max(axis=1) > 0.06]  # around the wrist
     seen = SeenCloud.of(points, camera())
     lifted = lift_joints(model, puppet(model), seen, np.ones(len(points), dtype=bool))
     row = model.joint_names.index("left_wrist")
@@ -76,6 +77,18 @@ def test_a_joint_in_a_hole_of_the_depth_has_no_depth_and_no_confidence(model: St
     assert lifted.confidence[row] == 0
     assert np.isfinite(lifted.rays[row]).all()
     assert lifted.confidence[model.joint_names.index("right_wrist")] == 0.8
+
+
+def test_a_lower_arm_without_any_depth_is_where_its_bones_are_likely(model: StitchedPuppet) -> None:
+    points = np.concatenate([wall(2.5, -1.5, 0.3), wall(2.5, 0.5, 1.5)])  # elbow and wrist are at x = 0.35 and 0.4
+    seen = SeenCloud.of(points, camera())
+    lifted = lift_joints(model, puppet(model), seen, np.ones(len(points), dtype=bool))
+    blank = [model.joint_names.index(name) for name in ("left_elbow", "left_wrist")]
+    np.testing.assert_array_equal(np.flatnonzero(lifted.blank), sorted(blank))
+    assert lifted.found[blank].all() and lifted.guessed[blank].all() and not lifted.hidden[blank].any()
+    np.testing.assert_allclose(lifted.points[blank, 2], 2.5, atol=0.3)
+    sparse = SeenCloud.of(points[::40], camera())  # a LiDAR's gaps are as wide
+    assert not lift_joints(model, puppet(model), sparse, np.ones(len(sparse.points), dtype=bool)).blank.any()
 
 
 @pytest.mark.parametrize("cut", [True, False])

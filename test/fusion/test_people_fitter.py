@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bodies of capsule men, whose surfaces owe nothing to the body model, from depth and joints with noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from capsule_man import joints_of  # type: ignore[import-not-found]
 from watched_people import (  # type: ignore[import-not-found]
     Standing,
+    Watched,
     find_puppet,
     make_colour_camera,
     stand_at,
@@ -65,6 +68,40 @@ def test_an_arm_that_points_at_the_camera_is_where_its_depth_is(model: StitchedP
     ((_, fit),) = people.fit_people(seen.seen_by(camera), [find_puppet(model, person, camera, "a1", 3.0)], seen.image)
     wrist = fit.joints[model.joint_names.index("right_wrist")]
     assert np.linalg.norm(wrist - person.joints["right_wrist"]) < 0.09
+
+
+@pytest.mark.parametrize("kinds", [("knee", "ankle"), ("elbow", "wrist")])
+def test_limbs_that_a_network_takes_for_the_other_sides_are_exchanged(
+    model: StitchedPuppet, people: PeopleFitter, kinds: tuple[str, ...]
+) -> None:
+    person = stand_at(joints_of(0.2, 0.2, 0.2), 2.4)
+    seen, camera = watch([person]), make_colour_camera()
+    puppet = find_puppet(model, person, camera, "a1", 3.0)
+    left, right = ([model.joint_names.index(f"{side}_{kind}") for kind in kinds] for side in ("left", "right"))
+    pixels = puppet.pixels.copy()
+    pixels[left], pixels[right] = puppet.pixels[right], puppet.pixels[left]
+    ((_, fit),) = people.fit_people(seen.seen_by(camera), [replace(puppet, pixels=pixels)], seen.image)
+    error = errors(model, fit, person)
+    assert error.mean() < 0.035
+    assert error.max() < 0.09
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.1, 0.0), (-0.05, 0.45)])
+def test_trousers_or_a_shirt_without_depth_do_not_bend_the_body(
+    model: StitchedPuppet, people: PeopleFitter, low: float, high: float
+) -> None:
+    """Black cloth gives no depth; the wall around it has some. `low` and `high` m are its ends above the camera."""
+    person = stand_at(joints_of(), 2.4)
+    seen, camera = watch([person]), make_colour_camera()
+    row, column = np.nonzero(np.isfinite(seen.depth))
+    black = (seen.owner == 0) & (seen.points[:, 2] > low) & (seen.points[:, 2] < high)
+    depth = seen.depth.copy()
+    depth[row[black], column[black]] = np.nan
+    dark = Watched(depth, seen.people, seen.owner[~black])
+    ((_, fit),) = people.fit_people(dark.seen_by(camera), [find_puppet(model, person, camera, "a1", 3.0)], dark.image)
+    error = errors(model, fit, person)
+    assert error.mean() < 0.07
+    assert error.max() < 0.2
 
 
 def test_the_result_does_not_depend_on_threads_and_nobody_is_where_no_points_are(

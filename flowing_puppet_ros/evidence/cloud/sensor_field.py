@@ -90,7 +90,30 @@ class SensorField:
 
         `points` (N, 3) m are the person's. Black clothes and sunlight leave such pixels as the open air does.
         """
-        limit = np.where(np.isinf(self.limit), np.float32(0), self.limit)
+        return self._doubt(np.isinf(self.limit), points)
+
+    def doubt_around(self, lines: F64, distance: float, points: F64) -> SensorField:
+        """Return the field of a sensor that knows nothing within a `distance`, metres across the ray, from lines.
+
+        `lines` (K, 2, 3) m have two ends, and `points` (N, 3) m are the person's, of which it knows. Beside a limb of
+        which it has no depth it sees through, but nothing tells where the limb's outline is.
+        """
+        near = np.zeros(self.limit.shape, dtype=bool)
+        rows, columns = np.ogrid[: near.shape[0], : near.shape[1]]
+        for line in lines:
+            pixels, depth = self.projection.project(line)
+            if (depth <= 0).any():
+                continue
+            radius = distance * self.projection.scale / (depth.mean() if self.projection.kind == PINHOLE else 1.0)
+            (u, v), (du, dv) = pixels[0] / radius, np.diff(pixels, axis=0)[0] / radius
+            across, down = columns / radius[0] - u, rows / radius[1] - v
+            along = np.clip((across * du + down * dv) / max(du * du + dv * dv, 1e-9), 0.0, 1.0)
+            near |= (across - along * du) ** 2 + (down - along * dv) ** 2 < 1
+        return self._doubt(near, points)
+
+    def _doubt(self, pixels: Bools, points: F64) -> SensorField:
+        """Return the field of a sensor that knows nothing about `pixels` (H, W), unless they show `points` (N, 3) m."""
+        limit = np.where(pixels, np.float32(0), self.limit)
         column, row = np.floor(self.projection.project(points)[0] + 0.5).astype(np.int64).T
         inside = (column >= 0) & (row >= 0) & (column < limit.shape[1]) & (row < limit.shape[0])
         own = row[inside], column[inside]

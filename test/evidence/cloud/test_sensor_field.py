@@ -158,3 +158,14 @@ def test_unknown_places_count_as_hidden_in_a_view_and_known_ones_the_same_as_wit
 def test_a_field_without_ends_and_without_others_hides_nothing() -> None:
     field = SensorField(LENS, np.array([-np.inf, -np.inf, np.inf, np.inf]), np.full((4, 4), np.inf, np.float32))
     assert not field.find_unknown(np.random.default_rng(0).uniform(-9, 9, (50, 3)) * [1, 1, 0] + [0, 0, 1]).any()
+
+
+def test_around_a_line_only_the_persons_own_pixels_are_known(scene: np.ndarray) -> None:
+    points, pixel = camera_points(scene)
+    own = own_of(scene)
+    field = RangeImage.of_camera(LENS, points, pixel, scene.shape).make_field(own)
+    line = np.array([[[-0.2, 0.0, 2.0], [0.2, 0.0, 2.0]]])  # 20 pixels across the middle
+    doubted = field.doubt_around(line, 0.1, points[own])
+    places = np.array([[0.0, 0.0, 2.0], [0.26, 0.0, 2.0], [0.26, 0.15, 2.0], [0.4, 0.0, 2.0]])
+    assert doubted.find_unknown(places).tolist() == [False, True, False, False]
+    assert not field.find_unknown(places).any()
