@@ -211,7 +211,6 @@ def _find_blank(
         return blank
     low, high = cloud.rectangle
     density = np.count_nonzero(cloud.seen) / max(float(np.prod(high - low)), 1.0)
-    own = usable & (np.abs(cloud.depth - depth) < MAX_LIMB_DEPTH_M)
     radius, sure = RADIUS_M * cloud.camera.focal / depth, puppet.confidence >= HALF_SEEN_CONFIDENCE
     for ends in bones:
         if not (puppet.known[list(ends)].all() and sure[list(ends)].any() and np.isin(ends, missed).any()):
@@ -219,8 +218,10 @@ def _find_blank(
         line = puppet.pixels[list(ends)]
         rows = _find_along(line, cloud.pixels, radius)
         expected = density * 2 * radius * float(np.linalg.norm(line[1] - line[0]))
-        few = len(rows) < BLANK_SHARES[1] * expected and np.count_nonzero(own[rows]) < BLANK_SHARES[0] * expected
-        if expected >= MIN_EXPECTED_POINTS and few:
+        if expected < MIN_EXPECTED_POINTS or len(rows) >= BLANK_SHARES[1] * expected:
+            continue
+        own = usable[rows] & (np.abs(cloud.depth[rows] - depth) < MAX_LIMB_DEPTH_M)
+        if np.count_nonzero(own) < BLANK_SHARES[0] * expected:
             blank[[joint for joint in ends if joint in missed]] = True
     return blank
 

@@ -36,8 +36,6 @@ GRID_M, TRUNK_REACH_M, LIMB_REACH_M = 0.08, 0.4, 0.8
 """Step of the grid of depths, and its ends from the trunk's depth for trunk and limbs."""
 SLOPE_M = 0.35
 """Standard deviation of the depth from a joint to the next: limbs are seldom along the ray."""
-LEAN_M = 0.2
-"""Standard deviation of a shoulder's place from above the hips, where the sensor sees one of both at most."""
 HALF_SEEN_CONFIDENCE, CONFIDENCE_WIDTH = 0.5, 0.1
 """Confidence of a joint that is as often seen as hidden, and the width of the logistic curve."""
 SEEN_RANGE = (0.05, 0.95)
@@ -212,13 +210,6 @@ def _choose_corners(first, count, joints, cost):  # type: ignore[no-untyped-def]
                     spread = np.hypot(lists[2, first[a], i], lists[2, first[b], j])
                     apart = _measure_gap(place[first[a], i], place[first[b], j])
                     pair[a, b, i, j] = _cost_bone(apart, length, spread)
-                    if spread > 0 and b < limbs // 2 <= a:
-                        # A shoulder and a hip: nothing else tells whether the trunk leans forward or back.
-                        x, y = (
-                            place[first[a], i, 0] - place[first[b], j, 0],
-                            place[first[a], i, 1] - place[first[b], j, 1],
-                        )
-                        pair[a, b, i, j] += 0.5 * (x * x + y * y) / LEAN_M**2
     least, found = np.inf, np.zeros(limbs, np.int64)
     for i in range(sizes[0]):
         for j in range(sizes[1]):

@@ -10,7 +10,6 @@ import pytest
 
 from flowing_puppet_ros.fusion.limb_depths import (
     CHAINS,
-    LEAN_M,
     SCALE_DEVIATION,
     SCALES,
     DepthChoices,
@@ -40,7 +39,7 @@ def _find_best(model: StitchedPuppet, choices: dict[int, DepthChoices]) -> dict[
         pairs += [(a, b, True) for a, b in pairwise(present)]
     corners = [row(limb[0]) for limb in LIMBS if row(limb[0]) in choices]
     pairs += [(a, b, False) for k, a in enumerate(corners) for b in corners[:k]]
-    rows, hips = list(choices), [row(f"{side}_hip") for side in ("left", "right")]
+    rows = list(choices)
     best: tuple[float, dict[int, int]] = (np.inf, {})
     for scale in SCALES:
         tables = {}
@@ -49,9 +48,6 @@ def _find_best(model: StitchedPuppet, choices: dict[int, DepthChoices]) -> dict[
             near, far = choices[a], choices[b]
             spread = np.hypot(near.spread[:, None], far.spread)
             bone = measure_bone_cost(near.points, far.points, length, spread)
-            if not along and (a in hips) != (b in hips):
-                lean = np.linalg.norm(near.points[:, None, :2] - far.points[None, :, :2], axis=2)
-                bone = bone + np.where(spread > 0, 0.5 * (lean / LEAN_M) ** 2, 0.0)
             tables[a, b] = measure_limb_cost(near, far, length) if along else bone
         for taken in product((0, 1), repeat=len(rows)):
             picked = dict(zip(rows, taken, strict=True))

@@ -30,7 +30,7 @@ class RgbdScore:
     """One fit against the truth; distances are means in metres, NaN where there is nothing to compare.
 
     Attributes:
-        cut: one of CUTS.
+        cut: one of CUTS, or of LOSSES of whole people.
         found: whether there is a body.
         vertex_error: over all vertices of the template.
         seen_vertex_error, hidden_vertex_error: over those that the depth camera sees, and over the others.

@@ -6,6 +6,6 @@ import pytest
 from flowing_puppet_ros.cli import main
 
 
-def test_lost_depth_needs_several_cameras(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "rgbd", "--lost-depth", "patches"]) == 2
-    assert "--lost-depth compares what several cameras see; give --cameras" in capsys.readouterr().err
+def test_all_cameras_but_one_are_several(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "rgbd", "--lost-depth", "clothes", "one"]) == 2
+    assert "--lost-depth one takes the depth of all cameras but one away; give --cameras" in capsys.readouterr().err

@@ -6,6 +6,7 @@ from __future__ import annotations
 import argparse
 import sys
 from dataclasses import asdict
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.moving.camera_ring import CameraRing, RingScore, compare_cameras, summarise_ring
 from flowing_puppet_ros.evaluate.moving.fitter_run import run_fitter
-from flowing_puppet_ros.evaluate.moving.lost_depth import LOSSES
+from flowing_puppet_ros.evaluate.moving.lost_depth import LOSSES, lose_depth
 from flowing_puppet_ros.evaluate.moving.ring_evidence import compare_evidence
 from flowing_puppet_ros.evaluate.moving.robot_view import SENSINGS, RobotView
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
@@ -76,8 +77,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--cameras", type=int, metavar="N", help="compare N depth cameras around the people with each of them alone"
     )
     parser.add_argument(
-        "--lost-depth", nargs="+", choices=LOSSES, metavar="LOSS", help="compare these cameras' depth, silhouettes and"
-        f" both together where depth is missing: {', '.join(LOSSES)}",
+        "--lost-depth", nargs="+", choices=LOSSES, metavar="LOSS", help="whole people of whom depth is missing:"
+        f" {', '.join(LOSSES)}; with --cameras, compare these cameras' depth, silhouettes and both together",
     )  # fmt: skip
     parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture that the poses are from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for rgbd.csv and rgbd.json")
@@ -91,8 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
         ways = _see_from_robot(arguments)
         print(format_json({"robot": ways}) if arguments.json else format_table(ways))
         return 0
-    if arguments.lost_depth is not None and arguments.cameras is None:
-        raise InputError("--lost-depth compares what several cameras see; give --cameras")
+    if "one" in (arguments.lost_depth or ()) and arguments.cameras is None:
+        raise InputError("--lost-depth one takes the depth of all cameras but one away; give --cameras")
     if arguments.mocap is None:
         raise InputError("drawn people stand and walk as motion capture does; give --mocap expmap_20hz.npz")
     if arguments.count < 1 or arguments.people < 1 or arguments.people_seed < 0 or not 0 <= arguments.noise <= 100:
@@ -113,14 +114,17 @@ def run(arguments: argparse.Namespace) -> int:
         print(format_json({"cameras": rings}) if arguments.json else format_table(rings))
         return 0
     scores: list[RgbdScore] = []
-    rows = [(cut, number) for cut in arguments.cuts for number in range(arguments.count)]
-    for cut, number in tqdm(rows, file=sys.stderr, disable=arguments.json):
+    kinds = arguments.lost_depth or arguments.cuts
+    for kind, number in tqdm(list(product(kinds, range(arguments.count))), file=sys.stderr, disable=arguments.json):
+        cut = "whole" if arguments.lost_depth else kind
         rng = np.random.default_rng([arguments.people_seed, CUTS.index(cut), number])
         frame = studio.draw_frame(rng, cut, arguments.people, arguments.noise, arguments.any_pose)
+        if arguments.lost_depth:
+            (frame,) = lose_depth([frame], kind, rng, fitter.model)
         fits, to_world, seconds = method.find(frame)
         each = seconds / len(fits)
-        scores += [score_body(fitter.model, fit, to_world, frame, k, cut, each) for k, fit in enumerate(fits)]
-    figures = [summarise_rgbd([score for score in scores if score.cut == cut]) for cut in arguments.cuts]
+        scores += [score_body(fitter.model, fit, to_world, frame, k, kind, each) for k, fit in enumerate(fits)]
+    figures = [summarise_rgbd([score for score in scores if score.cut == kind]) for kind in kinds]
     printed = {"summary": figures, "calibration": tabulate_calibration(scores)}
     if arguments.out is not None:
         table = [asdict(score) for score in scores]
