@@ -2,7 +2,7 @@
 """The floor of a scene as a grid of heights: a plane, and how far pavements, ramps and thresholds differ from it.
 
 Near a LiDAR whose lowest ray looks little below the horizon no floor is seen. What that ray hits there only tells that
-the floor is not above it.
+the floor is not above it. In a small room it may see none at all: then its level has to be known otherwise.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ MIN_UPRIGHT_M = 0.35  # height of what stands in a cell; a floor is flat
 PLANE_STEPS, PLANE_WIDTH_M = 12, 0.12  # of the robust fit; above the plane, cells count less beyond this width
 MAX_PLANE_SLOPE = 0.25
 BLUR_CELLS = 0.7
+MIN_SEEN_CELLS, MIN_SEEN_SHARE = 2, 0.08  # cells, and their share, whose lowest points are on a floor that is seen
 FLOOR_THICKNESS_M, MIN_FLOOR_SHARE, MAX_CEILING_SHARE = 0.1, 0.25, 0.08
 """Distance from the floor up to which points are on it, the share of a scan's points that are on it at least, and the
 share that may be on what is lowest in a scan that is upside down, or below it in one that is not."""
@@ -38,17 +39,22 @@ share that may be on what is lowest in a scan that is upside down, or below it i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FloorGrid:
-    """Heights of the floor: `heights` (W, D) m of cells from `low` (2,) m on, bilinear between their centres."""
+    """Heights of the floor: `heights` (W, D) m of cells from `low` (2,) m on, bilinear between their centres.
+
+    `is_seen`: whether the points show any of it; else it is as high as the lowest thing that they show, or as given.
+    """
 
     heights: np.ndarray
     low: np.ndarray
+    is_seen: bool = True
 
     @classmethod
-    def find(cls, points: np.ndarray, viewpoint: np.ndarray | None = None) -> FloorGrid:
+    def find(cls, points: np.ndarray, viewpoint: np.ndarray | None = None, level: float | None = None) -> FloorGrid:
         """Find the floor of a scene with points (N, 3) m, z up, N > 0; where none is seen, its neighbours' floor.
 
         Where the sensor at `viewpoint` (3,) m does not look down to the floor, what stands there says only that the
-        floor is not above it.
+        floor is not above it. `level` is z in metres of the floor below the sensor, where it is known otherwise: it
+        counts where the points show no floor, or only what lies above it.
         """
         points = np.ascontiguousarray(points)
         low, shape, all_inside = lay_grid(points, CELL_M, MAX_CELLS)
@@ -57,16 +63,16 @@ class FloorGrid:
         x, y = (low[k] + CELL_M * (np.arange(shape[k]) + 0.5) for k in (0, 1))
         plane = _fit_plane(lowest, cut, x, y, points)
         base = plane[0] + plane[1] * x[:, None] + plane[2] * y[None, :]
-        above = lowest - base
-        above[np.isnan(above) | (above < -MAX_BELOW_PLANE_M) | (cut & (above > 0))] = np.inf
-        if not np.isfinite(above).any():
-            above[:] = 0.0
-        eroded = _limit_slope(above, CELL_M * np.where(upright, MAX_SLOPE, MAX_RAMP_SLOPE))
-        nearest = distance_transform_edt(eroded < above, return_distances=False, return_indices=True)
-        floor = eroded[tuple(nearest)]
-        # What is higher than a kerb stands on the floor, which is as high there as where it is seen.
-        floor = np.where(above - floor > MAX_KERB_M, floor, eroded)
-        return cls(base + gaussian_filter(floor, BLUR_CELLS, mode="nearest"), low)
+        heights = base + _lay_over(lowest - base, upright, cut)
+        on_floor = int((~cut & (np.abs(lowest - heights) < FLOOR_THICKNESS_M)).sum())
+        is_seen = on_floor >= max(MIN_SEEN_CELLS, MIN_SEEN_SHARE * np.isfinite(lowest).sum())
+        found = cls(heights, low, is_seen)
+        if viewpoint is None or level is None or (is_seen and found.locate(*viewpoint[:2]) < level + MAX_KERB_M):
+            return found
+        # All that stands there may be cut off by what is before it.
+        above, beneath = lowest - level, np.clip((viewpoint[:2] - low) / CELL_M, 0, shape - 1).astype(np.int64)
+        above[tuple(beneath)] = 0.0
+        return cls(level + _lay_over(above, upright, upright), low, False)
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Return the heights (N,) of points (N, 3) over the floor, metres."""
@@ -171,6 +177,23 @@ def _fit_plane(lowest: np.ndarray, cut: np.ndarray, x: np.ndarray, y: np.ndarray
         plane = np.linalg.solve((table * weight[:, None]).T @ table + ridge, (table * weight[:, None]).T @ z)
     slope = np.clip(plane[1:], -MAX_PLANE_SLOPE, MAX_PLANE_SLOPE)
     return np.array([plane[0] - slope @ middle, *slope])
+
+
+def _lay_over(above: np.ndarray, upright: np.ndarray, cut: np.ndarray) -> np.ndarray:
+    """Return how high the floor is (W, D) m over a plane over which the cells' lowest points are `above` (W, D) it.
+
+    Something stands where `upright`; the floor may be lower where `cut`.
+    """
+    above = above.copy()
+    above[np.isnan(above) | (above < -MAX_BELOW_PLANE_M) | (cut & (above > 0))] = np.inf
+    if not np.isfinite(above).any():
+        above[:] = 0.0
+    eroded = _limit_slope(above, CELL_M * np.where(upright, MAX_SLOPE, MAX_RAMP_SLOPE))
+    nearest = distance_transform_edt(eroded < above, return_distances=False, return_indices=True)
+    floor = eroded[tuple(nearest)]
+    # What is higher than a kerb stands on the floor, which is as high there as where it is seen.
+    floor = np.where(above - floor > MAX_KERB_M, floor, eroded)
+    return np.asarray(gaussian_filter(floor, BLUR_CELLS, mode="nearest"))
 
 
 @njit(cache=True, nogil=True)
