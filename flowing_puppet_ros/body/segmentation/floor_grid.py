@@ -24,9 +24,9 @@ MAX_SLOPE, MAX_RAMP_SLOPE = 0.05, 0.1
 nothing stands up."""
 MAX_KERB_M = 0.2  # above the floor that is seen nearby: what is higher stands on it
 MAX_BELOW_PLANE_M = 1.0  # a cell that is lower shows a reflection or a shaft
-AZIMUTH_BINS, MIN_RAY_GAP, LIMIT_GAPS = 360, 0.005, 0.6
-"""Bins of azimuth in which the lowest ray is looked up, slope between two rays one above the other at least, and gaps
-between these within which a ray counts as the lowest."""
+AZIMUTH_BINS, MIN_RAY_GAP, LIMIT_GAPS, MAX_RISE_M = 360, 0.005, 0.6, 0.1
+"""Bins of azimuth in which the ray below another one is looked up, slope between two at least, gaps between the lowest
+two from which on one is below another, and how much higher than this it may end where it ends on the floor."""
 MIN_UPRIGHT_M = 0.35  # height of what stands in a cell; a floor is flat
 PLANE_STEPS, PLANE_WIDTH_M = 12, 0.12  # of the robust fit; above the plane, cells count less beyond this width
 MAX_PLANE_SLOPE = 0.25
@@ -58,8 +58,7 @@ class FloorGrid:
         """
         points = np.ascontiguousarray(points)
         low, shape, all_inside = lay_grid(points, CELL_M, MAX_CELLS)
-        by_lowest_ray = np.zeros(len(points), dtype=bool) if viewpoint is None else _find_lowest_rays(points, viewpoint)
-        lowest, upright, cut = _find_lowest(points, by_lowest_ray, low, shape, all_inside)
+        lowest, upright, cut = _find_lowest(points, viewpoint, low, shape, all_inside)
         x, y = (low[k] + CELL_M * (np.arange(shape[k]) + 0.5) for k in (0, 1))
         plane = _fit_plane(lowest, cut, x, y, points)
         base = plane[0] + plane[1] * x[:, None] + plane[2] * y[None, :]
@@ -92,17 +91,40 @@ def looks_upside_down(points: np.ndarray) -> bool:
     return bool((np.abs(height) < FLOOR_THICKNESS_M).mean() < MAX_CEILING_SHARE or too_low > MAX_CEILING_SHARE)
 
 
-def _find_lowest_rays(points: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
-    """Return which (N,) of the points (N, 3) m are on the lowest rays of the sensor at their azimuth."""
-    slope, number, lowest, gaps = _find_slopes(points, viewpoint)
+def _find_open_below(points: np.ndarray, viewpoint: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return of which (K,) of the points `rows` (K,) among (N, 3) m no ray tells what is below them.
+
+    The ray below ends on the floor where it ends no higher; else on what stands before it, or there is none.
+    """
+    slope, number, gaps = _find_slopes(points, viewpoint)
     gaps = gaps[np.isfinite(gaps)]
     margin = LIMIT_GAPS * float(np.median(gaps)) if len(gaps) else 0.0
-    return np.asarray(slope < lowest[number] + margin)
+    order = np.argsort(number, kind="stable")
+    first = np.searchsorted(number[order], np.arange(AZIMUTH_BINS + 1))
+    return np.asarray(_compare_with_ray_below(points, slope, number, order, first, rows, margin))
+
+
+@njit(cache=True, nogil=True)
+def _compare_with_ray_below(points, slope, number, order, first, rows, margin):  # type: ignore[no-untyped-def]
+    is_open = np.ones(len(rows), np.bool_)
+    for k in range(len(rows)):
+        own = rows[k]
+        begin, end = first[number[own]], first[number[own] + 1]
+        below = -np.inf
+        for place in range(begin, end):
+            other = slope[order[place]]
+            if other < slope[own] - margin:
+                below = max(below, other)
+        for place in range(begin, end):
+            row = order[place]
+            if below - margin < slope[row] <= below and points[row, 2] < points[own, 2] + MAX_RISE_M:
+                is_open[k] = False
+    return is_open
 
 
 @njit(cache=True, nogil=True)
 def _find_slopes(points, viewpoint):  # type: ignore[no-untyped-def]
-    """Return the slopes (N,) of the rays, their bins (N,), the lowest slope in each, and the gap to the next one."""
+    """Return the slopes (N,) of the rays, their bins (N,), and the gap between the lowest two in each."""
     slope, number = np.empty(len(points)), np.empty(len(points), np.int64)
     lowest = np.full(AZIMUTH_BINS, np.inf)
     for row in range(len(points)):
@@ -118,41 +140,43 @@ def _find_slopes(points, viewpoint):  # type: ignore[no-untyped-def]
         gap = slope[row] - lowest[number[row]]
         if gap > MIN_RAY_GAP:
             gaps[number[row]] = min(gaps[number[row]], gap)
-    return slope, number, lowest, gaps
+    return slope, number, gaps
 
 
 def _find_lowest(
-    points: np.ndarray, by_lowest_ray: np.ndarray, low: np.ndarray, shape: np.ndarray, all_inside: bool
+    points: np.ndarray, viewpoint: np.ndarray | None, low: np.ndarray, shape: np.ndarray, all_inside: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a low percentile (W, D) of z in each cell, and where something stands, and where its floor may be lower.
 
-    The percentile is NaN where too few points are. The floor may be lower where something stands whose lowest point is
-    `by_lowest_ray` (N,).
+    The percentile is NaN where too few points are. The floor may be lower where the sensor at `viewpoint` (3,) m does
+    not see below what stands there.
     """
     if not all_inside:
-        inside = ~((points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1))
-        points, by_lowest_ray = points[inside], by_lowest_ray[inside]
-    found = _select_lowest(points, by_lowest_ray, *sort_into_cells(points, low, shape, CELL_M))
-    lowest, upright, cut = (each.reshape(int(shape[0]), int(shape[1])) for each in found)
-    return lowest, upright, cut
+        points = points[~((points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1))]
+    lowest, upright, least = _select_lowest(points, *sort_into_cells(points, low, shape, CELL_M))
+    cut, standing = np.zeros(len(lowest), dtype=bool), np.flatnonzero(upright)
+    if viewpoint is not None:
+        cut[standing] = _find_open_below(points, viewpoint, least[standing])
+    size = int(shape[0]), int(shape[1])
+    return lowest.reshape(size), upright.reshape(size), cut.reshape(size)
 
 
 @njit(cache=True, nogil=True)
-def _select_lowest(points, by_lowest_ray, order, first):  # type: ignore[no-untyped-def]
+def _select_lowest(points, order, first):  # type: ignore[no-untyped-def]
+    """Return a low percentile of z in each cell, whether something stands in it, and its lowest point."""
     lowest = np.full(len(first) - 1, np.nan)
-    upright, cut = np.zeros((2, len(lowest)), np.bool_)
+    upright, least = np.zeros(len(lowest), np.bool_), np.zeros(len(lowest), np.int64)
     for cell in range(len(lowest)):
         count = first[cell + 1] - first[cell]
         if count >= MIN_CELL_POINTS:
             z = np.empty(count)
             for k in range(count):
                 z[k] = points[order[first[cell] + k], 2]
-            least = order[first[cell] + z.argmin()]
+            least[cell] = order[first[cell] + z.argmin()]
             upright[cell] = z.max() - z.min() > MIN_UPRIGHT_M
-            cut[cell] = upright[cell] and by_lowest_ray[least]
             rank = int(LOW_SHARE * count)
             lowest[cell] = np.partition(z, rank)[rank]
-    return lowest, upright, cut
+    return lowest, upright, least
 
 
 def _fit_plane(lowest: np.ndarray, cut: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray) -> np.ndarray:
