@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, minimum_filter1d
 
 from flowing_puppet_ros.body.segmentation.column_index import lay_grid, sort_into_cells
 
@@ -27,6 +27,8 @@ MAX_BELOW_PLANE_M = 1.0  # a cell that is lower shows a reflection or a shaft
 AZIMUTH_BINS, MIN_RAY_GAP, LIMIT_GAPS, MAX_RISE_M = 360, 0.005, 0.6, 0.1
 """Bins of azimuth in which the ray below another one is looked up, slope between two at least, gaps between the lowest
 two from which on one is below another, and how much higher than this it may end where it ends on the floor."""
+NEAR_BINS, MIN_CUT_AWAY = 10, 0.1
+"""Bins to either side, and how much lower rays there look, where a floor was cut away; a scanner may be tilted."""
 MIN_UPRIGHT_M = 0.35  # height of what stands in a cell; a floor is flat
 PLANE_STEPS, PLANE_WIDTH_M = 12, 0.12  # of the robust fit; above the plane, cells count less beyond this width
 MAX_PLANE_SLOPE = 0.25
@@ -94,19 +96,23 @@ def looks_upside_down(points: np.ndarray) -> bool:
 def _find_open_below(points: np.ndarray, viewpoint: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """Return of which (K,) of the points `rows` (K,) among (N, 3) m no ray tells what is below them.
 
-    The ray below ends on the floor where it ends no higher; else on what stands before it, or there is none.
+    The ray below ends on the floor where it ends no higher; else on what stands before it, or there is none. Where rays
+    at other azimuths look far below, those that are missing were on a floor that was cut away.
     """
-    slope, number, gaps = _find_slopes(points, viewpoint)
+    slope, number, lowest, gaps = _find_slopes(points, viewpoint)
     gaps = gaps[np.isfinite(gaps)]
     margin = LIMIT_GAPS * float(np.median(gaps)) if len(gaps) else 0.0
     order = np.argsort(number, kind="stable")
     first = np.searchsorted(number[order], np.arange(AZIMUTH_BINS + 1))
-    return np.asarray(_compare_with_ray_below(points, slope, number, order, first, rows, margin))
+    is_open, is_last = _compare_with_ray_below(points, slope, number, order, first, rows, margin)
+    around = minimum_filter1d(lowest, 2 * NEAR_BINS + 1, mode="wrap")
+    return np.asarray(is_open & ~(is_last & (slope[rows] > around[number[rows]] + MIN_CUT_AWAY)))
 
 
 @njit(cache=True, nogil=True)
 def _compare_with_ray_below(points, slope, number, order, first, rows, margin):  # type: ignore[no-untyped-def]
-    is_open = np.ones(len(rows), np.bool_)
+    """Return whether no ray just below a point ends as low, and whether there is none."""
+    is_open, is_last = np.ones((2, len(rows)), np.bool_)
     for k in range(len(rows)):
         own = rows[k]
         begin, end = first[number[own]], first[number[own] + 1]
@@ -115,16 +121,17 @@ def _compare_with_ray_below(points, slope, number, order, first, rows, margin): 
             other = slope[order[place]]
             if other < slope[own] - margin:
                 below = max(below, other)
+        is_last[k] = below == -np.inf
         for place in range(begin, end):
             row = order[place]
             if below - margin < slope[row] <= below and points[row, 2] < points[own, 2] + MAX_RISE_M:
                 is_open[k] = False
-    return is_open
+    return is_open, is_last
 
 
 @njit(cache=True, nogil=True)
 def _find_slopes(points, viewpoint):  # type: ignore[no-untyped-def]
-    """Return the slopes (N,) of the rays, their bins (N,), and the gap between the lowest two in each."""
+    """Return the slopes (N,) of the rays, their bins (N,), the lowest slope in each, and the gap to the next one."""
     slope, number = np.empty(len(points)), np.empty(len(points), np.int64)
     lowest = np.full(AZIMUTH_BINS, np.inf)
     for row in range(len(points)):
@@ -140,7 +147,7 @@ def _find_slopes(points, viewpoint):  # type: ignore[no-untyped-def]
         gap = slope[row] - lowest[number[row]]
         if gap > MIN_RAY_GAP:
             gaps[number[row]] = min(gaps[number[row]], gap)
-    return slope, number, gaps
+    return slope, number, lowest, gaps
 
 
 def _find_lowest(

@@ -47,8 +47,8 @@ SEARCH_EVERY = 3  # scans of a live stream in which somebody is tracked: the oth
 MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
 _UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
 _NO_FLOOR = (
-    "the clouds show no floor, so how high people stand is inferred from their build and no body is reliable; publish"
-    " base_footprint on /tf, or set segmentation.sensor_height"
+    "no floor is seen: how high people stand is inferred from their build, so they are not reliable; set"
+    " segmentation.sensor_height, or publish base_footprint on /tf"
 )
 INFERRED_CONFIDENCE = 0.5
 """Share of the bodies on an inferred floor that are as close as on one that is seen."""
