@@ -15,10 +15,10 @@ POINTS = np.array([[2.0, 0.3, -0.4], [3.0, -1.0, 0.5]])
 
 
 def places(
-    frames: FrameTree, fixed: str = "map", sensor: str = "", up: str = "auto", view: str = "auto"
+    frames: FrameTree, fixed: str = "map", sensor: str = "", up: str = "auto", view: str = "auto", floor: str = ""
 ) -> tuple[SensorPlaces, Report]:
     report = Report()
-    return SensorPlaces(frames, up, fixed, sensor, report, view), report
+    return SensorPlaces(frames, up, fixed, sensor, report, view, floor), report
 
 
 def find(made: SensorPlaces, frame: str, seconds: float) -> Any:
@@ -53,6 +53,31 @@ def test_a_sensor_that_hangs_upside_down_is_no_special_case() -> None:
     np.testing.assert_allclose(place.to_sensor @ np.array([0, 0, 1.0]), [0, 0, -1.0])
     alone = find(places(frames, fixed="", up="-z")[0], "lidar", 1.0)
     assert alone.put(np.array([0, 0, 1.2]))[2] == pytest.approx(-1.2)
+
+
+@pytest.mark.parametrize("fixed", ["", "map"])
+def test_the_sensor_is_as_high_as_it_is_over_base_footprint(fixed: str) -> None:
+    frames = FrameTree()
+    tilted = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # an optical frame that looks ahead
+    frames.add(
+        message(
+            make_transform(
+                FACTORY, make_header(FACTORY, 0, "base_footprint"), "base_link", np.array([0, 0, 0.2]), np.eye(3)
+            ),
+            make_transform(
+                FACTORY, make_header(FACTORY, 0, "base_link"), "eye_optical", np.array([0.1, 0, 1.1]), tilted
+            ),
+            make_transform(
+                FACTORY, make_header(FACTORY, 0, "map"), "base_footprint", np.array([5.0, 0, 0.4]), np.eye(3)
+            ),
+        )
+    )
+    made, _ = places(frames, fixed=fixed, floor="base_footprint")
+    place = find(made, "eye_optical", 1.0)
+    assert place.height == pytest.approx(1.3)
+    assert place.viewpoint[2] == pytest.approx(1.7 if fixed else 0.0)
+    assert find(made, "base_footprint", 1.0).height is None
+    assert find(places(frames, fixed=fixed, floor="no_frame")[0], "eye_optical", 1.0).height is None
 
 
 def test_frames_that_nothing_connects_are_one_sentence_and_the_sensors_frame_is_used() -> None:

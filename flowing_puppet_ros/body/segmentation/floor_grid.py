@@ -204,6 +204,8 @@ def _fit_plane(lowest: np.ndarray, cut: np.ndarray, x: np.ndarray, y: np.ndarray
         width = PLANE_WIDTH_M * (4 if step < PLANE_STEPS // 2 else 1)
         weight = 1 / (1 + np.where(gap > 0, gap / width, gap / MAX_BELOW_PLANE_M) ** 2) ** 2
         weight[open_below & (gap > 0)] = 0.0
+        if not weight.any():  # it is below all that may stand on it
+            break
         ridge = np.diag([1e-9, 20.0, 20.0])
         plane = np.linalg.solve((table * weight[:, None]).T @ table + ridge, (table * weight[:, None]).T @ z)
     slope = np.clip(plane[1:], -MAX_PLANE_SLOPE, MAX_PLANE_SLOPE)
