@@ -6,7 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.track.scene_tracker import SceneTracker
 from flowing_puppet_ros.reporting import Report
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header, make_transform
 from flowing_puppet_ros.stream.sensor_places import ANCHOR_GRID_M, SensorPlaces
 from test.stream.messages.test_frame_tree import FACTORY, SECOND, link, message, robot, turned
@@ -117,3 +121,21 @@ def test_clouds_in_the_maps_frame_need_the_sensors(fixed: str, view: str) -> Non
     np.testing.assert_allclose(place.put(POINTS), POINTS)
     assert report.drain_warnings() == []
     assert known.is_awaited("map", round(11.2 * SECOND))
+
+
+def test_the_people_of_a_cloud_are_looked_for_as_high_as_its_sensor_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[SceneCloud] = []
+
+    def step(tracker: SceneTracker, cloud: SceneCloud, *_: Any) -> tuple[list[Any], list[str]]:
+        seen.append(cloud)
+        return [], []
+
+    monkeypatch.setattr(SceneTracker, "step", step)
+    component = BodyFitterComponent(BodyFitterSettings(), FACTORY)
+    mounted = make_transform(
+        FACTORY, make_header(FACTORY, 0, "base_footprint"), "lidar", np.array([0, 0, 1.4]), np.eye(3)
+    )
+    component.handle("/tf_static", message(mounted))
+    component.handle("points", make_cloud(FACTORY, make_header(FACTORY, SECOND, "lidar"), POINTS))
+    component.flush()
+    assert [cloud.sensor_height for cloud in seen] == [pytest.approx(1.4)]

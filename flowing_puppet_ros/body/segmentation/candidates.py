@@ -75,18 +75,19 @@ class SceneHeights:
     wall: np.ndarray
 
     @classmethod
-    def of(cls, points: np.ndarray, viewpoint: np.ndarray | None = None, level: float | None = None) -> SceneHeights:
-        """Find the floor of N > 0 finite points, seen from `viewpoint` (3,) m; `level` as in `FloorGrid.find`."""
+    def of(cls, points: np.ndarray, viewpoint: np.ndarray | None = None, height: float | None = None) -> SceneHeights:
+        """Find the floor of N > 0 finite points, seen from `viewpoint` (3,) m, `height` m over it if known."""
         points = np.ascontiguousarray(points, dtype=np.float64)
+        level = None if viewpoint is None or height is None else float(viewpoint[2]) - height
         floor = FloorGrid.find(points, viewpoint, level)
-        height = floor.height(points)
-        return cls(points, height, floor, ColumnIndex.of(points), find_walls(points, height))
+        over = floor.height(points)
+        return cls(points, over, floor, ColumnIndex.of(points), find_walls(points, over))
 
-    def lay_on(self, viewpoint: np.ndarray, level: float) -> SceneHeights:
-        """Return the same scene over a floor that it does not show, at z = `level` m below the sensor."""
-        floor = FloorGrid.find(self.points, viewpoint, level)
-        height = floor.height(self.points)
-        return SceneHeights(self.points, height, floor, self.index, find_walls(self.points, height))
+    def lay_below(self, viewpoint: np.ndarray, height: float) -> SceneHeights:
+        """Return the same scene over a floor that it does not show, `height` m below the sensor."""
+        floor = FloorGrid.find(self.points, viewpoint, float(viewpoint[2]) - height)
+        over = floor.height(self.points)
+        return SceneHeights(self.points, over, floor, self.index, find_walls(self.points, over))
 
     def take(self, rows: np.ndarray) -> SceneHeights:
         """Return the part of the scene whose points are `rows` (K,), K > 0, over the same floor."""

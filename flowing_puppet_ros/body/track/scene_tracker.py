@@ -223,7 +223,11 @@ class SceneTracker:
             return bool(self._single_view) and self._settings.view != "full"
         points = self._in_range(cloud)[1]
         candidates = (
-            find_candidates(SceneHeights.of(points, cloud.viewpoint), cloud.viewpoint, MIN_DECIDING_POINTS)[0]
+            find_candidates(
+                SceneHeights.of(points, cloud.viewpoint, height=self._find_height(cloud)),
+                cloud.viewpoint,
+                MIN_DECIDING_POINTS,
+            )[0]
             if len(points)
             else []
         )
@@ -293,7 +297,7 @@ class SceneTracker:
     def _lay_floor(self, cloud: SceneCloud, points: F64, remember: bool) -> SceneHeights:
         """Return the heights of the points (N, 3) m, N > 0, in range; where no floor is seen, over the likeliest."""
         height = self._height if remember else SensorHeight()
-        given = cloud.sensor_height or self._settings.segmentation.sensor_height or None
+        given = self._find_height(cloud)
         rays: list[ScanRays] = []
 
         def rate(scene: SceneHeights) -> float:
@@ -303,6 +307,10 @@ class SceneTracker:
         scene = height.lay_floor(points, cloud.viewpoint, cloud.stamp, given, rate)
         self._sees_floor = height.is_known
         return scene
+
+    def _find_height(self, cloud: SceneCloud) -> float | None:
+        """Return the height of a cloud's sensor over the floor, metres, where it is known."""
+        return cloud.sensor_height or self._settings.segmentation.sensor_height or None
 
     def _doubt(self, fit: BodyFit) -> BodyFit:
         """Return a body, not reliable where nothing but people's build told how high the floor is."""

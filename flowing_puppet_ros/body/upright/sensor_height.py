@@ -56,7 +56,7 @@ class SensorHeight:
             given: metres, height of the sensor over the floor where it is known.
             rate: tells how well upright people explain what stands on a floor.
         """
-        scene = SceneHeights.of(points, viewpoint, None if given is None else float(viewpoint[2]) - given)
+        scene = SceneHeights.of(points, viewpoint, given)
         self.is_known = scene.floor.is_seen or given is not None
         if scene.floor.is_seen:
             self._seen = float(viewpoint[2]) - scene.floor.locate(*viewpoint[:2])
@@ -64,20 +64,20 @@ class SensorHeight:
             return scene
         if self._seen is not None:
             self.is_known = True
-            return scene.lay_on(viewpoint, float(viewpoint[2]) - self._seen)
+            return scene.lay_below(viewpoint, self._seen)
         if self._told < ASKED and not 0 <= stamp - self._asked < INTERVAL_NS:
             self._asked = stamp
             self._ask(scene, viewpoint, rate)
         height = self._find_best()
-        return scene if height is None else scene.lay_on(viewpoint, float(viewpoint[2]) - height)
+        return scene if height is None else scene.lay_below(viewpoint, height)
 
     def _ask(self, scene: SceneHeights, viewpoint: F64, rate: Callable[[SceneHeights], float]) -> None:
         """Add how well the people in a scan stand at heights below the lowest thing in it."""
         least = float(viewpoint[2]) - scene.floor.locate(*viewpoint[:2])
-        tried = range(int(np.floor(least / STEP_M)), int(np.ceil((least + MAX_BELOW_M) / STEP_M)))
+        tried = range(max(int(np.floor(least / STEP_M)), 1), int(np.ceil((least + MAX_BELOW_M) / STEP_M)))
         told = self._told
         for step in tried:
-            support = rate(scene.lay_on(viewpoint, float(viewpoint[2]) - step * STEP_M))
+            support = rate(scene.lay_below(viewpoint, step * STEP_M))
             if support:
                 self._support[step] = self._support.get(step, 0.0) + support
                 self._told = told + 1

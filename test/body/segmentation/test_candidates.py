@@ -101,9 +101,9 @@ def test_walls_behind_a_table_near_the_sensor_show_no_floor() -> None:
     seen = room(rng, -40.0)
     ray = seen - SENSOR
     hidden = ray[:, 2] / np.hypot(ray[:, 0], ray[:, 1]) < -0.3
-    angle, slope = rng.uniform(-np.pi, np.pi, 20_000), np.radians(2.0 * rng.integers(-20, -8, 20_000) + 1.0)
-    slope = slope[slope < -0.29], angle[slope < -0.29]
-    table = SENSOR + np.column_stack([0.8 * np.cos(slope[1]), 0.8 * np.sin(slope[1]), 0.8 * np.tan(slope[0])])
+    angle, slope = rng.uniform(-np.pi, np.pi, 20_000), np.tan(np.radians(2.0 * rng.integers(-20, -8, 20_000) + 1.0))
+    near = 0.8 * np.column_stack([np.cos(angle), np.sin(angle), slope])
+    table = SENSOR + near[slope < -0.3]
     floor = FloorGrid.find(np.concatenate([seen[~hidden], table]), SENSOR)
     assert seen[~hidden][:, 2].min() > 0.2 and not floor.is_seen
 
