@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, I64
+from flowing_puppet_ros.body.cloud.airborne import find_airborne
 from flowing_puppet_ros.body.cloud.coverage import is_single_view
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
@@ -240,14 +241,13 @@ class SceneTracker:
         return single
 
     def _in_range(self, cloud: SceneCloud) -> tuple[I64, F64]:
-        """Return the rows of the points that are finite and in range of the sensor, and the points."""
-        near = cloud.distance < self._settings.segmentation.max_range
-        rows = np.flatnonzero(near)
+        """Return the rows of the points that are finite and in range of the sensor, and no drops, and the points."""
+        rows = np.flatnonzero(cloud.distance < self._settings.segmentation.max_range)
         if len(rows) > MAX_SCENE_POINTS:
             rows = rows[np.linspace(0, len(rows) - 1, MAX_SCENE_POINTS).astype(np.int64)]
-        elif len(rows) == len(near):
-            return rows, np.ascontiguousarray(cloud.points, dtype=np.float64)
-        return rows, np.asarray(cloud.points[rows], dtype=np.float64)
+        points = np.asarray(cloud.points[rows], dtype=np.float64)
+        alone = find_airborne(points, cloud.viewpoint)
+        return (rows[~alone], points[~alone]) if alone.any() else (rows, points)
 
     def _find(
         self,
