@@ -51,8 +51,7 @@ _NO_FLOOR = (
     "no floor is seen: how high people stand is inferred from their build, so they are not reliable; set"
     " segmentation.sensor_height, or publish base_footprint on /tf"
 )
-INFERRED_CONFIDENCE = 0.5
-"""Share of the bodies on an inferred floor that are as close as on one that is seen."""
+INFERRED_CONFIDENCE = 0.5  # of a body on an inferred floor, relative to one on a floor that is seen
 MAX_REJECTED = 50  # candidates that are told of
 MIN_DECIDING_POINTS = 60
 """Points of a person from which on they tell whether people are seen from one side."""
