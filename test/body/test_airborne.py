@@ -52,6 +52,12 @@ def test_drops_hang_in_the_air_and_people_do_not(rings: tuple[float, float, int]
     assert alone[: len(points)].mean() < 0.002
 
 
+def test_the_few_points_that_hang_alone_in_clear_air_are_kept() -> None:
+    points, _ = scan(-24, 8, 64)
+    rain = let_it_rain(points, 0.02)[:50]
+    assert not find_airborne(np.concatenate([points, rain]), np.zeros(3)).any()
+
+
 def test_it_does_not_matter_where_the_sensor_is() -> None:
     points = scan(-15, 15, 16)[0]
     points, place = np.concatenate([points, let_it_rain(points, 0.03)]), np.array([200.0, -50.0, 3.0])

@@ -15,6 +15,8 @@ from flowing_puppet_ros.arrays import F64, Bools
 
 CELL_M, RANGE_M, HALF_HEIGHT_M = 0.15, 30.0, 6.0
 """Edge of a cell, and how far cells go from the sensor, across and up; what is beyond is kept."""
+MAX_CLEAR_SHARE = 0.005
+"""Share of the points that hang alone in clear air, too: fingers, cables, rays that graze an edge. These are kept."""
 BIN_RAD, MAX_ELEVATION_RAD = np.radians(4.0), np.radians(88.0)
 """Edge of a bin of directions in which points are counted, and the elevations in which they are."""
 MIN_SURFACE_SHARE = 0.04
@@ -23,9 +25,10 @@ an arm, a leg or a post fills a tenth of them."""
 
 
 def find_airborne(points: F64, viewpoint: F64) -> Bools:
-    """Return which (N,) of the points (N, 3) m, seen from `viewpoint` (3,) m, hang in the air alone."""
+    """Return which (N,) of the points (N, 3) m, seen from `viewpoint` (3,) m, hang in the air alone; none if few do."""
     side, high = (2 * int(np.ceil(reach / CELL_M)) + 3 for reach in (RANGE_M, HALF_HEIGHT_M))
-    return np.asarray(_find_airborne(np.ascontiguousarray(points), viewpoint, side, high))
+    alone = _find_airborne(np.ascontiguousarray(points), viewpoint, side, high)
+    return np.asarray(alone & (alone.mean() > MAX_CLEAR_SHARE)) if len(points) else alone
 
 
 @njit(cache=True, nogil=True)
