@@ -59,6 +59,13 @@ class SegmentationSettings(Settings):
     max_range: float = setting(
         30.0, "distance from the sensor beyond which points are dropped", unit="m", low=0.5, high=1000.0
     )
+    sensor_height: float = setting(
+        0.0,
+        "height of the sensor over the floor, for clouds that show no floor; 0: not known",
+        unit="m",
+        low=0.0,
+        high=20.0,
+    )
     plane_clearance: float = setting(
         0.05,
         "distance from the floor or a wall up to which points belong to it",

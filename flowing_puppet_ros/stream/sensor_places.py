@@ -2,13 +2,14 @@
 """Where sensors are when they see something: the frames of their data, which way is up there, and a fixed frame.
 
 People are tracked in the fixed frame, so that neither a robot that drives nor a head that nods or turns moves them; its
-z axis points up (REP-105). Without one they are tracked in the frame of the data, turned so that z points up.
+z axis points up (REP-105). Without one they are tracked in the frame of the data, turned so that z points up. A robot's
+base_footprint is on the floor (REP-120), which a sensor does not always see.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ NO_SENSOR_FRAMES = frozenset({"map", "odom", "world", "earth"})
 """Frames of REP-105 and of simulators in which no sensor stands at the origin."""
 MIN_CAMERA_DISTANCE_M = 0.1
 MAX_FIELD_OF_VIEW = 1.2  # tangent of half of it: 100 degrees from side to side
+MIN_SENSOR_HEIGHT_M = 0.05  # over a frame that can be on the floor
 ANCHOR_GRID_M = 100.0
 """Grid of the places near which coordinates are counted from, since those of a map may be large."""
 
@@ -38,6 +40,7 @@ class SensorPlace:
         viewpoint: (3,) metres, where the sensor is in the frame of the tracks.
         to_sensor: (3, 3), from the frame of the tracks to the sensor's own with z up, however the sensor is tilted.
         is_fixed: whether people are tracked in the fixed frame.
+        height: metres, of the sensor over the floor frame; None where that is not known.
     """
 
     rotation: F64
@@ -45,6 +48,7 @@ class SensorPlace:
     viewpoint: F64
     to_sensor: F64
     is_fixed: bool = False
+    height: float | None = None
 
     def put(self, points: F64) -> F64:
         """Return points (..., 3) m of the data in the frame of the tracks."""
@@ -65,13 +69,21 @@ class SensorPlaces:
     """Finds where the sensor of some data is, by the frames received on /tf and /tf_static."""
 
     def __init__(
-        self, frames: FrameTree, up: str, fixed_frame: str, sensor_frame: str, report: Report, view: str = "auto"
+        self,
+        frames: FrameTree,
+        up: str,
+        fixed_frame: str,
+        sensor_frame: str,
+        report: Report,
+        view: str = "auto",
+        floor_frame: str = "",
     ) -> None:
         """Look frames up in `frames`; the others are the settings of these names of the body fitter."""
         self._view = view
         self._frames = frames
         self._up = up
         self._fixed, self._sensor = fixed_frame.lstrip("/"), sensor_frame.lstrip("/")
+        self._floor = floor_frame.lstrip("/")
         self._is_given, self._level = bool(self._fixed), np.eye(3)
         self._report = report
         self.reset()
@@ -93,9 +105,10 @@ class SensorPlaces:
         Where nothing connects the frames, only the first data wait.
         """
         pairs = [(frame, target) for target in (self._fixed, self._sensor) if target and target != frame.lstrip("/")]
+        known = [(frame, self._floor)] if self._floor and self._frames.is_connected(frame, self._floor) else []
         return any(
             self._frames.is_awaited(*pair, stamp) and (self._frames.is_connected(*pair) or not self._missed)
-            for pair in pairs
+            for pair in [*pairs, *known]
         )
 
     def find(self, header: Any, stamp: int, points: F64, of_depth: bool) -> SensorPlace | None:
@@ -106,7 +119,7 @@ class SensorPlaces:
         """
         place, frame = self.find_alone(header, stamp, points, of_depth), header.frame_id.lstrip("/")
         if not self._fixed:
-            return place
+            return self._measure_height(place, frame, stamp)
         pose = self._frames.lookup_pose(frame, self._fixed, stamp)
         if pose is None:
             self._missed = True
@@ -116,15 +129,16 @@ class SensorPlaces:
             )
             self._report.warn(f"{self._frames.describe_missing(frame, self._fixed, stamp)}: {rest}")
             self._report.counters["clouds without fixed_frame"] += 1
-            return None if alone else place
+            return None if alone else self._measure_height(place, frame, stamp)
         pose = self._level @ pose[0], self._level @ pose[1]
         if self._anchor is None:
             self._anchor = ANCHOR_GRID_M * np.round(pose[0] / ANCHOR_GRID_M)
         turn = pose[1] @ place.rotation.T  # from the data's frame with z up
         shift = pose[0] - self._anchor
-        return SensorPlace(
+        fixed = SensorPlace(
             pose[1], shift, turn @ place.viewpoint + shift, place.to_sensor @ turn.T, is_fixed=True
         )  # fmt: skip
+        return self._measure_height(fixed, frame, stamp)
 
     def fix(self, frame: str) -> str:
         """Track people in the root of a frame's tree where no fixed frame is set; return the frame of the tracks.
@@ -173,6 +187,12 @@ class SensorPlaces:
                 "be at the origin, where it is probably not; set sensor_frame to the sensor's own frame"
             )
         return here
+
+    def _measure_height(self, place: SensorPlace, frame: str, stamp: int) -> SensorPlace:
+        """Return a place of the sensor of data in a `frame` with its height over the floor frame, if any is known."""
+        found = self._frames.lookup_pose(self._floor, frame, stamp) if self._floor else None
+        height = 0.0 if found is None else float(place.viewpoint[2] - place.put(found[0])[2])
+        return replace(place, height=height if height > MIN_SENSOR_HEIGHT_M else None)
 
     def _find_up(self, frame: str, points: F64, of_depth: bool) -> str:
         """Return the axis that is up in a frame; for one without a name the first cloud decides."""

@@ -6,7 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.track.scene_tracker import SceneTracker
 from flowing_puppet_ros.reporting import Report
+from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
+from flowing_puppet_ros.stream.messages.clouds import make_cloud
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_header, make_transform
 from flowing_puppet_ros.stream.sensor_places import ANCHOR_GRID_M, SensorPlaces
 from test.stream.messages.test_frame_tree import FACTORY, SECOND, link, message, robot, turned
@@ -15,10 +19,10 @@ POINTS = np.array([[2.0, 0.3, -0.4], [3.0, -1.0, 0.5]])
 
 
 def places(
-    frames: FrameTree, fixed: str = "map", sensor: str = "", up: str = "auto", view: str = "auto"
+    frames: FrameTree, fixed: str = "map", sensor: str = "", up: str = "auto", view: str = "auto", floor: str = ""
 ) -> tuple[SensorPlaces, Report]:
     report = Report()
-    return SensorPlaces(frames, up, fixed, sensor, report, view), report
+    return SensorPlaces(frames, up, fixed, sensor, report, view, floor), report
 
 
 def find(made: SensorPlaces, frame: str, seconds: float) -> Any:
@@ -53,6 +57,31 @@ def test_a_sensor_that_hangs_upside_down_is_no_special_case() -> None:
     np.testing.assert_allclose(place.to_sensor @ np.array([0, 0, 1.0]), [0, 0, -1.0])
     alone = find(places(frames, fixed="", up="-z")[0], "lidar", 1.0)
     assert alone.put(np.array([0, 0, 1.2]))[2] == pytest.approx(-1.2)
+
+
+@pytest.mark.parametrize("fixed", ["", "map"])
+def test_the_sensor_is_as_high_as_it_is_over_base_footprint(fixed: str) -> None:
+    frames = FrameTree()
+    tilted = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # an optical frame that looks ahead
+    frames.add(
+        message(
+            make_transform(
+                FACTORY, make_header(FACTORY, 0, "base_footprint"), "base_link", np.array([0, 0, 0.2]), np.eye(3)
+            ),
+            make_transform(
+                FACTORY, make_header(FACTORY, 0, "base_link"), "eye_optical", np.array([0.1, 0, 1.1]), tilted
+            ),
+            make_transform(
+                FACTORY, make_header(FACTORY, 0, "map"), "base_footprint", np.array([5.0, 0, 0.4]), np.eye(3)
+            ),
+        )
+    )
+    made, _ = places(frames, fixed=fixed, floor="base_footprint")
+    place = find(made, "eye_optical", 1.0)
+    assert place.height == pytest.approx(1.3)
+    assert place.viewpoint[2] == pytest.approx(1.7 if fixed else 0.0)
+    assert find(made, "base_footprint", 1.0).height is None
+    assert find(places(frames, fixed=fixed, floor="no_frame")[0], "eye_optical", 1.0).height is None
 
 
 def test_frames_that_nothing_connects_are_one_sentence_and_the_sensors_frame_is_used() -> None:
@@ -92,3 +121,21 @@ def test_clouds_in_the_maps_frame_need_the_sensors(fixed: str, view: str) -> Non
     np.testing.assert_allclose(place.put(POINTS), POINTS)
     assert report.drain_warnings() == []
     assert known.is_awaited("map", round(11.2 * SECOND))
+
+
+def test_the_people_of_a_cloud_are_looked_for_as_high_as_its_sensor_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[SceneCloud] = []
+
+    def step(tracker: SceneTracker, cloud: SceneCloud, *_: Any) -> tuple[list[Any], list[str]]:
+        seen.append(cloud)
+        return [], []
+
+    monkeypatch.setattr(SceneTracker, "step", step)
+    component = BodyFitterComponent(BodyFitterSettings(), FACTORY)
+    mounted = make_transform(
+        FACTORY, make_header(FACTORY, 0, "base_footprint"), "lidar", np.array([0, 0, 1.4]), np.eye(3)
+    )
+    component.handle("/tf_static", message(mounted))
+    component.handle("points", make_cloud(FACTORY, make_header(FACTORY, SECOND, "lidar"), POINTS))
+    component.flush()
+    assert [cloud.sensor_height for cloud in seen] == [pytest.approx(1.4)]

@@ -75,12 +75,19 @@ class SceneHeights:
     wall: np.ndarray
 
     @classmethod
-    def of(cls, points: np.ndarray, viewpoint: np.ndarray | None = None) -> SceneHeights:
-        """Find the floor of a scene with N > 0 finite points, seen from `viewpoint` (3,) m."""
+    def of(cls, points: np.ndarray, viewpoint: np.ndarray | None = None, height: float | None = None) -> SceneHeights:
+        """Find the floor of N > 0 finite points, seen from `viewpoint` (3,) m, `height` m over it if known."""
         points = np.ascontiguousarray(points, dtype=np.float64)
-        floor = FloorGrid.find(points, viewpoint)
-        height = floor.height(points)
-        return cls(points, height, floor, ColumnIndex.of(points), find_walls(points, height))
+        level = None if viewpoint is None or height is None else float(viewpoint[2]) - height
+        floor = FloorGrid.find(points, viewpoint, level)
+        over = floor.height(points)
+        return cls(points, over, floor, ColumnIndex.of(points), find_walls(points, over))
+
+    def lay_below(self, viewpoint: np.ndarray, height: float) -> SceneHeights:
+        """Return the same scene over a floor that it does not show, `height` m below the sensor."""
+        floor = FloorGrid.find(self.points, viewpoint, float(viewpoint[2]) - height)
+        over = floor.height(self.points)
+        return SceneHeights(self.points, over, floor, self.index, find_walls(self.points, over))
 
     def take(self, rows: np.ndarray) -> SceneHeights:
         """Return the part of the scene whose points are `rows` (K,), K > 0, over the same floor."""

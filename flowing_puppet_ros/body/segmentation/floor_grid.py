@@ -2,7 +2,7 @@
 """The floor of a scene as a grid of heights: a plane, and how far pavements, ramps and thresholds differ from it.
 
 Near a LiDAR whose lowest ray looks little below the horizon no floor is seen. What that ray hits there only tells that
-the floor is not above it.
+the floor is not above it. In a small room it may see none at all: then its level has to be known otherwise.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.ndimage import distance_transform_edt, gaussian_filter
+from scipy.ndimage import distance_transform_edt, gaussian_filter, minimum_filter1d
 
 from flowing_puppet_ros.body.segmentation.column_index import lay_grid, sort_into_cells
 
@@ -24,13 +24,16 @@ MAX_SLOPE, MAX_RAMP_SLOPE = 0.05, 0.1
 nothing stands up."""
 MAX_KERB_M = 0.2  # above the floor that is seen nearby: what is higher stands on it
 MAX_BELOW_PLANE_M = 1.0  # a cell that is lower shows a reflection or a shaft
-AZIMUTH_BINS, MIN_RAY_GAP, LIMIT_GAPS = 360, 0.005, 0.6
-"""Bins of azimuth in which the lowest ray is looked up, slope between two rays one above the other at least, and gaps
-between these within which a ray counts as the lowest."""
+AZIMUTH_BINS, MIN_RAY_GAP, LIMIT_GAPS, MAX_RISE_M = 360, 0.005, 0.6, 0.1
+"""Bins of azimuth in which the ray below another one is looked up, slope between two at least, gaps between the lowest
+two from which on one is below another, and how much higher than this it may end where it ends on the floor."""
+NEAR_BINS, MIN_CUT_AWAY = 10, 0.1
+"""Bins to either side, and how much lower rays there look, where a floor was cut away; a scanner may be tilted."""
 MIN_UPRIGHT_M = 0.35  # height of what stands in a cell; a floor is flat
 PLANE_STEPS, PLANE_WIDTH_M = 12, 0.12  # of the robust fit; above the plane, cells count less beyond this width
 MAX_PLANE_SLOPE = 0.25
 BLUR_CELLS = 0.7
+MIN_SEEN_CELLS, MIN_SEEN_SHARE = 2, 0.08  # cells, and their share, whose lowest points are on a floor that is seen
 FLOOR_THICKNESS_M, MIN_FLOOR_SHARE, MAX_CEILING_SHARE = 0.1, 0.25, 0.08
 """Distance from the floor up to which points are on it, the share of a scan's points that are on it at least, and the
 share that may be on what is lowest in a scan that is upside down, or below it in one that is not."""
@@ -38,35 +41,39 @@ share that may be on what is lowest in a scan that is upside down, or below it i
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FloorGrid:
-    """Heights of the floor: `heights` (W, D) m of cells from `low` (2,) m on, bilinear between their centres."""
+    """Heights of the floor: `heights` (W, D) m of cells from `low` (2,) m on, bilinear between their centres.
+
+    `is_seen`: whether the points show any of it; else it is as high as the lowest thing that they show, or as given.
+    """
 
     heights: np.ndarray
     low: np.ndarray
+    is_seen: bool = True
 
     @classmethod
-    def find(cls, points: np.ndarray, viewpoint: np.ndarray | None = None) -> FloorGrid:
+    def find(cls, points: np.ndarray, viewpoint: np.ndarray | None = None, level: float | None = None) -> FloorGrid:
         """Find the floor of a scene with points (N, 3) m, z up, N > 0; where none is seen, its neighbours' floor.
 
         Where the sensor at `viewpoint` (3,) m does not look down to the floor, what stands there says only that the
-        floor is not above it.
+        floor is not above it. `level` is z in metres of the floor below the sensor, where it is known otherwise: it
+        counts where the points show no floor, or only what lies above it.
         """
         points = np.ascontiguousarray(points)
         low, shape, all_inside = lay_grid(points, CELL_M, MAX_CELLS)
-        by_lowest_ray = np.zeros(len(points), dtype=bool) if viewpoint is None else _find_lowest_rays(points, viewpoint)
-        lowest, upright, cut = _find_lowest(points, by_lowest_ray, low, shape, all_inside)
+        lowest, upright, cut = _find_lowest(points, viewpoint, low, shape, all_inside)
         x, y = (low[k] + CELL_M * (np.arange(shape[k]) + 0.5) for k in (0, 1))
         plane = _fit_plane(lowest, cut, x, y, points)
         base = plane[0] + plane[1] * x[:, None] + plane[2] * y[None, :]
-        above = lowest - base
-        above[np.isnan(above) | (above < -MAX_BELOW_PLANE_M) | (cut & (above > 0))] = np.inf
-        if not np.isfinite(above).any():
-            above[:] = 0.0
-        eroded = _limit_slope(above, CELL_M * np.where(upright, MAX_SLOPE, MAX_RAMP_SLOPE))
-        nearest = distance_transform_edt(eroded < above, return_distances=False, return_indices=True)
-        floor = eroded[tuple(nearest)]
-        # What is higher than a kerb stands on the floor, which is as high there as where it is seen.
-        floor = np.where(above - floor > MAX_KERB_M, floor, eroded)
-        return cls(base + gaussian_filter(floor, BLUR_CELLS, mode="nearest"), low)
+        heights = base + _lay_over(lowest - base, upright, cut)
+        on_floor = int((~cut & (np.abs(lowest - heights) < FLOOR_THICKNESS_M)).sum())
+        is_seen = on_floor >= max(MIN_SEEN_CELLS, MIN_SEEN_SHARE * np.isfinite(lowest).sum())
+        found = cls(heights, low, is_seen)
+        if viewpoint is None or level is None or (is_seen and found.locate(*viewpoint[:2]) < level + MAX_KERB_M):
+            return found
+        # All that stands there may be cut off by what is before it.
+        above, beneath = lowest - level, np.clip((viewpoint[:2] - low) / CELL_M, 0, shape - 1).astype(np.int64)
+        above[tuple(beneath)] = 0.0
+        return cls(level + _lay_over(above, upright, upright), low, False)
 
     def height(self, points: np.ndarray) -> np.ndarray:
         """Return the heights (N,) of points (N, 3) over the floor, metres."""
@@ -86,12 +93,40 @@ def looks_upside_down(points: np.ndarray) -> bool:
     return bool((np.abs(height) < FLOOR_THICKNESS_M).mean() < MAX_CEILING_SHARE or too_low > MAX_CEILING_SHARE)
 
 
-def _find_lowest_rays(points: np.ndarray, viewpoint: np.ndarray) -> np.ndarray:
-    """Return which (N,) of the points (N, 3) m are on the lowest rays of the sensor at their azimuth."""
+def _find_open_below(points: np.ndarray, viewpoint: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return of which (K,) of the points `rows` (K,) among (N, 3) m no ray tells what is below them.
+
+    The ray below ends on the floor where it ends no higher; else on what stands before it, or there is none. Where rays
+    at other azimuths look far below, those that are missing were on a floor that was cut away.
+    """
     slope, number, lowest, gaps = _find_slopes(points, viewpoint)
     gaps = gaps[np.isfinite(gaps)]
     margin = LIMIT_GAPS * float(np.median(gaps)) if len(gaps) else 0.0
-    return np.asarray(slope < lowest[number] + margin)
+    order = np.argsort(number, kind="stable")
+    first = np.searchsorted(number[order], np.arange(AZIMUTH_BINS + 1))
+    is_open, is_last = _compare_with_ray_below(points, slope, number, order, first, rows, margin)
+    around = minimum_filter1d(lowest, 2 * NEAR_BINS + 1, mode="wrap")
+    return np.asarray(is_open & ~(is_last & (slope[rows] > around[number[rows]] + MIN_CUT_AWAY)))
+
+
+@njit(cache=True, nogil=True)
+def _compare_with_ray_below(points, slope, number, order, first, rows, margin):  # type: ignore[no-untyped-def]
+    """Return whether no ray just below a point ends as low, and whether there is none."""
+    is_open, is_last = np.ones((2, len(rows)), np.bool_)
+    for k in range(len(rows)):
+        own = rows[k]
+        begin, end = first[number[own]], first[number[own] + 1]
+        below = -np.inf
+        for place in range(begin, end):
+            other = slope[order[place]]
+            if other < slope[own] - margin:
+                below = max(below, other)
+        is_last[k] = below == -np.inf
+        for place in range(begin, end):
+            row = order[place]
+            if below - margin < slope[row] <= below and points[row, 2] < points[own, 2] + MAX_RISE_M:
+                is_open[k] = False
+    return is_open, is_last
 
 
 @njit(cache=True, nogil=True)
@@ -116,37 +151,39 @@ def _find_slopes(points, viewpoint):  # type: ignore[no-untyped-def]
 
 
 def _find_lowest(
-    points: np.ndarray, by_lowest_ray: np.ndarray, low: np.ndarray, shape: np.ndarray, all_inside: bool
+    points: np.ndarray, viewpoint: np.ndarray | None, low: np.ndarray, shape: np.ndarray, all_inside: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return a low percentile (W, D) of z in each cell, and where something stands, and where its floor may be lower.
 
-    The percentile is NaN where too few points are. The floor may be lower where something stands whose lowest point is
-    `by_lowest_ray` (N,).
+    The percentile is NaN where too few points are. The floor may be lower where the sensor at `viewpoint` (3,) m does
+    not see below what stands there.
     """
     if not all_inside:
-        inside = ~((points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1))
-        points, by_lowest_ray = points[inside], by_lowest_ray[inside]
-    found = _select_lowest(points, by_lowest_ray, *sort_into_cells(points, low, shape, CELL_M))
-    lowest, upright, cut = (each.reshape(int(shape[0]), int(shape[1])) for each in found)
-    return lowest, upright, cut
+        points = points[~((points[:, :2] < low).any(axis=1) | (points[:, :2] >= low + CELL_M * shape).any(axis=1))]
+    lowest, upright, least = _select_lowest(points, *sort_into_cells(points, low, shape, CELL_M))
+    cut, standing = np.zeros(len(lowest), dtype=bool), np.flatnonzero(upright)
+    if viewpoint is not None:
+        cut[standing] = _find_open_below(points, viewpoint, least[standing])
+    size = int(shape[0]), int(shape[1])
+    return lowest.reshape(size), upright.reshape(size), cut.reshape(size)
 
 
 @njit(cache=True, nogil=True)
-def _select_lowest(points, by_lowest_ray, order, first):  # type: ignore[no-untyped-def]
+def _select_lowest(points, order, first):  # type: ignore[no-untyped-def]
+    """Return a low percentile of z in each cell, whether something stands in it, and its lowest point."""
     lowest = np.full(len(first) - 1, np.nan)
-    upright, cut = np.zeros((2, len(lowest)), np.bool_)
+    upright, least = np.zeros(len(lowest), np.bool_), np.zeros(len(lowest), np.int64)
     for cell in range(len(lowest)):
         count = first[cell + 1] - first[cell]
         if count >= MIN_CELL_POINTS:
             z = np.empty(count)
             for k in range(count):
                 z[k] = points[order[first[cell] + k], 2]
-            least = order[first[cell] + z.argmin()]
+            least[cell] = order[first[cell] + z.argmin()]
             upright[cell] = z.max() - z.min() > MIN_UPRIGHT_M
-            cut[cell] = upright[cell] and by_lowest_ray[least]
             rank = int(LOW_SHARE * count)
             lowest[cell] = np.partition(z, rank)[rank]
-    return lowest, upright, cut
+    return lowest, upright, least
 
 
 def _fit_plane(lowest: np.ndarray, cut: np.ndarray, x: np.ndarray, y: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -167,10 +204,29 @@ def _fit_plane(lowest: np.ndarray, cut: np.ndarray, x: np.ndarray, y: np.ndarray
         width = PLANE_WIDTH_M * (4 if step < PLANE_STEPS // 2 else 1)
         weight = 1 / (1 + np.where(gap > 0, gap / width, gap / MAX_BELOW_PLANE_M) ** 2) ** 2
         weight[open_below & (gap > 0)] = 0.0
+        if not weight.any():  # it is below all that may stand on it
+            break
         ridge = np.diag([1e-9, 20.0, 20.0])
         plane = np.linalg.solve((table * weight[:, None]).T @ table + ridge, (table * weight[:, None]).T @ z)
     slope = np.clip(plane[1:], -MAX_PLANE_SLOPE, MAX_PLANE_SLOPE)
     return np.array([plane[0] - slope @ middle, *slope])
+
+
+def _lay_over(above: np.ndarray, upright: np.ndarray, cut: np.ndarray) -> np.ndarray:
+    """Return how high the floor is (W, D) m over a plane over which the cells' lowest points are `above` (W, D) it.
+
+    Something stands where `upright`; the floor may be lower where `cut`.
+    """
+    above = above.copy()
+    above[np.isnan(above) | (above < -MAX_BELOW_PLANE_M) | (cut & (above > 0))] = np.inf
+    if not np.isfinite(above).any():
+        above[:] = 0.0
+    eroded = _limit_slope(above, CELL_M * np.where(upright, MAX_SLOPE, MAX_RAMP_SLOPE))
+    nearest = distance_transform_edt(eroded < above, return_distances=False, return_indices=True)
+    floor = eroded[tuple(nearest)]
+    # What is higher than a kerb stands on the floor, which is as high there as where it is seen.
+    floor = np.where(above - floor > MAX_KERB_M, floor, eroded)
+    return np.asarray(gaussian_filter(floor, BLUR_CELLS, mode="nearest"))
 
 
 @njit(cache=True, nogil=True)

@@ -56,6 +56,7 @@ class SceneCloud:
         image: its range image where it is organised, whose pixels are those of the points.
         viewpoint: (3,) metres, where the sensor is.
         to_sensor: (3, 3), from this frame to the sensor's own with z up, however the sensor is tilted.
+        sensor_height: metres, of the sensor over the floor where that is known; else the points have to show it.
     """
 
     points: F64
@@ -65,6 +66,7 @@ class SceneCloud:
     image: RangeImage | None = None
     viewpoint: F64 = field(default_factory=lambda: np.zeros(3))
     to_sensor: F64 = field(default_factory=lambda: np.eye(3))
+    sensor_height: float | None = None
 
     @property
     def is_merged(self) -> bool:

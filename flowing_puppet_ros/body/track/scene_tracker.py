@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, I64
+from flowing_puppet_ros.body.cloud.airborne import find_airborne
 from flowing_puppet_ros.body.cloud.coverage import is_single_view
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
@@ -27,6 +28,8 @@ from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget, FoundBody, JudgedFit
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
+from flowing_puppet_ros.body.upright.scan_rays import ScanRays
+from flowing_puppet_ros.body.upright.sensor_height import SensorHeight
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.process.threads import usable_threads
@@ -44,6 +47,11 @@ that the first bodies do not wait for others, which come with the next."""
 SEARCH_EVERY = 3  # scans of a live stream in which somebody is tracked: the others are not searched for new people
 MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
 _UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
+_NO_FLOOR = (
+    "no floor is seen: how high people stand is inferred from their build, so they are not reliable; set"
+    " segmentation.sensor_height, or publish base_footprint on /tf"
+)
+INFERRED_CONFIDENCE = 0.5  # of a body on an inferred floor, relative to one on a floor that is seen
 MAX_REJECTED = 50  # candidates that are told of
 MIN_DECIDING_POINTS = 60
 """Points of a person from which on they tell whether people are seen from one side."""
@@ -84,6 +92,8 @@ class SceneTracker:
         self._planes = PlaneCache()
         self._finder = PersonFinder(fitter, settings.people)
         self._seen_free = SeenFree()
+        self._height = SensorHeight()
+        self._sees_floor = True
         self._searched = np.empty(0, dtype=np.int64)
         self._was_searched = False
         self._since_search = 0
@@ -103,6 +113,7 @@ class SceneTracker:
         self._planes = PlaneCache()
         self._finder.reset()
         self._seen_free.reset()
+        self._height.reset()
         self._was_searched = False
 
     @property
@@ -145,12 +156,13 @@ class SceneTracker:
             if not settings.track:
                 fits = {id(body.person): body.fit for body in found}
                 named = self._tracker.associate_only([body.person for body in found], cloud.stamp)
-                return [TrackedBody(name, self._improve(person, fits[id(person)], seed)) for name, person in named], []
+                improved = [(name, self._improve(person, fits[id(person)], seed)) for name, person in named]
+                return [TrackedBody(name, self._doubt(fit)) for name, fit in improved], []
             first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
             seen = [body.person for body in found]
             judge = partial(self._judge, quick=live)
             bodies = self._tracker.step(seen, cloud.stamp, seed, executor, first, judge)
-            return bodies, self._tracker.occluded_ids
+            return [replace(body, fit=self._doubt(body.fit)) for body in bodies], self._tracker.occluded_ids
         people = self._with_viewpoint(cloud, self._segment(cloud, known, self._planes))
         if settings.track:
             return self._tracker.step(people, cloud.stamp, seed, executor), self._tracker.occluded_ids
@@ -194,7 +206,7 @@ class SceneTracker:
     def fit_found(self, found: Sequence[FoundBody], seed: int, progress: Progress | None = None) -> list[BodyFit]:
         """Return the bodies of people found in a scene, fitted again where that may help, without the doubtful."""
         fits = [(self._improve(body.person, body.fit, seed, progress), body.person.proven) for body in found]
-        return [fit for fit, proven in fits if proven or fit.reliable]
+        return [self._doubt(fit) for fit, proven in fits if proven or fit.reliable]
 
     def is_one_sided_scene(self, cloud: SceneCloud) -> bool:
         """Return whether a cloud shows people from one side, and more than one person alone."""
@@ -211,7 +223,11 @@ class SceneTracker:
             return bool(self._single_view) and self._settings.view != "full"
         points = self._in_range(cloud)[1]
         candidates = (
-            find_candidates(SceneHeights.of(points, cloud.viewpoint), cloud.viewpoint, MIN_DECIDING_POINTS)[0]
+            find_candidates(
+                SceneHeights.of(points, cloud.viewpoint, height=self._find_height(cloud)),
+                cloud.viewpoint,
+                MIN_DECIDING_POINTS,
+            )[0]
             if len(points)
             else []
         )
@@ -224,14 +240,13 @@ class SceneTracker:
         return single
 
     def _in_range(self, cloud: SceneCloud) -> tuple[I64, F64]:
-        """Return the rows of the points that are finite and in range of the sensor, and the points."""
-        near = cloud.distance < self._settings.segmentation.max_range
-        rows = np.flatnonzero(near)
+        """Return the rows of the points that are finite and in range of the sensor, and no drops, and the points."""
+        rows = np.flatnonzero(cloud.distance < self._settings.segmentation.max_range)
         if len(rows) > MAX_SCENE_POINTS:
             rows = rows[np.linspace(0, len(rows) - 1, MAX_SCENE_POINTS).astype(np.int64)]
-        elif len(rows) == len(near):
-            return rows, np.ascontiguousarray(cloud.points, dtype=np.float64)
-        return rows, np.asarray(cloud.points[rows], dtype=np.float64)
+        points = np.asarray(cloud.points[rows], dtype=np.float64)
+        alone = find_airborne(points, cloud.viewpoint)
+        return (rows[~alone], points[~alone]) if alone.any() else (rows, points)
 
     def _find(
         self,
@@ -256,7 +271,7 @@ class SceneTracker:
         come = self._seen_free.add(points, cloud.viewpoint) if remember and not only_known else None
         search = partial(
             self._finder.find,
-            points,
+            self._lay_floor(cloud, points, remember) if len(points) else None,
             normals,
             cloud.viewpoint,
             cloud.stamp,
@@ -277,6 +292,31 @@ class SceneTracker:
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
+
+    def _lay_floor(self, cloud: SceneCloud, points: F64, remember: bool) -> SceneHeights:
+        """Return the heights of the points (N, 3) m, N > 0, in range; where no floor is seen, over the likeliest."""
+        height = self._height if remember else SensorHeight()
+        given = self._find_height(cloud)
+        rays: list[ScanRays] = []
+
+        def rate(scene: SceneHeights) -> float:
+            rays[:] = rays or [ScanRays(points, cloud.viewpoint)]
+            return self._finder.rate_floor(scene, rays[0])
+
+        scene = height.lay_floor(points, cloud.viewpoint, cloud.stamp, given, rate)
+        self._sees_floor = height.is_known
+        return scene
+
+    def _find_height(self, cloud: SceneCloud) -> float | None:
+        """Return the height of a cloud's sensor over the floor, metres, where it is known."""
+        return cloud.sensor_height or self._settings.segmentation.sensor_height or None
+
+    def _doubt(self, fit: BodyFit) -> BodyFit:
+        """Return a body, not reliable where nothing but people's build told how high the floor is."""
+        if self._sees_floor:
+            return fit
+        self._report.warn(_NO_FLOOR)
+        return replace(fit, reliable=False, confidence=INFERRED_CONFIDENCE * fit.confidence)
 
     def _make_budget(self, is_stream: bool, is_live: bool, is_tracked: bool) -> FitBudget:
         """Return how many bodies are fitted in a scan."""

@@ -161,3 +161,25 @@ def pop_nearest(middles: dict[int, np.ndarray], place: np.ndarray) -> int | None
         return None
     del middles[nearest]
     return nearest
+
+
+def make_person(
+    scene: SceneHeights,
+    normals: np.ndarray | None,
+    viewpoint: np.ndarray,
+    stamp: int,
+    rows: np.ndarray,
+    score: float = 1.0,
+    owner: int | None = None,
+) -> PersonCloud:
+    """Return the person in some rows (N,) of a scene, with the normals (M, 3) of its points, if any."""
+    return PersonCloud(
+        scene.points[rows],
+        None if normals is None else normals[rows],
+        stamp,
+        viewpoint,
+        rows,
+        score,
+        owner,
+        scene.floor.locate(*np.median(scene.points[rows, :2], axis=0)),
+    )

@@ -24,6 +24,7 @@ from flowing_puppet_ros.body.upright.found_body import (
     JudgedFit,
     ScanView,
     find_only_reached,
+    make_person,
     pop_nearest,
     take_apart,
 )
@@ -53,6 +54,9 @@ MIN_QUICK_BESIDE = 0.5  # probability of who is found beside a quick body
 BESIDE_M, CONTEXT_M, OWN_M = 1.0, 1.0, 0.10
 """Distance from a person within which others are looked for in what that person leaves, of their surroundings beyond,
 and from a body, up to which points are its own."""
+
+MAX_FLOOR_FITS, MAX_FLOOR_COST_M = 4, 0.1
+"""Bodies by which a floor is rated, and the cost of a body that says nothing for it."""
 
 
 @dataclass(frozen=True)
@@ -109,7 +113,7 @@ class PersonFinder:
     @one_blas_thread()
     def find(
         self,
-        points: np.ndarray,
+        scene: SceneHeights | None,
         normals: np.ndarray | None,
         viewpoint: np.ndarray,
         stamp: int,
@@ -123,7 +127,7 @@ class PersonFinder:
         """Find the people in a scan; the same scans give the same answer.
 
         Args:
-            points: (N, 3) m, z up, within the range in which people are searched for.
+            scene: its N points, z up, within the range in which people are searched for; None without any.
             normals: (N, 3) or None; only passed on.
             viewpoint: (3,) position of the sensor, metres.
             stamp: of the scan in nanoseconds.
@@ -138,9 +142,9 @@ class PersonFinder:
         self.last_rejected = []
         self.left_over = False
         self._view = None
-        if len(points) < self._settings.min_points:
+        if scene is None or len(scene.points) < self._settings.min_points:
             return []
-        scene = SceneHeights.of(points, viewpoint)
+        points = scene.points
         middles = [np.asarray(body)[:, :2].mean(axis=0) if len(body) else np.full(2, np.inf) for body in known]
         if expected:
             known = [body if each.claims else body[:0] for body, each in zip(known, expected, strict=True)]
@@ -148,7 +152,7 @@ class PersonFinder:
         candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known)
         if only_known and len(owned) < sum(len(body) > 0 for body in known):
             candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
-        make = partial(_make_person, points, normals, scene, viewpoint, stamp)
+        make = partial(make_person, scene, normals, viewpoint, stamp)
         people = [
             FoundBody(make(rows, owner=owner), None)
             for owner, rows in owned.items()
@@ -255,6 +259,25 @@ class PersonFinder:
         if budget.quick:  # such a body leaves points of its own person, too
             found = [each for each in found if each[0].probability >= MIN_QUICK_BESIDE]
         return [(judged, replace(candidate, rows=rows[candidate.rows])) for judged, candidate in found]
+
+    @one_blas_thread()
+    def rate_floor(self, scene: SceneHeights, rays: ScanRays) -> float:
+        """Return how well upright people explain what stands on the floor of a scene, seen by `rays`.
+
+        Each person counts by how much they look like one and how close the body is; 0 where nobody stands there.
+        """
+        view = ScanView(scene, rays, 0, False, None)
+        candidates, _ = find_candidates(scene, rays.viewpoint, self._settings.min_points)
+        offered = self._choose(candidates, view)[:MAX_FLOOR_FITS]
+        start = partial(self._start, view=view, quick=True)
+        fits = parallel_map(start, [candidate for candidate, _ in offered], self._threads)
+        proven = [
+            (first.judged, candidate, likely * max(1.0 - first.found.cost / MAX_FLOOR_COST_M, 0.0))
+            for first, (candidate, likely) in zip(fits, offered, strict=True)
+            if first is not None and self._is_proven(first.judged)
+        ]
+        apart = {id(judged) for judged, _ in take_apart([each[:2] for each in proven], [])}
+        return sum(judged.probability * weight for judged, _, weight in proven if id(judged) in apart)
 
     @one_blas_thread()
     def judge(
@@ -371,25 +394,3 @@ class _FirstFit(NamedTuple):
     others: list[tuple[float, BodyState]]
     found: UprightFit
     judged: JudgedFit
-
-
-def _make_person(
-    points: np.ndarray,
-    normals: np.ndarray | None,
-    scene: SceneHeights,
-    viewpoint: np.ndarray,
-    stamp: int,
-    rows: np.ndarray,
-    score: float = 1.0,
-    owner: int | None = None,
-) -> PersonCloud:
-    return PersonCloud(
-        points[rows],
-        None if normals is None else normals[rows],
-        stamp,
-        viewpoint,
-        rows,
-        score,
-        owner,
-        scene.floor.locate(*np.median(points[rows, :2], axis=0)),
-    )

@@ -79,7 +79,8 @@ def fit_view(
             raise PuppetError(
                 f"{source} shows no person among its {len(view.points)} depths; check --unit, --up and --camera-info"
             )
-        frame, fits = found
+        frame, fits = found.frame, found.fits
+        notes += found.notes
     unit = ScanUnit.named("m")
     return [FrameFit(frame, unit, fit, True, True, measure_stature(fitter.model, fit.joints)) for fit in fits], notes
 

@@ -44,9 +44,9 @@ def fit_file(source: Path, options: FitOptions, shown: bool = False) -> dict[str
     if viewed is not None:
         return {"input": str(source), "people": _finish_all(source, *viewed, fitter, options, started)}
     scan = read_scan(source)
-    seen = _find_one_sided(scan, fitter, options) if options.scene else []
+    seen, notes = _find_one_sided(scan, fitter, options) if options.scene else ([], ())
     if seen:
-        return {"input": str(source), "people": _finish_all(source, seen, (), fitter, options, started)}
+        return {"input": str(source), "people": _finish_all(source, seen, notes, fitter, options, started)}
     people = find_people(scan, source, fitter, options)
     if options.joints and len(people) > 1:
         raise InputError(f"{source} shows {len(people)} people and --joints are those of one; cut out one person")
@@ -120,20 +120,20 @@ def _fit_view(source: Path, fitter: BodyFitter, options: FitOptions) -> tuple[li
     return None if view is None else fit_view(view, source, fitter, options)
 
 
-def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> list[FrameFit]:
-    """Return the people of a scene that was seen from the origin; none where it was not, or nobody is found so."""
+def _find_one_sided(scan: Scan, fitter: BodyFitter, options: FitOptions) -> tuple[list[FrameFit], tuple[str, ...]]:
+    """Return the people of a scene that was seen from the origin, and notes; none where it was not, or nobody is."""
     moved = options.viewpoint is not None or (scan.viewpoint is not None and np.any(scan.viewpoint))
     if options.upright == "any" or scan.faces is not None or moved:
-        return []
+        return [], ()
     from flowing_puppet_ros.cli.scans.fit_scene import fit_one_sided_scene  # loaded here: takes 0.1 s
 
     unit = ScanUnit.named("m" if options.unit == "auto" else options.unit)
     ups = list_scene_ups(options)
     found = fit_one_sided_scene(fitter, scan.points, unit.metres, ups, options.view, options.segmentation)
     if found is None:
-        return []
-    frame, fits = found
-    return [FrameFit(frame, unit, fit, True, True, measure_stature(fitter.model, fit.joints)) for fit in fits]
+        return [], ()
+    measured = [(fit, measure_stature(fitter.model, fit.joints)) for fit in found.fits]
+    return [FrameFit(found.frame, unit, fit, True, True, stature) for fit, stature in measured], found.notes
 
 
 def write_result(

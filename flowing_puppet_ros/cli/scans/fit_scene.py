@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,15 @@ from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, rotation_to_z_up
 from flowing_puppet_ros.body.settings import SegmentationSettings
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
+from flowing_puppet_ros.reporting import Report
+
+
+class FittedScene(NamedTuple):
+    """The `fits` in metres with z up, the likeliest person first, their `frame`, and `notes` for the user."""
+
+    frame: ScanFrame
+    fits: list[BodyFit]
+    notes: tuple[str, ...]
 
 
 def fit_one_sided_scene(
@@ -21,7 +31,7 @@ def fit_one_sided_scene(
     ups: Sequence[np.ndarray],
     view: str,
     segmentation: SegmentationSettings,
-) -> tuple[ScanFrame, list[BodyFit]] | None:
+) -> FittedScene | None:
     """Find and fit the people that a sensor at the scan's origin sees.
 
     Args:
@@ -33,19 +43,19 @@ def fit_one_sided_scene(
         segmentation: limits.
 
     Returns:
-        The frame and the bodies in metres with z up, the likeliest first; None where people are seen from all sides or
-        nobody is found.
+        What was fitted; None where people are seen from all sides or nobody is found.
     """
     tried = []
     for up in ups:
         frame = ScanFrame(scale, rotation_to_z_up(up))
-        tracker = SceneTracker(fitter, SceneSettings(view=view, segmentation=segmentation))
+        report = Report()
+        tracker = SceneTracker(fitter, SceneSettings(view=view, segmentation=segmentation), report)
         cloud = SceneCloud(frame.to_body(points), None, 0)
         found = tracker.find_once(cloud) if tracker.is_one_sided_scene(cloud) else []
         if found:
-            tried.append((sum(body.person.score for body in found), frame, tracker, found))
+            tried.append((sum(body.person.score for body in found), frame, tracker, report, found))
     if not tried:
         return None
-    _, frame, tracker, found = max(tried, key=lambda each: each[0])
+    _, frame, tracker, report, found = max(tried, key=lambda each: each[0])
     fits = tracker.fit_found(found, fitter.settings.seed)
-    return (frame, fits) if fits else None
+    return FittedScene(frame, fits, tuple(report.drain_warnings())) if fits else None

@@ -24,6 +24,7 @@ from flowing_puppet_ros.cli.scans.fit_file import make_fitter, write_result
 from flowing_puppet_ros.cli.scans.fit_people import FitOptions, list_scene_ups
 from flowing_puppet_ros.errors import InputError, PuppetError
 from flowing_puppet_ros.image.formats.video_reader import natural_sort_key
+from flowing_puppet_ros.reporting import Report
 
 
 def track_scene(
@@ -54,7 +55,8 @@ def track_scene(
     fitter = make_fitter(options.model, options.settings)
     unit = ScanUnit.named("m" if options.unit == "auto" else options.unit)
     settings = SceneSettings(view=options.view, segmentation=options.segmentation)
-    tracker, frame = SceneTracker(fitter, settings), None
+    told = Report()
+    tracker, frame = SceneTracker(fitter, settings, told), None
     status, seen = 0, 0
     for number, source in enumerate(ordered):
         started = time.perf_counter()
@@ -70,13 +72,13 @@ def track_scene(
         seen += len(bodies)
         view = "single" if tracker.sees_one_side else "full"
         each = (time.perf_counter() - started) / max(1, len(bodies))
-        people = []
+        people, notes = [], told.drain_warnings()
         for body in bodies:
             assert frame is not None
             stature = measure_stature(fitter.model, body.fit.joints)
             found = FrameFit(frame, unit, body.fit, True, True, stature)
             name = f"{source.stem}-{body.id}"
-            people.append({"id": body.id} | write_result(name, fitter.model, found, view, (), each, options))
+            people.append({"id": body.id} | write_result(name, fitter.model, found, view, tuple(notes), each, options))
         report({"input": str(source), "people": people})
     if not seen and not status:
         raise PuppetError(f"there is nobody in the {len(ordered)} scans of {ordered[0].parent}")

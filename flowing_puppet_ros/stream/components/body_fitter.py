@@ -76,6 +76,11 @@ class BodyFitterSettings(SceneSettings):
         "frame of the sensor of clouds that come in another frame (base_link, odom, map); empty: the cloud's",
         advanced=True,
     )
+    floor_frame: str = setting(
+        "base_footprint",
+        "frame whose origin is on the floor (REP-120): it tells how high the sensor is where clouds show no floor",
+        advanced=True,
+    )
     transform_wait: int = setting(
         3, "clouds to wait for late transforms before one is fitted without them", low=0, high=50, advanced=True
     )
@@ -126,7 +131,13 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self._frames = FrameTree()
         self._puppets = PuppetPairs(self._model, settings.fusion, self._frames)
         self._places = SensorPlaces(
-            self._frames, settings.up, settings.fixed_frame, settings.sensor_frame, self.report, settings.view
+            self._frames,
+            settings.up,
+            settings.fixed_frame,
+            settings.sensor_frame,
+            self.report,
+            settings.view,
+            settings.floor_frame,
         )
         self._is_fixed = False
         self._rig = DepthRig(settings.rig, self._places, self.report, factory) if settings.rig.cameras else None
@@ -208,7 +219,9 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         place = found or self._places.find_alone(*where)
         normals = None if normals is None else normals @ place.rotation.T
         image = image and image.turn(place.rotation).move(place.translation)
-        scene = SceneCloud(place.put(points), normals, stamp, of_depth, image, place.viewpoint, place.to_sensor)
+        scene = SceneCloud(
+            place.put(points), normals, stamp, of_depth, image, place.viewpoint, place.to_sensor, place.height
+        )
         return scene, place, found is not None
 
     def _fit_initial(

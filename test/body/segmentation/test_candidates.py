@@ -59,11 +59,66 @@ def test_the_floor_follows_a_ramp_and_not_what_stands_on_it() -> None:
         assert abs(floor.locate(x, 0.0) - np.clip(0.08 * x - 0.16, 0.0, 0.64)) < 0.09
 
 
+def room(rng: np.random.Generator, lowest: float, half: float = 3.0, count: int = 30_000) -> np.ndarray:
+    """The walls of a room with z = 0 on the floor, and a person, by rays every two degrees from `lowest` on up."""
+    along = rng.uniform(-half, half, count)
+    side = rng.integers(0, 4, count)
+    xy = np.where((side < 2)[:, None], np.column_stack([along, half * (2 * side - 1)]), 0.0)
+    xy[side > 1] = np.column_stack([half * (2 * side - 5), along])[side > 1]
+    walls = np.column_stack([xy, rng.uniform(0.0, 3.0, count)])
+    floor = np.column_stack([rng.uniform(-half, half, (2 * count, 2)), np.zeros(2 * count)])
+    points = np.concatenate([floor, walls, figure(2.0, 0.5, 0.0, rng, 4000)])
+    ray = points - SENSOR
+    elevation = np.degrees(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1])))
+    return points[(np.abs((elevation + 90.0) % 2.0 - 1.0) < 0.1) & (elevation > lowest)]
+
+
+def test_a_room_in_which_all_rays_end_above_the_floor_shows_none() -> None:
+    rng = np.random.default_rng(6)
+    seen = room(rng, -16.0)
+    assert seen[:, 2].min() > 0.3
+    floor = FloorGrid.find(seen, SENSOR)
+    assert not floor.is_seen and floor.locate(2.0, 0.5) > 0.3
+    for level in (0.0, 0.1):
+        known = FloorGrid.find(seen, SENSOR, level)
+        assert not known.is_seen
+        assert abs(known.locate(2.0, 0.5) - level) < 0.02 and abs(known.locate(-2.0, -2.0) - level) < 0.02
+
+
+def test_a_floor_that_is_seen_counts_unless_it_is_known_to_be_lower() -> None:
+    seen = room(np.random.default_rng(7), -40.0)
+    for level in (0.0, -0.1, 0.5):
+        floor = FloorGrid.find(seen, SENSOR, level)
+        assert floor.is_seen and abs(floor.locate(2.0, 0.5)) < 0.05
+    up = np.array([0.0, 0.0, 0.7])
+    table = FloorGrid.find(seen + up, SENSOR + up, 0.0)
+    assert not table.is_seen and abs(table.locate(2.0, 0.5)) < 0.05
+
+
+def test_walls_behind_a_table_near_the_sensor_show_no_floor() -> None:
+    """No ray ends below them, but they are not what the lowest rays hit."""
+    rng = np.random.default_rng(8)
+    seen = room(rng, -40.0)
+    ray = seen - SENSOR
+    hidden = ray[:, 2] / np.hypot(ray[:, 0], ray[:, 1]) < -0.3
+    angle, slope = rng.uniform(-np.pi, np.pi, 20_000), np.tan(np.radians(2.0 * rng.integers(-20, -8, 20_000) + 1.0))
+    near = 0.8 * np.column_stack([np.cos(angle), np.sin(angle), slope])
+    table = SENSOR + near[slope < -0.3]
+    floor = FloorGrid.find(np.concatenate([seen[~hidden], table]), SENSOR)
+    assert seen[~hidden][:, 2].min() > 0.2 and not floor.is_seen
+
+
 def test_a_floor_that_was_cut_away_is_where_the_legs_end() -> None:
     rng = np.random.default_rng(1)
     people = [figure(x, y, 0.0, rng) for x, y in ((3, 0), (5, 2), (6, -3), (8, 1))]
     floor = FloorGrid.find(np.concatenate(people))
     assert abs(floor.locate(5, 2)) < 0.15
+
+
+def test_walls_and_people_over_a_floor_that_was_cut_away_show_where_it_was() -> None:
+    seen = room(np.random.default_rng(9), -40.0)
+    floor = FloorGrid.find(seen[seen[:, 2] > 0.1], SENSOR)
+    assert floor.is_seen and abs(floor.locate(2.0, 0.5)) < 0.25
 
 
 def test_the_gap_grows_with_the_distance_and_is_larger_upwards() -> None:

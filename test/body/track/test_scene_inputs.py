@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.segmentation.candidates import SceneHeights
 from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
@@ -65,8 +66,8 @@ def test_millions_of_points_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None
 
     sizes = []
 
-    def find_nobody(_: PersonFinder, points: np.ndarray, *rest: object) -> list[object]:
-        sizes.append(len(points))
+    def find_nobody(_: PersonFinder, scene: SceneHeights, *rest: object) -> list[object]:
+        sizes.append(len(scene.points))
         return []
 
     monkeypatch.setattr(PersonFinder, "find", find_nobody)
