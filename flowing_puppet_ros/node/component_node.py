@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Callable
+from threading import Timer
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
@@ -26,6 +27,8 @@ from flowing_puppet_ros.process.memory import return_start_memory
 from flowing_puppet_ros.stream.component import Component
 from flowing_puppet_ros.stream.components.registry import COMPONENTS, FIXED_SETTINGS, node_settings
 
+SLOW_START_S = 10.0
+_SLOW_START = "still loads models and compiles kernels, which takes minutes at the first start after an installation"
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 _UNUSABLE = (PuppetError, ParameterException, NameValidationException, RuntimeError, ValueError)
 """Errors of components and rclpy for unusable parameters, names and policies."""
@@ -136,8 +139,12 @@ class ComponentNode[C: Component[Any]](LifecycleNode):
         kind: Any = COMPONENTS[self._component]
         component: C = kind(self._settings, RosMessageFactory())
         component.node = self.get_fully_qualified_name()
-        self.get_logger().info("loads models and kernels, which takes minutes at the first start after an installation")
-        component.warm_up()
+        still_starting = Timer(SLOW_START_S, lambda: self.get_logger().info(_SLOW_START))
+        still_starting.start()
+        try:
+            component.warm_up()
+        finally:
+            still_starting.cancel()
         return_start_memory()
         settings = self._node_settings
         self.session = Session(self, component, settings.queue, self._diagnostics, settings.image_transport)

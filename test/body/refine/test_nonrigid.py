@@ -44,7 +44,7 @@ def test_umbrella_takes_the_mean_of_the_neighbours() -> None:
 
 def test_what_the_model_cannot_express_is_followed(model: StitchedPuppet, nonrigid: NonRigidRefinement) -> None:
     start, truth = swollen(model)
-    cloud = cloud_on(truth, model.faces, 8000)
+    cloud = cloud_on(truth, model.faces, 12000)
     refined = nonrigid.run(start, cloud)
     before, after = (np.linalg.norm(vertices - truth, axis=1).mean() for vertices in (start, refined))
     assert before > 0.006
@@ -55,7 +55,7 @@ def test_what_the_model_cannot_express_is_followed(model: StitchedPuppet, nonrig
 def test_holes_follow_their_surroundings(model: StitchedPuppet, nonrigid: NonRigidRefinement) -> None:
     start = model.vertices(model.rest_state())
     truth = start + np.array([0.01, 0.0, 0.01])
-    whole = cloud_on(truth, model.faces, 8000)
+    whole = cloud_on(truth, model.faces, 12000)
     low, high = np.quantile(start[:, 2], [0.35, 0.42])
     kept = (whole.points[:, 2] < low) | (whole.points[:, 2] > high)
     refined = nonrigid.run(start, Cloud.of(whole.points[kept], whole.normals[kept]))
