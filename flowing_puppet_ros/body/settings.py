@@ -65,6 +65,7 @@ class SegmentationSettings(Settings):
         unit="m",
         low=0.0,
         high=20.0,
+        advanced=True,
     )
     plane_clearance: float = setting(
         0.05,
