@@ -79,15 +79,17 @@ class SceneHeights:
         """Find the floor of N > 0 finite points, seen from `viewpoint` (3,) m, `height` m over it if known."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         level = None if viewpoint is None or height is None else float(viewpoint[2]) - height
-        floor = FloorGrid.find(points, viewpoint, level)
-        over = floor.height(points)
-        return cls(points, over, floor, ColumnIndex.of(points), find_walls(points, over))
+        return cls._over(points, FloorGrid.find(points, viewpoint, level), ColumnIndex.of(points))
 
     def lay_below(self, viewpoint: np.ndarray, height: float) -> SceneHeights:
         """Return the same scene over a floor that it does not show, `height` m below the sensor."""
         floor = FloorGrid.find(self.points, viewpoint, float(viewpoint[2]) - height)
-        over = floor.height(self.points)
-        return SceneHeights(self.points, over, floor, self.index, find_walls(self.points, over))
+        return self._over(self.points, floor, self.index)
+
+    @classmethod
+    def _over(cls, points: np.ndarray, floor: FloorGrid, index: ColumnIndex) -> SceneHeights:
+        height = floor.height(points)
+        return cls(points, height, floor, index, find_walls(points, height))
 
     def take(self, rows: np.ndarray) -> SceneHeights:
         """Return the part of the scene whose points are `rows` (K,), K > 0, over the same floor."""

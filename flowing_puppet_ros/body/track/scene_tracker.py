@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -297,11 +297,10 @@ class SceneTracker:
         """Return the heights of the points (N, 3) m, N > 0, in range; where no floor is seen, over the likeliest."""
         height = self._height if remember else SensorHeight()
         given = self._find_height(cloud)
-        rays: list[ScanRays] = []
+        make_rays = cache(lambda: ScanRays(points, cloud.viewpoint))  # few scans need them
 
         def rate(scene: SceneHeights) -> float:
-            rays[:] = rays or [ScanRays(points, cloud.viewpoint)]
-            return self._finder.rate_floor(scene, rays[0])
+            return self._finder.rate_floor(scene, make_rays())
 
         scene = height.lay_floor(points, cloud.viewpoint, cloud.stamp, given, rate)
         self._sees_floor = height.is_known

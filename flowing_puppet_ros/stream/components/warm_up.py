@@ -17,6 +17,7 @@ from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.stream.component import Component
 from flowing_puppet_ros.stream.messages.clouds import make_cloud
+from flowing_puppet_ros.stream.messages.depth import back_project
 from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform
 from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, PUPPETS, TRANSFORMS, MessageFactory
@@ -28,7 +29,7 @@ IMAGE_SIZE = (192, 160)  # px, height and width
 SCALE_PX_PER_M, FOCAL_PX, DISTANCE_M = 80.0, 200.0, 2.5  # scale = focal length / distance
 PERIOD_NS = 100_000_000  # between two images
 FRAMES = 3  # images per camera
-SIDE_BY_SIDE_M = np.array([0.4, 0.0, 0.0])
+SIDE_BY_SIDE_M = np.array([0.4, 0.0, 0.0])  # between people who are found as one piece and taken apart
 WORLD_FRAME = "warm_up"
 
 
@@ -104,10 +105,8 @@ def make_scan_input(factory: MessageFactory, model: StitchedPuppet) -> Messages:
     """Return scans of two people who touch, before a wall, as a LiDAR publishes them: points in no order, z up."""
     vertices = _place_before_camera(model)[0]
     depth = 1e-3 * _draw_depth(np.concatenate([vertices - SIDE_BY_SIDE_M / 2, vertices + SIDE_BY_SIDE_M / 2]))
-    rows, columns = np.indices(IMAGE_SIZE)
-    right = (columns - (IMAGE_SIZE[1] - 1) / 2) / FOCAL_PX * depth
-    down = (rows - (IMAGE_SIZE[0] - 1) / 2) / FOCAL_PX * depth
-    points = np.stack([depth, -right, -down], axis=2).reshape(-1, 3)
+    right, down, forward = back_project(depth.astype(np.float32), _make_camera_info(factory, WORLD_FRAME)).T
+    points = np.stack([forward, -right, -down], axis=1)
     headers = [make_header(factory, number * PERIOD_NS, WORLD_FRAME) for number in range(1, FRAMES + 1)]
     return [("points", make_cloud(factory, header, points)) for header in headers]
 
