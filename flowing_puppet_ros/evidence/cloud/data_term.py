@@ -121,23 +121,8 @@ def fill_nearest(points: np.ndarray, low: np.ndarray, cell: float, shape: np.nda
 
 
 @njit(cache=True, nogil=True)
-def _offer(
-    points: np.ndarray, low: np.ndarray, cell: float, nearest: np.ndarray, distance: np.ndarray,
-    i: int, j: int, k: int, candidate: int,
-) -> None:  # fmt: skip
-    """Store a point in a cell if it is nearer to the cell's centre than the stored one."""
-    x = low[0] + cell * i - points[candidate, 0]
-    y = low[1] + cell * j - points[candidate, 1]
-    z = low[2] + cell * k - points[candidate, 2]
-    squared = x * x + y * y + z * z
-    if squared < distance[i, j, k]:
-        distance[i, j, k] = squared
-        nearest[i, j, k] = candidate
-
-
-@njit(cache=True, nogil=True)
 def _scatter(points: np.ndarray, low: np.ndarray, cell: float, nearest: np.ndarray, distance: np.ndarray) -> None:
-    """Offer every point to its cell and the 26 around it."""
+    """Store every point in its cell and the 26 around it if it is nearer to their centres than the stored one."""
     for p in range(len(points)):
         home = (
             int(np.floor((points[p, 0] - low[0]) / cell + 0.5)),
@@ -147,32 +132,54 @@ def _scatter(points: np.ndarray, low: np.ndarray, cell: float, nearest: np.ndarr
         for i in range(max(home[0] - 1, 0), min(home[0] + 2, nearest.shape[0])):
             for j in range(max(home[1] - 1, 0), min(home[1] + 2, nearest.shape[1])):
                 for k in range(max(home[2] - 1, 0), min(home[2] + 2, nearest.shape[2])):
-                    _offer(points, low, cell, nearest, distance, i, j, k, p)
+                    x = low[0] + cell * i - points[p, 0]
+                    y = low[1] + cell * j - points[p, 1]
+                    z = low[2] + cell * k - points[p, 2]
+                    squared = x * x + y * y + z * z
+                    if squared < distance[i, j, k]:
+                        distance[i, j, k], nearest[i, j, k] = squared, p
+
+
+@njit(cache=True, nogil=True)
+def _list_half(layers: int) -> np.ndarray:
+    """Return the steps (13, 3) to the cells around one that come before it, (4, 3) in a grid of one layer."""
+    steps, count = np.empty((13, 3), np.int64), 0
+    for a in (-1, 0):
+        for b in range(-1, 2 if a else 1):
+            for c in range(-1, 2 if a or b else 0):
+                if layers > 1 or c == 0:
+                    steps[count, 0], steps[count, 1], steps[count, 2] = a, b, c
+                    count += 1
+    return steps[:count]
 
 
 @njit(cache=True, nogil=True)
 def _sweep(points: np.ndarray, low: np.ndarray, cell: float, nearest: np.ndarray, distance: np.ndarray) -> None:
-    """Offer every cell the points of its 26 neighbours, once through the grid and once back.
+    """Give every cell the nearest of the points of the 26 around it, once through the grid and once back.
 
-    The half of the neighbours that a pass has already seen: nine of the layer before and four of the same layer.
+    A pass looks at the half of them that it has already been to.
     """
     nx, ny, nz = nearest.shape
+    steps = _list_half(nz)
     for way in (1, -1):
         for i in range(nx) if way == 1 else range(nx - 1, -1, -1):
             for j in range(ny) if way == 1 else range(ny - 1, -1, -1):
                 for k in range(nz) if way == 1 else range(nz - 1, -1, -1):
-                    for a in (-1, 0):
-                        x = i + way * a
-                        if not 0 <= x < nx:
+                    best, least = nearest[i, j, k], distance[i, j, k]
+                    for s in range(len(steps)):
+                        x, y, z = i + way * steps[s, 0], j + way * steps[s, 1], k + way * steps[s, 2]
+                        if not (0 <= x < nx and 0 <= y < ny and 0 <= z < nz):
                             continue
-                        for b in range(-1, 2 if a else 1):
-                            y = j + way * b
-                            if not 0 <= y < ny:
-                                continue
-                            for c in range(-1, 2 if a or b else 0):
-                                z = k + way * c
-                                if 0 <= z < nz and nearest[x, y, z] >= 0 and nearest[x, y, z] != nearest[i, j, k]:
-                                    _offer(points, low, cell, nearest, distance, i, j, k, nearest[x, y, z])
+                        found = nearest[x, y, z]
+                        if found < 0 or found == best:
+                            continue
+                        dx = low[0] + cell * i - points[found, 0]
+                        dy = low[1] + cell * j - points[found, 1]
+                        dz = low[2] + cell * k - points[found, 2]
+                        squared = dx * dx + dy * dy + dz * dz
+                        if squared < least:
+                            best, least = found, squared
+                    nearest[i, j, k], distance[i, j, k] = best, least
 
 
 @njit(cache=True, inline="always")
