@@ -22,7 +22,6 @@ from flowing_puppet_ros.fusion.limb_depths import (
     TRUNK_REACH_M,
     DepthChoices,
     choose_depths,
-    expect_depth,
     list_choices,
     measure_seen_share,
 )
@@ -108,8 +107,9 @@ def lift_joints(
         usable: (N,) which points may be the person's.
         expected: (J, 3) metres, where the joints should be, None for a person who is new.
     """
-    offsets = np.array([BEHIND_SURFACE_M.get(_kind(name), 0.0) for name in model.joint_names])
-    rays, axis = cloud.camera.cast_rays(puppet.pixels), cloud.camera.rotation[2]
+    kinds = [_kind(name) for name in model.joint_names]
+    offsets = np.array([BEHIND_SURFACE_M.get(kind, 0.0) for kind in kinds])
+    rays, axis, centre = cloud.camera.cast_rays(puppet.pixels), cloud.camera.rotation[2], cloud.camera.centre
     samples, beyond = _collect_samples(puppet, cloud, usable, np.flatnonzero(puppet.known))
     outside = _find_outside(puppet, cloud)
     trunk = trunk_rows(model)
@@ -122,34 +122,31 @@ def lift_joints(
         missed = missed[puppet.confidence[missed] >= HALF_SEEN_CONFIDENCE]
         samples.update(_collect_samples(puppet, cloud, usable, missed, MISSED_FACTOR)[0])
     points = np.full((len(offsets), 3), np.nan)
-    hidden = puppet.hidden.copy()
+    hidden, seen_share = puppet.hidden.copy(), measure_seen_share(puppet.confidence, puppet.hidden)
     choices: dict[int, DepthChoices] = {}
     for joint, values in samples.items():
         near_trunk = joint in trunk
         near = values[np.abs(values - depth) < (MAX_TRUNK_DEPTH_M if near_trunk else MAX_LIMB_DEPTH_M)]
         near = near[:0] if blank[joint] else near
-        chosen = _kind(model.joint_names[joint]) in CHOSEN
+        chosen = kinds[joint] in CHOSEN
         if len(near) < MIN_POINTS and not (
             chosen and _may_be_there(values, beyond[joint], bool(outside[joint] | blank[joint]), depth)
         ):
             continue
         if not chosen:
-            along = np.median(near) / (rays[joint] @ axis) + offsets[joint]
-            points[joint] = cloud.camera.centre + rays[joint] * along
+            along = _find_median(near) / (rays[joint] @ axis) + offsets[joint]
+            points[joint] = centre + rays[joint] * along
             continue
         choices[joint] = list_choices(
-            rays[joint], axis, cloud.camera.centre, _find_surfaces(near), offsets[joint], depth,
-            TRUNK_REACH_M if near_trunk else LIMB_REACH_M,
-            measure_seen_share(puppet.confidence[joint], bool(puppet.hidden[joint])),
+            rays[joint], axis, centre, _find_surfaces(near), offsets[joint], depth,
+            TRUNK_REACH_M if near_trunk else LIMB_REACH_M, seen_share[joint], should[joint],
         )  # fmt: skip
-        if np.isfinite(should[joint]):
-            choices[joint] = expect_depth(choices[joint], float(should[joint]))
     for joint, choice in choose_depths(model, choices).items():
         points[joint] = choices[joint].points[choice]
         hidden[joint] |= not (choices[joint].seen[choice] or blank[joint])
     found = np.isfinite(points).all(axis=1)
     confidence = np.where(found, puppet.confidence, 0.0)
-    return LiftedJoints(points, rays, confidence, hidden, blank, depth, cloud.camera.centre, choices)
+    return LiftedJoints(points, rays, confidence, hidden, blank, depth, centre, choices)
 
 
 def find_lifted_onto_others(people: Sequence[LiftedJoints], axis: F64) -> list[Bools]:
@@ -311,12 +308,14 @@ def _find_around(joints, pixels, depth, focal):  # type: ignore[no-untyped-def]
     found_joint, found_row, count = np.empty(1024, np.int64), np.empty(1024, np.int64), 0
     low_x, high_x = joints[:, 0].min(), joints[:, 0].max()
     low_y, high_y = joints[:, 1].min(), joints[:, 1].max()
+    reach = RADIUS_M * focal
     for row in range(len(pixels)):
-        x, y = pixels[row, 0], pixels[row, 1]
-        radius = max(MIN_RADIUS_PX, RADIUS_M * focal / max(depth[row], 1e-3))
+        x, y, far = pixels[row, 0], pixels[row, 1], max(depth[row], 1e-3)
+        aside = max(max(low_x - x, x - high_x), max(low_y - y, y - high_y))
         # Not so for points that are not seen, whose pixels are NaN.
-        if not (low_x - radius < x < high_x + radius and low_y - radius < y < high_y + radius):
+        if not (aside < MIN_RADIUS_PX or aside * far < reach):
             continue
+        radius = max(MIN_RADIUS_PX, reach / far)
         for k in range(len(joints)):
             if abs(x - joints[k, 0]) < radius and abs(y - joints[k, 1]) < radius:
                 if count == len(found_row):
@@ -366,9 +365,15 @@ def _find_trunk_depth(
         near = {joint: values[np.abs(values - middle) < MAX_TRUNK_DEPTH_M] for joint, values in known.items()}
         known = {joint: values for joint, values in near.items() if len(values) >= MIN_POINTS} or known
         if known:
-            depth = np.array([np.median(values) for values in known.values()])
+            depth = np.array([_find_median(values) for values in known.values()])
             return _find_weighted_median(depth, puppet.confidence[list(known)] ** 2)
     return float("nan")
+
+
+@njit(cache=True, nogil=True)
+def _find_median(values: F64) -> float:
+    """Return the median of values (N,), in a tenth of NumPy's time for as few."""
+    return float(np.median(values))
 
 
 def _find_weighted_median(values: F64, weight: F64) -> float:

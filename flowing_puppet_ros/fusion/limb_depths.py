@@ -11,7 +11,7 @@ sizes.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -72,8 +72,9 @@ class DepthChoices:
 
 
 def list_choices(
-    ray: F64, axis: F64, centre: F64, surfaces: F64, offset: float, middle: float, reach: float, seen_share: float
-) -> DepthChoices:
+    ray: F64, axis: F64, centre: F64, surfaces: F64, offset: float, middle: float, reach: float, seen_share: float,
+    expected: float = float("nan"),
+) -> DepthChoices:  # fmt: skip
     """List the depths of a joint.
 
     Args:
@@ -86,37 +87,44 @@ def list_choices(
         middle: depth of the trunk, metres.
         reach: of the grid around it, metres.
         seen_share: probability that the joint is seen.
+        expected: depth of the joint, metres, where the clouds before let it be expected, else NaN: a pixel beside a
+            thin limb shows what is behind it.
     """
-    slope = float(ray @ axis)
-    steps = int(reach / GRID_M)
-    grid = middle + GRID_M * np.arange(-steps, steps + 1)
-    on_surface = surfaces + offset * slope
-    depth = np.concatenate([on_surface, grid])
-    rank = np.arange(len(surfaces))
-    behind = grid > on_surface.min() + GRID_M / 2 if len(surfaces) else np.ones(len(grid), dtype=bool)
-    seen_cost = -np.log(seen_share) + np.log(2.0) * rank
-    grid_cost = np.where(behind, -np.log(1 - seen_share), -np.log(MISSED))
-    return DepthChoices(
-        centre + ray * (depth / slope)[:, None],
-        depth,
-        np.concatenate([seen_cost, grid_cost]),
-        np.arange(len(depth)) < len(surfaces),
-    )
+    return DepthChoices(*_list_choices(ray, axis, centre, surfaces, offset, middle, reach, seen_share, expected))
 
 
-def measure_seen_share(confidence: float, hidden: bool) -> float:
-    """Return the probability that a joint of a confidence (0 to 1) is seen; `hidden` by the puppet's own parts."""
+@njit(cache=True, nogil=True)
+def _list_choices(ray, axis, centre, surfaces, offset, middle, reach, seen_share, expected):  # type: ignore[no-untyped-def]
+    slope = ray[0] * axis[0] + ray[1] * axis[1] + ray[2] * axis[2]
+    steps, count = int(reach / GRID_M), len(surfaces)
+    depth, cost = np.empty(count + 2 * steps + 1), np.empty(count + 2 * steps + 1)
+    nearest = np.inf
+    for k in range(count):
+        depth[k] = surfaces[k] + offset * slope
+        cost[k] = np.log(2.0) * k - np.log(seen_share)
+        nearest = min(nearest, depth[k])
+    for step in range(2 * steps + 1):
+        depth[count + step] = middle + GRID_M * (step - steps)
+        in_front = count > 0 and depth[count + step] <= nearest + GRID_M / 2
+        cost[count + step] = -np.log(MISSED if in_front else 1 - seen_share)
+    points = np.empty((len(depth), 3))
+    for k in range(len(depth)):
+        for i in range(3):
+            points[k, i] = centre[i] + ray[i] * (depth[k] / slope)
+        if np.isfinite(expected):
+            cost[k] += min(0.5 * ((depth[k] - expected) / EXPECTED_DEVIATION_M) ** 2, MAX_EXPECTED_COST)
+    return points, depth, cost, np.arange(len(depth)) < count
+
+
+def measure_seen_share(confidence: F64, hidden: Bools | None = None) -> F64:
+    """Return the probabilities (J,) that joints are seen, by their confidence (J,) 0 to 1.
+
+    `hidden` (J,) are those that the puppet's own parts hide, if that counts.
+    """
     share = 1 / (1 + np.exp(-(confidence - HALF_SEEN_CONFIDENCE) / CONFIDENCE_WIDTH))
-    return float(np.clip(share * (OWN_HIDDEN_FACTOR if hidden else 1.0), *SEEN_RANGE))
-
-
-def expect_depth(choices: DepthChoices, expected: float) -> DepthChoices:
-    """Return the choices of a joint that should be at an `expected` depth, metres, as it was in the clouds before.
-
-    A pixel beside a thin limb shows what is behind it.
-    """
-    gap = (choices.depth - expected) / EXPECTED_DEVIATION_M
-    return replace(choices, cost=choices.cost + np.minimum(0.5 * gap**2, MAX_EXPECTED_COST))
+    if hidden is not None:
+        share = np.where(hidden, OWN_HIDDEN_FACTOR * share, share)
+    return np.asarray(np.clip(share, *SEEN_RANGE))
 
 
 def choose_depths(model: StitchedPuppet, choices: Mapping[int, DepthChoices]) -> dict[int, int]:

@@ -253,15 +253,9 @@ class LimbSearcher:
 
 def _find_doubtful(joints: LiftedJoints) -> Bools:
     """Return which joints (J,) may well be elsewhere on their rays."""
-    return np.array([_is_doubtful(row, joints) for row in range(len(joints.points))])
-
-
-def _is_doubtful(row: int, joints: LiftedJoints) -> bool:
-    """Return whether a joint may well be elsewhere on its ray."""
-    choices = joints.choices.get(row)
-    several = choices is not None and np.count_nonzero(choices.seen) > 1
-    sure = measure_seen_share(joints.confidence[row], False) >= MIN_SEEN_SHARE
-    return bool(joints.guessed[row] or several or not sure)
+    doubtful = joints.guessed | (measure_seen_share(joints.confidence) < MIN_SEEN_SHARE)
+    doubtful[[row for row, choices in joints.choices.items() if np.count_nonzero(choices.seen) > 1]] = True
+    return np.asarray(doubtful)
 
 
 def find_on_surface(joints: LiftedJoints) -> Bools:
@@ -278,6 +272,7 @@ def _can_count(joints: LiftedJoints) -> Bools:
 def measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F64:
     """Return what the `counted` (J,) joints of bodies, at `places` (P, J, 3) m, cost each of them (P,), metres."""
     cost = np.zeros(len(places))
+    seen_share = measure_seen_share(joints.confidence)
     for row in np.flatnonzero(counted):
         ray, confidence = joints.rays[row], joints.confidence[row]
         gap = places[:, row] - joints.points[row]
@@ -287,7 +282,7 @@ def measure_joint_cost(places: F64, joints: LiftedJoints, counted: Bools) -> F64
         if choices is not None and choices.seen.any():
             surfaces = (choices.points[choices.seen] - joints.points[row]) @ ray
             off_surface = np.abs(along[:, None] - surfaces).min(axis=1)
-            cost += ALONG_SHARE * measure_seen_share(confidence, False) * _saturate(off_surface)
+            cost += ALONG_SHARE * seen_share[row] * _saturate(off_surface)
         if joints.hidden[row]:
             cost += HIDDEN_ALONG_SHARE * _saturate(along, SLOPE_M)
     return JOINT_COST_M * cost
