@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.draw.mesh_render import render

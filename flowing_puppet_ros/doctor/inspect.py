@@ -7,8 +7,8 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from flowing_puppet_ros.bag.graph import Instance
 from flowing_puppet_ros.bag.reader import open_bag
+from flowing_puppet_ros.bag.replay.graph import Instance
 from flowing_puppet_ros.doctor.files import inspect_file
 from flowing_puppet_ros.doctor.finding import Inspection
 from flowing_puppet_ros.doctor.recognise import Kind, make_command, recognise

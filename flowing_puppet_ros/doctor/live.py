@@ -7,8 +7,8 @@ from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from flowing_puppet_ros.bag.graph import Graph, Instance
 from flowing_puppet_ros.bag.reader import Record, Topic
+from flowing_puppet_ros.bag.replay.graph import Graph, Instance
 from flowing_puppet_ros.doctor.finding import Inspection
 from flowing_puppet_ros.doctor.recording import SENSOR_TYPES, inspect_recording
 

@@ -7,10 +7,10 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any, Protocol
 
-from flowing_puppet_ros.bag.graph import Graph, Instance
 from flowing_puppet_ros.bag.reader import RecordingLike
-from flowing_puppet_ros.bag.replay import plan_replay
-from flowing_puppet_ros.bag.unused import explain_unused
+from flowing_puppet_ros.bag.replay.graph import Graph, Instance
+from flowing_puppet_ros.bag.replay.replay import plan_replay
+from flowing_puppet_ros.bag.replay.unused import explain_unused
 from flowing_puppet_ros.doctor.finding import Inspection
 from flowing_puppet_ros.doctor.topic_samples import TopicSample, compare_clocks, describe_faults, sample_topics
 from flowing_puppet_ros.errors import InputError

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.bag.reader import Bag, open_bag
-from flowing_puppet_ros.bag.replay import METADATA_NAME
+from flowing_puppet_ros.bag.replay.replay import METADATA_NAME
 from flowing_puppet_ros.draw.pictures import shrink
 from flowing_puppet_ros.draw.plots import Series
 from flowing_puppet_ros.errors import InputError

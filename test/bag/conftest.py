@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 
 GOLDEN = Path(__file__).resolve().parents[2] / "bags" / "golden"
 SETTINGS = {"visual_hull": {"hull_every": 4}}

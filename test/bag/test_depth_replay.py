@@ -10,9 +10,9 @@ import pytest
 from capsule_man import cloud_of, joints_of  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.bag.depth_topics import ImageSample
-from flowing_puppet_ros.bag.graph import build_graph
 from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay.build import build_graph
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.bag.depth_topics import ImageSample
-from flowing_puppet_ros.bag.graph import Graph, build_graph
+from flowing_puppet_ros.bag.replay.build import build_graph
+from flowing_puppet_ros.bag.replay.graph import Graph
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, make_camera_info, make_header, make_transform
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, IMAGE, TRANSFORMS

@@ -19,7 +19,7 @@ from rosbags.rosbag2 import Writer as OtherWriter
 from ruamel.yaml import YAML
 
 from flowing_puppet_ros.bag.reader import Record, open_bag
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.bag.frames import open_bag_frames
-from flowing_puppet_ros.bag.graph import build_graph
 from flowing_puppet_ros.bag.reader import Record, open_bag
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay.build import build_graph
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 
 from flowing_puppet_ros.bag.reader import Record, open_bag
-from flowing_puppet_ros.bag.replay import replay
+from flowing_puppet_ros.bag.replay.replay import replay
 from flowing_puppet_ros.ids import make_public_id
 from flowing_puppet_ros.model.tree import mirrored_name
 from flowing_puppet_ros.multiview.camera import Camera

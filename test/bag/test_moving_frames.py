@@ -10,7 +10,7 @@ from watched_people import stand_at  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.bag.foreign.static_frames import is_of_people
 from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, IMAGE, TRANSFORMS

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.bag import replay as replay_module
 from flowing_puppet_ros.bag.reader import Record, open_bag
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay import replay as replay_module
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.cli import main

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.stream.messages.clouds import make_cloud

@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import replays
 from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.bag.replay import ReplayOptions
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions
 from flowing_puppet_ros.errors import PuppetError
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns
 

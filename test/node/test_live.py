@@ -13,7 +13,7 @@ import pytest
 from rclpy.qos import QoSProfile
 
 from flowing_puppet_ros.bag.reader import open_bag
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.typestore import typestore
 from flowing_puppet_ros.node.factory import message_type
 from flowing_puppet_ros.stream.messages.geometry import stamp_ns

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.bag.replay import METADATA_NAME
+from flowing_puppet_ros.bag.replay.replay import METADATA_NAME
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.evaluate.joints import LIMB_JOINTS

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.bag.replay import METADATA_NAME
+from flowing_puppet_ros.bag.replay.replay import METADATA_NAME
 from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.report.data import gather_data

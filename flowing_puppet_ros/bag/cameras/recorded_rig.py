@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.bag.frames import open_bag_frames
-from flowing_puppet_ros.bag.graph import MIN_CAMERAS, find_cameras, find_info_topics
 from flowing_puppet_ros.bag.reader import Bag, open_bag
+from flowing_puppet_ros.bag.replay.cameras import MIN_CAMERAS, find_cameras, find_info_topics
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.image.networks.keypoint_networks import KeypointSource
 from flowing_puppet_ros.image.video.clip import Clip, Progress, track_clip

@@ -14,7 +14,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from flowing_puppet_ros.bag.replay import ReplayOptions, replay
+from flowing_puppet_ros.bag.replay.replay import ReplayOptions, replay
 from flowing_puppet_ros.bag.storage.paths import is_bag
 from flowing_puppet_ros.cli.batch import runner
 from flowing_puppet_ros.errors import InputError, PuppetError

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from flowing_puppet_ros.bag.graph import IMAGE_NAMES, Graph, Instance
 from flowing_puppet_ros.bag.reader import Topic
+from flowing_puppet_ros.bag.replay.cameras import IMAGE_NAMES
+from flowing_puppet_ros.bag.replay.graph import Graph, Instance
 from flowing_puppet_ros.stream.component import base_topic
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, PUPPETS, TRANSFORMS
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from graphlib import TopologicalSorter
 from typing import Any
 
-from flowing_puppet_ros.bag.graph import Graph, Instance
+from flowing_puppet_ros.bag.replay.graph import Graph, Instance
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.stream.component import Output
 from flowing_puppet_ros.stream.messages.images import compress_image

@@ -7,10 +7,8 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -18,37 +16,34 @@ from tqdm import tqdm
 
 from flowing_puppet_ros import __version__
 from flowing_puppet_ros.bag.depth_topics import read_samples
-from flowing_puppet_ros.bag.foreign.static_frames import find_static_transforms, is_of_people
-from flowing_puppet_ros.bag.graph import MIN_CAMERAS, Graph, Instance, build_graph, find_info_topics
-from flowing_puppet_ros.bag.graph_run import Call, GraphRun, Step
-from flowing_puppet_ros.bag.reader import Record, RecordingLike, open_bag, rename_topics
-from flowing_puppet_ros.bag.typestore import BagMessageFactory, typestore
-from flowing_puppet_ros.bag.unused import count_used, explain_unused
+from flowing_puppet_ros.bag.foreign.static_frames import is_of_people
+from flowing_puppet_ros.bag.reader import Record, RecordingLike, open_bag
+from flowing_puppet_ros.bag.replay.build import build_graph
+from flowing_puppet_ros.bag.replay.graph import Graph, Instance
+from flowing_puppet_ros.bag.replay.preview import STATIC_TRANSFORMS, RecordingPreview
+from flowing_puppet_ros.bag.replay.run import Call, GraphRun, Step
+from flowing_puppet_ros.bag.replay.unused import count_used, explain_unused
+from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.bag.writer import BagWriter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.process.threads import MAX_THREADS, one_blas_thread, one_opencv_thread, usable_threads
 from flowing_puppet_ros.stream.component import COMPRESSED
 from flowing_puppet_ros.stream.components.registry import COMPONENTS
 from flowing_puppet_ros.stream.messages.detections import name_body
-from flowing_puppet_ros.stream.messages.geometry import FrameTree
 from flowing_puppet_ros.stream.messages.images import SharedImages
 from flowing_puppet_ros.stream.messages.message_types import (
     CAMERA_INFO,
     COMPRESSED_IMAGE,
-    POINT_CLOUD,
     PUPPETS,
     TRANSFORMS,
 )
 from flowing_puppet_ros.stream.pairing.stuck_stamps import StuckStamps
 from flowing_puppet_ros.stream.pipeline import Pipeline
 
-STATIC_TRANSFORMS = "/tf_static"
 METADATA_NAME = "flowing_puppet_ros"
 """Name of the output bag's metadata whose "replay" is JSON of the version, settings and counters of the replay."""
 MAX_STEPS_PER_TOPIC = 4
 """Messages of the recording that are worked on or wait for it at a time, per topic: the bound of a replay's memory."""
-MAX_FIRST_TRANSFORMS = 2000
-"""Messages of a recording from whose transforms it is decided which sensors belong together."""
 _COPIED_TYPES = (CAMERA_INFO, PUPPETS, TRANSFORMS)
 """Types of input topics that are copied to the output bag, so that a viewer needs no other bag."""
 
@@ -124,31 +119,22 @@ class _Replay:
     def __init__(self, bag: RecordingLike, options: ReplayOptions) -> None:
         self._bag = bag
         self._options = options
-        self._new_name = rename_topics(bag.topics, options.topic_map)
         self._factory = BagMessageFactory()
-        self.warnings: list[str] = list(bag.notes)
+        preview = RecordingPreview(bag, options.topic_map, self._factory)
+        self._new_name, self._static = preview.new_name, preview.static
+        self.warnings: list[str] = [*bag.notes, *preview.warnings]
         self._stuck = StuckStamps()
         self._writing_seconds = 0.0
-        topics = {self._new_name[name]: kind for name, kind in bag.topics.items()}
-        unknown = sorted(set(options.topic_map) - set(bag.topics))
-        if unknown:
-            raise InputError(f"--topic-map names {unknown[0]}, but the topics are {', '.join(sorted(bag.topics))}")
-        if len(topics) < len(bag.topics):
-            new = next(name for name in topics if list(self._new_name.values()).count(name) > 1)
-            raise InputError(f"--topic-map gives two topics the name {new}: choose another name")
-        self._static = self._read_static_transforms(topics)
-        infos = self._read_first_infos(topics)
-        self._static += self._find_fixed_frames(topics, infos)
         samples = {self._new_name[name]: sample for name, sample in read_samples(bag).items()}
         self._graph = build_graph(
-            topics,
+            preview.topics,
             samples,
-            self._build_frame_tree(),
-            infos,
+            preview.build_frame_tree(),
+            preview.infos,
             self._collect_settings(),
             self._factory,
-            self._read_cloud_frames(topics),
-            self._connect_frames(topics),
+            preview.read_cloud_frames(),
+            preview.connect_frames(),
         )
         self.warnings += self._graph.notes
         self._recorded = {self._new_name[name]: detail for name, detail in bag.details.items()}
@@ -175,87 +161,6 @@ class _Replay:
         for name, seed in (("puppet_tracker", "tracker.seed"), ("body_fitter", "fitter.seed")):
             chosen[name] = {seed: self._options.seed} | chosen[name]
         return chosen
-
-    def _find_recorded_topics(self, kinds: Mapping[str, str], wanted: Callable[[str], bool]) -> list[str]:
-        return [old for old, new in self._new_name.items() if new in kinds and wanted(new)]
-
-    def _read_static_transforms(self, topics: Mapping[str, str]) -> list[Record]:
-        """Return all static transforms of the bag; in a split or cut recording they may come late."""
-        names = self._find_recorded_topics(
-            topics, lambda name: name == STATIC_TRANSFORMS and topics[name] == TRANSFORMS
-        )
-        return list(self._bag.messages(names)) if names else []
-
-    def _find_fixed_frames(self, topics: Mapping[str, str], infos: Mapping[str, Any]) -> list[Record]:
-        """Return the transforms that never change of cameras whose frames /tf_static does not connect, as its message.
-
-        Only several cameras need them, so the other recordings are not searched.
-        """
-        frames = self._build_frame_tree()
-        cameras = {info.header.frame_id.lstrip("/") for info in infos.values()}
-        with suppress(InputError):
-            if len(cameras) < MIN_CAMERAS or all(frames.find_root(frame) != frame for frame in cameras):
-                return []
-        names = self._find_recorded_topics(
-            topics, lambda name: name != STATIC_TRANSFORMS and topics[name] == TRANSFORMS
-        )
-        fixed = [
-            item
-            for item in find_static_transforms(self._read_usable(names))
-            if frames.find_root(child := item.child_frame_id.lstrip("/")) == child
-        ]
-        if not fixed:
-            return []
-        children = ", ".join(item.child_frame_id for item in fixed)
-        self.warnings.append(f"the frames {children} on {', '.join(names)} never move: they are used as static")
-        raw = typestore().serialize_cdr(self._factory.make(TRANSFORMS, transforms=fixed), TRANSFORMS)
-        self._new_name[STATIC_TRANSFORMS] = STATIC_TRANSFORMS
-        time_of_first = self._static[0].log_time if self._static else next(iter(self._bag.messages())).log_time
-        return [Record(STATIC_TRANSFORMS, TRANSFORMS, time_of_first, bytes(raw))]
-
-    def _read_usable(self, names: list[str]) -> Iterator[Any]:
-        for record in self._bag.messages(names) if names else ():
-            with suppress(InputError):
-                yield record.message
-
-    def _build_frame_tree(self) -> FrameTree:
-        """Return the frames of the static transforms; the replay itself warns of unusable ones."""
-        frames = FrameTree()
-        for record in self._static:
-            with suppress(InputError):
-                frames.add(record.message)
-        return frames
-
-    def _connect_frames(self, topics: Mapping[str, str]) -> FrameTree:
-        """Return the frames of the static transforms, and those of the first ones that move."""
-        frames = self._build_frame_tree()
-        names = self._find_recorded_topics(topics, lambda name: topics[name] == TRANSFORMS)
-        for message in islice(self._read_usable(names), MAX_FIRST_TRANSFORMS):
-            with suppress(InputError):
-                frames.add(message, moving=True)
-        return frames
-
-    def _read_first_infos(self, topics: Mapping[str, str]) -> dict[str, Any]:
-        """Return the first readable message of every camera_info topic."""
-        names = self._find_recorded_topics(topics, set(find_info_topics(topics)).__contains__)
-        found: dict[str, Any] = {}
-        for record in self._bag.messages(names) if names else ():
-            if record.topic not in found:
-                with suppress(InputError):
-                    found[record.topic] = record.message
-            if len(found) == len(names):
-                break
-        return {self._new_name[old]: info for old, info in found.items()}
-
-    def _read_cloud_frames(self, topics: Mapping[str, str]) -> dict[str, str]:
-        """Return cloud topic -> the frame of its first readable cloud."""
-        found: dict[str, str] = {}
-        for name in self._find_recorded_topics(topics, lambda name: topics[name] == POINT_CLOUD):
-            for record in self._bag.messages([name]):
-                with suppress(InputError):
-                    found[self._new_name[name]] = record.message.header.frame_id
-                break
-        return found
 
     def write_to(self, writer: BagWriter) -> None:
         """Pass every message through the graph and write the results."""

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The components that a recording can feed, found from its topics, and how their topics connect."""
+"""Which components a recording can feed, by its topics: trackers, a visual hull, body fitters."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
-from flowing_puppet_ros.bag.colour_topics import ColourTopics, choose_colour, find_colour_topics
 from flowing_puppet_ros.bag.depth_topics import (
     DepthTopic,
     ImageSample,
@@ -16,99 +14,34 @@ from flowing_puppet_ros.bag.depth_topics import (
     holds_depth,
     select_depth_topics,
 )
+from flowing_puppet_ros.bag.replay.cameras import (
+    IMAGE_NAMES,
+    MIN_CAMERAS,
+    CameraTopics,
+    find_cameras,
+    select_calibrated,
+)
+from flowing_puppet_ros.bag.replay.colour_topics import ColourTopics, choose_colour, find_colour_topics
+from flowing_puppet_ros.bag.replay.graph import Graph, Instance, find_skeletons
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.multiview.camera import Camera
 from flowing_puppet_ros.settings import Settings
-from flowing_puppet_ros.stream.component import COMPRESSED_DEPTH, Component, Port, base_topic
+from flowing_puppet_ros.stream.component import COMPRESSED_DEPTH, base_topic
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.components.visual_hull import VisualHullComponent, VisualHullSettings
-from flowing_puppet_ros.stream.messages.detections import UNDERSTOOD, find_body_id
+from flowing_puppet_ros.stream.messages.detections import UNDERSTOOD
 from flowing_puppet_ros.stream.messages.geometry import FrameTree
 from flowing_puppet_ros.stream.messages.message_types import (
     BODIES,
-    CAMERA_INFO,
     COMPRESSED_IMAGE,
     IDS_LIST,
     IMAGE,
     POINT_CLOUD,
     PUPPETS,
-    SKELETON_2D,
     MessageFactory,
 )
 
-IMAGE_NAMES = ("image", "image_raw", "image_color", "image_rect", "image_rect_color")
-"""Last names of the image topics of cameras, in order of preference."""
 _DETECTIONS = next(port for port in PuppetTrackerComponent.inputs if port.name == "detections")
-MIN_CAMERAS = 2
-"""Minimum calibrated cameras for a visual hull and the fit to its silhouettes."""
-
-
-@dataclass(slots=True, eq=False)
-class Instance:
-    """A component in the graph: the namespace of its relative topics, and port -> topic for remapped ports.
-
-    An input that is remapped to "" gets nothing.
-    """
-
-    name: str
-    component: Component[Any]
-    namespace: str
-    remapped: dict[str, str] = field(default_factory=dict)
-    seconds: float = 0.0
-
-    def resolve(self, port: str) -> str:
-        """Return the absolute topic of a port."""
-        if port in self.remapped:
-            return self.remapped[port]
-        return port if port.startswith("/") else f"{self.namespace}/{port}"
-
-
-@dataclass(slots=True, eq=False)
-class Graph:
-    """The components for a recording, in the order in which messages reach them; `notes` say what is missing."""
-
-    instances: list[Instance]
-    notes: list[str] = field(default_factory=list)
-
-    def find_routes(self, recorded: Mapping[str, str]) -> dict[str, list[tuple[Instance, str]]]:
-        """Return topic -> (instance, input port) it feeds; `recorded` is topic -> type of the recording.
-
-        An image's compressed topic feeds the same input, unless the raw image was recorded too, and so do the skeletons
-        of the bodies in a list. A recorded topic of another type than the input's feeds nothing.
-        """
-        found: dict[str, list[tuple[Instance, str]]] = {}
-        for instance in self.instances:
-            for port in instance.component.inputs:
-                topic = instance.resolve(port.name)
-                if not topic:
-                    continue
-                kind = recorded.get(topic, port.type)
-                if port.accepts(kind) or (port.transport and kind == COMPRESSED_IMAGE):
-                    found.setdefault(topic, []).append((instance, port.name))
-                if port.accepts(kind) and kind == IDS_LIST:
-                    for skeleton in _find_skeletons(topic, recorded):
-                        found.setdefault(skeleton, []).append((instance, port.name))
-                if port.transport and topic not in recorded:
-                    found.setdefault(f"{topic}/{port.transport}", []).append((instance, port.name))
-        return found
-
-    def find_outputs(self) -> dict[str, Port]:
-        """Return topic -> the output port that publishes it."""
-        return {instance.resolve(port.name): port for instance in self.instances for port in instance.component.outputs}
-
-
-@dataclass(frozen=True, slots=True)
-class CameraTopics:
-    """The topics of one camera in a recording."""
-
-    namespace: str
-    image: str
-
-    @property
-    def name(self) -> str:
-        """The camera's name: its namespace without the leading slash."""
-        return self.namespace.lstrip("/")
 
 
 def build_graph(
@@ -145,7 +78,7 @@ def build_graph(
     graph.notes += [*_note_missing_detections(graph.instances, topics), *depth_notes]
     calibrated: list[CameraTopics] = []
     if len(cameras) >= MIN_CAMERAS:
-        calibrated, note = _select_calibrated(cameras, moving or frames, infos)
+        calibrated, note = select_calibrated(cameras, moving or frames, infos)
         graph.notes += [note] if note else []
         if len(calibrated) >= MIN_CAMERAS:
             graph.instances += _make_hull_and_fitter(calibrated, settings, factory)
@@ -208,25 +141,8 @@ def _find_detections(topics: Mapping[str, str], trackers: list[Instance]) -> set
     found = {name for name, kind in topics.items() if _DETECTIONS.accepts(kind)}
     lists = {name for name in found if topics[name] == IDS_LIST}
     ours = any(topics[name] == PUPPETS for name in found & made)
-    empty = {name for name in lists if ours or not _find_skeletons(name, topics)}
+    empty = {name for name in lists if ours or not find_skeletons(name, topics)}
     return found - made - empty
-
-
-def _find_skeletons(listing: str, topics: Mapping[str, str]) -> list[str]:
-    """Return the topics of the skeletons of the bodies that are listed on the topic `listing`."""
-    return sorted(name for name, kind in topics.items() if kind == SKELETON_2D and find_body_id(listing, name))
-
-
-def find_cameras(topics: Mapping[str, str]) -> list[CameraTopics]:
-    """Return the cameras whose images are among the topics (name -> type), by namespace."""
-    found: dict[str, str] = {}
-    for base in IMAGE_NAMES:
-        for topic, kind in topics.items():
-            image = topic.removesuffix("/compressed") if kind == COMPRESSED_IMAGE else topic
-            namespace, _, name = image.rpartition("/")
-            if kind in (IMAGE, COMPRESSED_IMAGE) and name == base:
-                found.setdefault(namespace, image)
-    return [CameraTopics(namespace, found[namespace]) for namespace in sorted(found)]
 
 
 def _make_settings[S: Settings](kind: type[S], name: str, settings: Mapping[str, Mapping[str, Any]], **fixed: Any) -> S:
@@ -243,43 +159,6 @@ def _make_tracker(
         if port.optional:
             component.set_expected(port.name, port.accepts(topics.get(instance.resolve(port.name), "")))
     return instance
-
-
-def _select_calibrated(
-    cameras: list[CameraTopics], frames: FrameTree, infos: Mapping[str, Any]
-) -> tuple[list[CameraTopics], str]:
-    """Return the largest group of calibrated cameras with a common root frame, and why others are not in it."""
-    groups: dict[str, list[CameraTopics]] = {}
-    reasons = []
-    for camera in cameras:
-        try:
-            groups.setdefault(_find_root(camera, frames, infos), []).append(camera)
-        except InputError as error:
-            reasons.append(f"{camera.name}: {error}")
-    chosen = max(groups.values(), key=len, default=[])
-    for root, group in groups.items():
-        if group is not chosen:
-            reasons += [f"{camera.name}: its frames end in {root!r}" for camera in group]
-    if not reasons:
-        return chosen, ""
-    what = "without these cameras" if len(chosen) >= MIN_CAMERAS else f"not built, it needs {MIN_CAMERAS} cameras"
-    return chosen, f"the visual hull is {what} ({'; '.join(reasons)})"
-
-
-def _find_root(camera: CameraTopics, frames: FrameTree, infos: Mapping[str, Any]) -> str:
-    """Return the root of a camera's frame; InputError if the camera is not calibrated or its frame has no parent."""
-    info = infos.get(f"{camera.namespace}/camera_info")
-    if info is None:
-        raise InputError(f"there is no {camera.namespace}/camera_info")
-    frame = info.header.frame_id.lstrip("/")
-    root = frames.find_root(frame)
-    if root == frame:
-        raise InputError(f"/tf_static has no transform to its frame {frame!r}")
-    pose = frames.lookup_pose(root, frame)
-    assert pose is not None
-    translation, rotation = pose
-    Camera.from_info(info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model)
-    return root
 
 
 def _make_hull_and_fitter(
@@ -359,8 +238,3 @@ def _join_colour(
     fitter.remapped |= {"puppets": tracker.resolve("puppets"), "puppets/camera_info": colour.info}
     for port in ("puppets", "puppets/camera_info"):
         fitter.component.set_expected(port, True)
-
-
-def find_info_topics(topics: Mapping[str, str]) -> list[str]:
-    """Return the topics of type CameraInfo."""
-    return [topic for topic, kind in topics.items() if kind == CAMERA_INFO]
