@@ -9,13 +9,13 @@ import numpy as np
 
 from benchmarks import stages
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.segmentation import candidates as segmentation
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights
 from flowing_puppet_ros.body.segmentation.seen_free import SeenFree
 from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track import multi_body_tracker, scene_tracker
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTrackerSettings
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.body.upright import person_finder
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder

@@ -6,8 +6,8 @@ import pytest
 
 from flowing_puppet_ros.body.cloud.airborne import find_airborne
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.settings import FitterSettings
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder
 from flowing_puppet_ros.model.sp import StitchedPuppet

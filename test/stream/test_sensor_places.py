@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneTracker
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.components.body_fitter import BodyFitterComponent, BodyFitterSettings

@@ -26,14 +26,7 @@ from flowing_puppet_ros.body.fit.partial_view import hang_unseen_parts
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights, SurfaceTerm
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.settings import BodyTrackerSettings
-from flowing_puppet_ros.body.track.tracked_body import (
-    BodyObservation,
-    TrackState,
-    align,
-    extrapolate,
-    is_far,
-    translate,
-)
+from flowing_puppet_ros.body.track.track_state import BodyObservation, TrackState, align, extrapolate, translate
 from flowing_puppet_ros.body.upright.upright_fit import (
     FEW_POINTS,
     MANY_POINTS,
@@ -54,13 +47,11 @@ SHAPE_WEIGHT_PER_FRAME = 1e-6  # that each frame adds to `RefineWeights.shape` f
 MAX_SHAPE_FRAMES = 30  # that count for the shape: with more, a first mistake would stay
 MIN_VISIBLE = 0.4  # visible fraction, relative to normal, below which the person counts as occluded ...
 MIN_VISIBLE_OF_FEW = 0.75  # ... and where few points show the person, and half of them bends the body more
-VISIBLE_HALF_LIFE_S = 2.0  # in which the normal visible surface falls to half where less is seen
 MAX_TURNED_RATIO = 1.25
 """Two-way distance of a body that walks ahead, relative to that of one that walks backwards, up to which it is taken:
 few points hardly tell front from back, and hardly anybody walks backwards."""
 MAX_TRACKED_POINTS = 2500
 """Of one side of a person whose joints somebody sees: the shape comes from many clouds, and no full fit from these."""
-LONG_GAP_NS = 250_000_000  # time between clouds from which on the middle of the cloud tells better where somebody went
 ALIGN_GAP_NS = 100_000_000
 """Time between clouds from which on a body is first moved to the joints that somebody sees."""
 
@@ -178,6 +169,9 @@ class BodyTracker:
             return None
         return extrapolate(self._state.before, last, stamp)
 
+    def _predict(self, points: F64, stamp: int) -> BodyState | None:
+        return self._state.predict(stamp, points.mean(axis=0), self._settings.max_time_gap)
+
     def accept(self) -> None:
         """Take the last body for the best there is: a full fit has found none that is closer."""
         last = self._state.last
@@ -241,13 +235,14 @@ class BodyTracker:
             points, normals = downsample(points, normals, self._settings.max_points)
         if self._state.last is not None and stamp <= self._state.last.stamp:
             self.reset()
-        occluded = viewpoint is not None and self._update_visible(
-            points, stamp, viewpoint, MIN_VISIBLE_OF_FEW if few else MIN_VISIBLE
-        )
-        last = self._state.last
-        oriented = normals is None and viewpoint is None and last is not None
-        if oriented and last is not None:
-            vertices = self._fitter.model.vertices(self._predict(last, points.mean(axis=0), stamp))
+        if viewpoint is not None:
+            min_visible = MIN_VISIBLE_OF_FEW if few else MIN_VISIBLE
+            self._state = self._state.see(points, stamp, viewpoint, min_visible)
+        occluded = viewpoint is not None and self._state.hidden
+        expected = self._predict(points, stamp) if normals is None and viewpoint is None else None
+        oriented = expected is not None
+        if expected is not None:
+            vertices = self._fitter.model.vertices(expected)
             normals = estimate_normals(points, (vertices, vertex_normals(vertices, self._fitter.model.faces)))
         if targets is not None and viewpoint is not None and person.field is not None:
             points, normals = downsample(points, normals, MAX_TRACKED_POINTS)
@@ -267,10 +262,10 @@ class BodyTracker:
         if prepared.occluded and last is not None:
             self.counters["hidden"] += 1
             return self._fitter.assess(translate(self._state.before, last, prepared.stamp), cloud), False
-        if last is None:
-            return None, True
         if start is None:
-            start = self._predict(last, cloud.points.mean(axis=0), prepared.stamp)
+            start = self._predict(cloud.points, prepared.stamp)
+        if last is None or start is None:
+            return None, True
         fit = self._step(start, prepared)
         return fit, self._is_lost(fit, prepared)
 
@@ -334,29 +329,6 @@ class BodyTracker:
         # How much of the person is normally seen does not depend on the body.
         self._state = TrackState(best=fit.two_way_distance, best_points=points, visible=self._state.visible)
         return fit
-
-    def _predict(self, last: BodyObservation, middle: F64, stamp: int) -> BodyState:
-        """Return the last body, moved on by its last motion in proportion to the time.
-
-        Without one, and after a long gap, which a full fit leaves in a live stream too, it moves as the middle of the
-        cloud did; after a shorter one, it turns by its last motion.
-        """
-        if stamp - last.stamp > 1e9 * self._settings.max_time_gap or is_far(self._state.before, last, stamp):
-            return replace(last.fit.state, center=last.fit.state.center + middle - last.middle)
-        moved = extrapolate(self._state.before, last, stamp)
-        if stamp - last.stamp <= LONG_GAP_NS:
-            return moved
-        return replace(moved, center=moved.center + middle - last.middle - (moved.center[0] - last.fit.state.center[0]))
-
-    def _update_visible(self, points: F64, stamp: int, viewpoint: F64, min_visible: float) -> bool:
-        """Return whether less than a share of the person is seen than normally; what is normal follows what is seen."""
-        state = self._state
-        seen = len(points) * float(((points - viewpoint) ** 2).sum(axis=1).mean())
-        passed = 0.0 if state.last is None else 1e-9 * (stamp - state.last.stamp)
-        visible = max(seen, state.visible * 0.5 ** (passed / VISIBLE_HALF_LIFE_S))
-        hidden = seen < min_visible * visible
-        self._state = replace(state, visible=visible, hidden=hidden)
-        return hidden
 
     def _refine(self, start: BodyState, prepared: _Prepared, widths: tuple[float, float], steps: int) -> BodyFit:
         cloud, floor = prepared.cloud, prepared.floor

@@ -11,9 +11,9 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.scene.rig_scene import shows_person
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.person_belief import EVERY_SCAN, PersonBelief
-from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.tracked_body import TorsoMotion, TrackedBody
 from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, JudgedFit
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS

@@ -15,6 +15,8 @@ from flowing_puppet_ros.body.cloud.airborne import find_airborne
 from flowing_puppet_ros.body.cloud.coverage import is_single_view
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
+from flowing_puppet_ros.body.scene.rig_scene import shows_person
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
 from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.segmentation.people import segment_people
@@ -22,8 +24,6 @@ from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.segmentation.seen_free import SeenFree
 from flowing_puppet_ros.body.settings import SegmentationSettings
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
-from flowing_puppet_ros.body.track.rig_scene import shows_person
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget, FoundBody, JudgedFit
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings

@@ -11,20 +11,10 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import BodyFit
-from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
-from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.model import rotation
-from flowing_puppet_ros.model.sp import BodyState
-
-MAX_STRETCH = 2.0  # frames by which a motion is extrapolated at most
-FIRST_GAP_NS = 150_000_000  # time after the first frame up to which somebody is taken to be where they were
-ALIGNED = RefineWeights(stitch=1.0, pose=1e-5, shape=1e-2, pairwise=1e-5, sigma_start=0.4, sigma_end=0.08, iterations=6)
-"""To joints alone, the shape being known."""
 
 VELOCITY_WINDOW_NS = 500_000_000
 """Time over which a velocity is measured: shorter ones show the noise of the fits, longer ones lag behind a turn."""
-
-
 MAX_TURN_RAD_PER_S, MAX_SPEED_M_PER_S = 10.0, 12.0
 """Of a torso: somebody who turns on the spot takes half a second for it; a sprinter runs with 12 m/s."""
 MAX_TURN_ERROR_RAD, MAX_PLACE_ERROR_M = 1.0, 0.3
@@ -125,71 +115,3 @@ def _is_jump(before: BodyFit, after: BodyFit, nanoseconds: int) -> bool:
         moved > MAX_PLACE_ERROR_M + MAX_SPEED_M_PER_S * seconds
         or turned > MAX_TURN_ERROR_RAD + MAX_TURN_RAD_PER_S * seconds
     )
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BodyObservation:
-    """A fit, the time of its cloud in nanoseconds, the mean (3,) of the cloud's points, metres, and their number."""
-
-    fit: BodyFit
-    stamp: int
-    middle: F64
-    points: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackState:
-    """What is known of the person after a cloud.
-
-    `best` two-way distance in metres since the last full fit, of a cloud of `best_points`, `frames` whose shape was
-    learned, `visible` surface that is normally seen (points times squared metres of distance), `lost`: the body is not
-    where the person is.
-    """
-
-    before: BodyObservation | None = None
-    last: BodyObservation | None = None
-    best: float = np.inf
-    best_points: int = 0
-    frames: int = 0
-    visible: float = 0.0
-    hidden: bool = False
-    lost: bool = True
-
-
-def is_far(before: BodyObservation | None, last: BodyObservation, stamp: int) -> bool:
-    """Return whether a time in nanoseconds is farther from the last one than the last motion, if any, tells about."""
-    known = FIRST_GAP_NS if before is None else MAX_STRETCH * (last.stamp - before.stamp)
-    return stamp - last.stamp > known
-
-
-def extrapolate(before: BodyObservation | None, last: BodyObservation, stamp: int) -> BodyState:
-    """Return the last body, moved on by its last motion in proportion to the time."""
-    state = last.fit.state
-    if before is None:
-        return state
-    share = _stretch(before, last, stamp)
-    turn = rotation.log(np.swapaxes(before.fit.state.rotation, -1, -2) @ state.rotation)
-    return replace(
-        state,
-        center=state.center + share * (state.center - before.fit.state.center),
-        rotation=state.rotation @ rotation.exp(share * turn),
-    )
-
-
-def translate(before: BodyObservation | None, last: BodyObservation, stamp: int) -> BodyState:
-    """Return the last body, moved on as its torso moved, in the pose that it has."""
-    state = last.fit.state
-    if before is None:
-        return state
-    moved = state.center[0] - before.fit.state.center[0]
-    return replace(state, center=state.center + _stretch(before, last, stamp) * moved)
-
-
-def align(refiner: GaussNewton, body: BodyState, places: JointTargets) -> BodyState:
-    """Return the body of the same shape whose joints lie at `places` as well as they can, in a few milliseconds."""
-    return refiner.run(body, None, places, replace(ALIGNED, shape_center=body.shape.mean(axis=0)))
-
-
-def _stretch(before: BodyObservation, last: BodyObservation, stamp: int) -> float:
-    """Return by how many frames the last motion is extrapolated."""
-    return min((stamp - last.stamp) / (last.stamp - before.stamp), MAX_STRETCH)

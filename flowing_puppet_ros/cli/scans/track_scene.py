@@ -16,8 +16,8 @@ from flowing_puppet_ros.body.fit.up_axis_search import FrameFit, measure_stature
 from flowing_puppet_ros.body.scans.scan import Scan, read_scan
 from flowing_puppet_ros.body.scans.scan_frame import ScanFrame, parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.scans.unit import ScanUnit
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.segmentation.people import segment_people
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody, TrackStatus
 from flowing_puppet_ros.cli.scans.fit_file import make_fitter, write_result

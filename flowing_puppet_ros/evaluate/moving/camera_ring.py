@@ -12,8 +12,8 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
-from flowing_puppet_ros.body.track.rig_scene import RigScene
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.scene.rig_scene import RigScene
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import TrueBody

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
+from flowing_puppet_ros.body.scene.rig_scene import RigScene
 from flowing_puppet_ros.body.settings import BodyTrackerSettings
-from flowing_puppet_ros.body.track.rig_scene import RigScene
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.moving.camera_ring import CameraRing, RingScore, make_scene, score_fits, score_scene
 from flowing_puppet_ros.evaluate.moving.drawn_silhouettes import draw_people

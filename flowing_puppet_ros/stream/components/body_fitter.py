@@ -11,8 +11,8 @@ import numpy as np
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, Progress
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES
+from flowing_puppet_ros.body.scene.scene_cloud import RegionSettings, SceneCloud, crop_to_region
 from flowing_puppet_ros.body.settings import FitterSettings
-from flowing_puppet_ros.body.track.scene_cloud import RegionSettings, SceneCloud, crop_to_region
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError

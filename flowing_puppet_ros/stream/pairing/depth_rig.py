@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64
-from flowing_puppet_ros.body.track.rig_agreement import measure_disagreement
-from flowing_puppet_ros.body.track.rig_scene import RigScene
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.scene.rig_agreement import measure_disagreement
+from flowing_puppet_ros.body.scene.rig_scene import RigScene
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.settings import Settings, setting

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from flowing_puppet_ros.arrays import Bools
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTrackerSettings
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter

@@ -12,13 +12,13 @@ import pytest
 from kept_tasks import KeptTasks  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.segmentation.candidates import Candidate
 from flowing_puppet_ros.body.settings import BodyTrackerSettings, FitterSettings
 from flowing_puppet_ros.body.track.body_tracker import BodyTracker
 from flowing_puppet_ros.body.track.multi_body_tracker import MAX_LIVE_ASKED, MultiBodyTracker, MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.person_belief import PersonBelief
 from flowing_puppet_ros.body.track.person_track import PersonTrack
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import MAX_LIVE_FITS, SEARCH_EVERY, SceneSettings, SceneTracker
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, find_only_reached

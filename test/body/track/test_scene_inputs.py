@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights
 from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.settings import FitterSettings
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import MAX_SCENE_POINTS, SceneSettings, SceneTracker
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet

@@ -24,8 +24,8 @@ from flowing_puppet_ros.body.scans.names import SUFFIXES, UP_AXES
 from flowing_puppet_ros.body.scans.scan import read_scan
 from flowing_puppet_ros.body.scans.scan_frame import parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.scans.scene_labels import LabelledScene, label_scene, read_labels
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.settings import FitterSettings
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError

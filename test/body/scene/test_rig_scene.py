@@ -4,9 +4,9 @@
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
-from flowing_puppet_ros.body.track.rig_agreement import find_seen_through
-from flowing_puppet_ros.body.track.rig_scene import RigScene
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.scene.rig_agreement import find_seen_through
+from flowing_puppet_ros.body.scene.rig_scene import RigScene
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorProjection
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig

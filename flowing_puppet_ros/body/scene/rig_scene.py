@@ -11,8 +11,8 @@ import numpy as np
 from flowing_puppet_ros.arrays import F64, I64, Bools
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
-from flowing_puppet_ros.body.track.rig_agreement import find_seen_through
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.scene.rig_agreement import find_seen_through
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
 
 MAX_PERSON_DISTANCE_M = 0.024

@@ -10,8 +10,8 @@ from scipy.ndimage import minimum_filter
 
 from flowing_puppet_ros.arrays import F64, Bools
 from flowing_puppet_ros.body.cloud.normals import downsample
+from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.segmentation.planes import find_planes, is_clear_of_planes
-from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 
 FREE_DEPTH_M = 0.1
