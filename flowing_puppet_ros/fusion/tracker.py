@@ -42,7 +42,7 @@ BETTER_SHARE = 0.95
 """Two-way distance of a new fit, relative to the tracked body's, below which it is better."""
 MAX_PLANE_CLOUDS = 40
 """Clouds after which floor and walls are searched again though they are still there."""
-MAX_STEPS = 3
+MAX_STEPS = 2
 """Gauss-Newton steps a cloud: the joints say where the limbs are, and more steps bring a body no closer."""
 MAX_SAME_PERSON_M = 0.6
 """Between the trunks of a puppet without an id and of the known body that it is."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Bools
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.evidence.cloud.depth_smoothing import smooth_depth
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.settings import Settings, setting
 
@@ -106,16 +107,18 @@ class SceneCloud:
         """Return people seen from the viewpoint with what the sensor can know of each.
 
         A scan without order is drawn into an image for that, unless the person is all of it: its own extent says
-        nothing about the sensor's.
+        nothing about the sensor's. The points of a noisy depth image are averaged.
         """
         image = self.image
         if image is None and any(person.rows is not None for person in people):
             image = self.draw_image()
         if image is None:
             return list(people)
-        return [
-            replace(person, field=image.make_field(slice(None) if person.rows is None else person.rows))
-            if self.image is not None or person.rows is not None
-            else person
-            for person in people
-        ]
+        made = []
+        for person in people:
+            rows = slice(None) if person.rows is None else person.rows
+            seen = replace(person, field=image.make_field(rows))
+            if self.image is not None and person.normals is None:
+                seen = replace(seen, points=smooth_depth(image, self.points, rows))
+            made.append(seen if self.image is not None or person.rows is not None else person)
+        return made

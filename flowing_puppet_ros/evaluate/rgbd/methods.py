@@ -14,6 +14,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS, SeenKeypoints
 from flowing_puppet_ros.evaluate.rgbd.views import RgbdFrame
+from flowing_puppet_ros.evidence.cloud.depth_smoothing import smooth_depth
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, place_joints
@@ -123,7 +124,8 @@ class SearchMethod:
             own = frame.clean(person).ravel()[scene.pixel]
             try:
                 field = scene.image.make_field(own)
-                fits.append(self._fitter.fit(scene.points[own], viewpoint=np.zeros(3), field=field))
+                points = smooth_depth(scene.image, scene.points, own)
+                fits.append(self._fitter.fit(points, viewpoint=np.zeros(3), field=field))
             except InputError:
                 fits.append(None)
         return fits, scene.to_world, time.process_time() - started

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of depth images averaged over neighbouring pixels of one person, where it is larger than a fit bears.
+"""Noise of depth images averaged over neighbouring pixels of one person.
 
 The error of stereo and of projected patterns grows with the square of the depth: 1 cm at 2 m is 9 cm at 6 m, more than
 a limb is thick and several times the distance between points. Normals of such points point anywhere, and what a surface
-hides is decided by chance. It is an error along the ray, so depth is fitted over the image, not a plane through points.
+hides is decided by chance; with 1 cm at 2 m, nearly as large as the distance between points, they waver. It is an error along the ray, so depth is fitted over the image, not a plane through points.
 """
 
 from __future__ import annotations
@@ -17,9 +17,8 @@ from flowing_puppet_ros.evidence.cloud.sensor_field import PINHOLE
 
 RADIUS_M, MAX_WINDOW_PX = 0.03, 7
 """Half of the window in which depths are averaged, at most: less than the radius of most limbs."""
-MIN_NOISE_M, WANTED_NOISE_M = 0.03, 0.004
-"""Deviation from which on depths are averaged, which fits do not bear well, and that which is left by windows that need
-not be larger."""
+MIN_NOISE_M, WANTED_NOISE_M = 0.008, 0.004
+"""Deviation from which on depths are averaged, and that which is left by windows that need not be larger."""
 SAME_SURFACE_NOISES, MIN_SAME_SURFACE_M, ROUNDS = 3.0, 0.02, 2
 """Deviations of the noise from the surface, and metres, within which depths in the window belong to it."""
 SECOND_DIFFERENCE = np.sqrt(1.5)
@@ -27,7 +26,7 @@ SECOND_DIFFERENCE = np.sqrt(1.5)
 TO_DEVIATION = 1.4826  # from the median of absolute values of a Gaussian
 
 
-def smooth_depth(image: RangeImage, points: F64, own: Bools | I64) -> F64:
+def smooth_depth(image: RangeImage, points: F64, own: Bools | I64 | slice) -> F64:
     """Return a person's points (K, 3) m of a scan (N, 3) m, each moved along its ray onto the surface around it.
 
     Only those of depth images are; a LiDAR's points are farther apart than its noise.

@@ -2,6 +2,7 @@
 """Noise of depth images of a cylinder as thick as a trunk, far away and near."""
 
 import numpy as np
+import pytest
 
 from flowing_puppet_ros.evidence.cloud.depth_smoothing import smooth_depth
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
@@ -23,8 +24,9 @@ def look(distance: float, noise: float) -> tuple[RangeImage, np.ndarray, np.ndar
     return image, clouds[0], clouds[1], own.ravel()
 
 
-def test_noise_larger_than_limbs_is_averaged_along_the_rays() -> None:
-    image, points, true, own = look(6.0, 0.08)
+@pytest.mark.parametrize(("distance", "noise"), [(6.0, 0.08), (3.5, 0.02), (2.0, 0.01)])
+def test_noise_is_averaged_along_the_rays(distance: float, noise: float) -> None:
+    image, points, true, own = look(distance, noise)
     smooth = smooth_depth(image, points, own)
     np.testing.assert_allclose(smooth[:, :2] / smooth[:, 2:], points[own, :2] / points[own, 2:], atol=1e-9)
     before, after = (np.abs(cloud[:, 2] - true[own, 2]) for cloud in (points[own], smooth))
@@ -32,7 +34,7 @@ def test_noise_larger_than_limbs_is_averaged_along_the_rays() -> None:
 
 
 def test_points_with_little_noise_and_those_of_no_depth_image_stay() -> None:
-    image, points, _, own = look(2.5, 0.01)
+    image, points, _, own = look(2.5, 0.005)
     np.testing.assert_array_equal(smooth_depth(image, points, own), points[own])
     noisy = look(6.0, 0.08)[1]
     scan = RangeImage.of_scan(noisy, np.zeros(3))
