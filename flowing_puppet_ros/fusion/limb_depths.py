@@ -10,7 +10,7 @@ sizes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,6 +69,11 @@ class DepthChoices:
     def spread(self) -> F64:
         """Standard deviation (C,) of the places across the ray beyond that of seen joints, metres."""
         return np.where(self.seen, 0.0, HIDDEN_SPREAD_M)
+
+    def take(self, rows: Sequence[int]) -> DepthChoices:
+        """Return some of the choices."""
+        chosen = list(rows)
+        return DepthChoices(self.points[chosen], self.depth[chosen], self.cost[chosen], self.seen[chosen])
 
 
 def list_choices(

@@ -9,10 +9,12 @@ kept if the whole body then costs less.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Bools
+from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
 from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
@@ -56,6 +58,9 @@ STRAYED_GAP_M, STRAYED_SEEN_GAP_M = 0.1, 0.2
 """Between a joint and its ray, and its place on a surface, beyond which closest points would not bring a limb back."""
 WRONG_GAP_M, WRONG_SEEN_GAP_M = 0.12, 0.2
 """The same, beyond which a body cannot be relied on."""
+LEFT_OUT_RADIUS_M, LEFT_OUT_GAP_M, MIN_LEFT_OUT, MIN_LEFT_OUT_SHARE = 0.08, 0.06, 10, 0.5
+"""About a joint's place on a surface, and from the body: points within the former that are farther from the latter,
+and share of all that are within, from which on the body leaves out the limb that is there."""
 MIN_SEEN_SHARE = 0.9  # probability that a joint is seen, below which its limb may be in a wrong place
 MIN_GAIN_M = 0.0005  # by which a body with a limb hung anew costs less
 MIN_CONFIDENCE = 0.2  # of joints that count
@@ -120,6 +125,28 @@ class LimbSearcher:
     def find_lost(self, body: BodyState, joints: LiftedJoints) -> list[int]:
         """Return the limbs of a tracked body of which a joint is certainly not where the puppet sees it."""
         return self._find_far(body, joints, LOST_GAP_M, LOST_SEEN_GAP_M)
+
+    def lift_left_out(self, fit: BodyFit, points: F64, joints: LiftedJoints) -> LiftedJoints:
+        """Return the joints with those lifted anew at whose pixels a tracked body leaves out one of the surfaces.
+
+        A track keeps a limb on the surface where the clouds before had it: a forearm that comes to point at the camera
+        would stay at the trunk behind it.
+
+        Args:
+            fit: the body.
+            points: (N, 3) metres, the person's.
+            joints: of the person.
+        """
+        places, hidden, choices = joints.points.copy(), joints.hidden.copy(), dict(joints.choices)
+        for row in np.concatenate([rows[1:] for _, rows in self._limbs]).tolist():
+            if row not in joints.choices or joints.confidence[row] < HALF_SEEN_CONFIDENCE:
+                continue
+            own = joints.choices[row]
+            elsewhere = own.seen & (np.linalg.norm(own.points - fit.joints[row], axis=1) > LOST_SEEN_GAP_M)
+            left_out = [int(k) for k in np.flatnonzero(elsewhere) if _is_left_out(own.points[k], points, fit.vertices)]
+            if left_out:
+                places[row], hidden[row], choices[row] = own.points[left_out[0]], False, own.take(left_out[:1])
+        return replace(joints, points=places, hidden=hidden, choices=choices)
 
     def find_strayed(self, body: BodyState, joints: LiftedJoints) -> list[int]:
         """Return the limbs of which a joint is certainly not where a tracked body's motion would bring it."""
@@ -249,6 +276,15 @@ class LimbSearcher:
         pick = np.zeros(len(groups), dtype=np.int64)
         pick[list(limb)] = row
         return particles_to_state(self._model, groups, pick)
+
+
+def _is_left_out(place: F64, points: F64, vertices: F64) -> bool:
+    """Return whether a body with `vertices` (V, 3) m leaves out what `points` (N, 3) m show about a place (3,)."""
+    near = points[np.linalg.norm(points - place, axis=1) < LEFT_OUT_RADIUS_M]
+    if len(near) < MIN_LEFT_OUT:
+        return False
+    away = np.linalg.norm(near[:, None] - vertices, axis=2).min(axis=1) > LEFT_OUT_GAP_M
+    return bool(np.count_nonzero(away) >= max(MIN_LEFT_OUT, MIN_LEFT_OUT_SHARE * len(near)))
 
 
 def _find_doubtful(joints: LiftedJoints) -> Bools:

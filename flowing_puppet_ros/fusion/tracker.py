@@ -250,13 +250,14 @@ class FusedTracker:
     def _find_lost_limbs(self, job: _TrackJob, fit: BodyFit, claim: Claim, stamp: int) -> BodyFit:
         """Return the body with the limbs hung anew that the puppet sees elsewhere."""
         track, fitter = job.track, self._people.joint_fitter
-        lost = fitter.limbs.find_lost(fit.state, claim.joints)
+        joints = fitter.limbs.lift_left_out(fit, job.person.points, claim.joints)
+        lost = fitter.limbs.find_lost(fit.state, joints)
         tries = {limb: track.searches.setdefault(limb, _Retry(LIMB_INTERVAL_NS)) for limb in lost}
         lost = [limb for limb in lost if tries[limb].is_due(stamp)]
         if not lost or track.tracker.hidden:
             return fit
         cloud = fitter.take_cloud(job.person, track.tracker.cloud)
-        found = fitter.hang_anew(cloud, fit.state, claim.joints, lost)
+        found = fitter.hang_anew(cloud, fit.state, joints, lost)
         for limb in lost:
             tries[limb].record(stamp, found is not None)
         if found is None:

@@ -3,7 +3,8 @@
 
 The error of stereo and of projected patterns grows with the square of the depth: 1 cm at 2 m is 9 cm at 6 m, more than
 a limb is thick and several times the distance between points. Normals of such points point anywhere, and what a surface
-hides is decided by chance; with 1 cm at 2 m, nearly as large as the distance between points, they waver. It is an error along the ray, so depth is fitted over the image, not a plane through points.
+hides is decided by chance; with 1 cm at 2 m, nearly as large as the distance between points, they waver. It is an error
+along the ray, so depth is fitted over the image, not a plane through points.
 """
 
 from __future__ import annotations
