@@ -10,6 +10,7 @@ from watched_people import find_puppet, make_colour_camera, stand_at, watch  # t
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.settings import FitterSettings
+from flowing_puppet_ros.fusion.limb_depths import DepthChoices
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter, make_person
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -47,6 +48,18 @@ def test_an_arm_in_a_wrong_place_is_noticed_and_found(model: StitchedPuppet) -> 
     assert np.linalg.norm(back[wrist] - person.joints["left_wrist"]) < 0.1
     others = [part for part in range(len(model.tree)) if part not in fitter.limbs.list_parts(number)]
     np.testing.assert_allclose(pointed.center[others], wrong.center[others])
-    found = fitter.hang_anew(fitter.make_cloud(points.points, points.field), wrong, claim.joints, [number])
+    # The wrist is lifted onto where the body has it, though the body leaves out another surface at its pixel.
+    single = fitter.make_cloud(points.points, points.field)
+    wrong_fit, place = fitter.fitter.assess(wrong, single), claim.joints.points.copy()
+    place[wrist] = wrong_fit.joints[wrist]
+    both = DepthChoices(
+        np.stack([place[wrist], claim.joints.points[wrist]]), np.zeros(2), np.zeros(2), np.ones(2, dtype=bool)
+    )
+    mistaken = replace(claim.joints, points=place, choices={**claim.joints.choices, wrist: both})
+    lifted = fitter.limbs.lift_left_out(wrong_fit, points.points, mistaken)
+    np.testing.assert_array_equal(lifted.points[wrist], claim.joints.points[wrist])
+    same = fitter.limbs.lift_left_out(good, points.points, claim.joints)
+    np.testing.assert_array_equal(same.points, claim.joints.points)
+    found = fitter.hang_anew(single, wrong, claim.joints, [number])
     assert found is not None
     assert np.linalg.norm(found.joints[wrist] - person.joints["left_wrist"]) < 0.07
