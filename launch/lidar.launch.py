@@ -19,7 +19,10 @@ ARGUMENTS = {
     "camera_info": ("camera_info", "calibration of the depth camera"),
     "initial": ("initial", "joints that start the fit (BodyArray), if another node publishes them"),
     "view": ("auto", "single: one sensor, at the origin of the cloud's frame; full: all sides; auto: found out"),
-    "up": ("auto", "z, y or -y: the axis of the cloud's frame that points up; auto: by /tf_static, or the name of the frame"),
+    "up": (
+        "auto",
+        "z, y or -y: the axis of the cloud's frame that points up; auto: by /tf_static, or the name of the frame",
+    ),
 }
 
 

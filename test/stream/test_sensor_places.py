@@ -145,7 +145,9 @@ def test_the_people_of_a_cloud_are_looked_for_as_high_as_its_sensor_is(monkeypat
 def test_what_a_sensor_is_mounted_on_tells_which_way_is_up_without_a_fixed_frame() -> None:
     tilted = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])  # looks down
     frames = FrameTree()
-    frames.add(message(make_transform(FACTORY, make_header(FACTORY, 0, "base"), "lidar", np.array([0, 0, 1.0]), tilted)))
+    frames.add(
+        message(make_transform(FACTORY, make_header(FACTORY, 0, "base"), "lidar", np.array([0, 0, 1.0]), tilted))
+    )
     place = find(places(frames, fixed="")[0], "lidar", 1.0)
     np.testing.assert_allclose(place.put(tilted.T @ np.array([3.0, 0.0, -1.0]))[2], -1.0)
     np.testing.assert_allclose(place.to_sensor @ place.rotation, np.eye(3), atol=1e-12)

@@ -25,7 +25,7 @@ from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, M
 from flowing_puppet_ros.body.track.rig_scene import shows_person
 from flowing_puppet_ros.body.track.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
-from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget, FoundBody, JudgedFit
+from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget, FoundBody, JudgedFit, SearchedScan
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
@@ -269,19 +269,9 @@ class SceneTracker:
         only_known = live and is_tracked and self._since_search + 1 < SEARCH_EVERY and not self._finder.left_over
         self._since_search = self._since_search + 1 if only_known else 0
         come = self._seen_free.add(points, cloud.viewpoint) if remember and not only_known else None
-        search = partial(
-            self._finder.find,
-            self._lay_floor(cloud, points, remember) if len(points) else None,
-            normals,
-            cloud.viewpoint,
-            cloud.stamp,
-            known,
-            expected,
-            self._make_budget(remember, live, is_tracked),
-            remember,
-            come,
-            only_known,
-        )
+        scene = self._lay_floor(cloud, points, remember) if len(points) else None
+        scan = SearchedScan(scene, cloud.viewpoint, cloud.stamp, normals, known, expected, come)
+        search = partial(self._finder.find, scan, self._make_budget(remember, live, is_tracked), remember, only_known)
         # Who is tracked will need the range image.
         if live and is_tracked and usable_threads(self._fitter.settings.threads) > 1:
             with ThreadPoolExecutor(1) as beside:
