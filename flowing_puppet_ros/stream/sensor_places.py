@@ -91,6 +91,7 @@ class SensorPlaces:
     def reset(self) -> None:
         """Forget the recording."""
         self._up_of_nameless = ""
+        self._looked_into: set[str] = set()
         self._anchor: F64 | None = None
         self._missed = False
 
@@ -212,6 +213,13 @@ class SensorPlaces:
             return self._up
         if of_depth or OPTICAL.search(frame):
             return "-y"
+        if frame and len(points) and frame not in self._looked_into:
+            self._looked_into.add(frame)
+            if not self._fixed and self._find_mounted_up(frame) is None and is_ahead_along_z(points):
+                self._report.warn(
+                    f"the clouds in {frame!r} lie ahead along z as in the frame of a camera, but z is taken as up: name"
+                    " the camera's optical frame, or set up:=-y"
+                )
         if frame or not len(points):
             return "z"
         if not self._up_of_nameless:

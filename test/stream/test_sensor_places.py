@@ -164,3 +164,14 @@ def test_nobody_is_tracked_from_one_way_up_to_another() -> None:
     turned_over = replace(place, rotation=np.diag([1.0, -1.0, -1.0]))
     frames = [component._is_turned("lidar", each) for each in (place, place, turned_over, turned_over)]
     assert frames == [False, False, True, False]
+
+
+def test_a_camera_whose_frame_is_not_named_as_one_is_told() -> None:
+    made, report = places(FrameTree(), fixed="")
+    ahead = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 5], (200, 3))
+    for _ in range(2):
+        made.find(make_header(FACTORY, 0, "camera"), 0, ahead, False)
+    assert len(report.warnings) == 1 and "up:=-y" in report.warnings[0]
+    made, report = places(FrameTree(), fixed="")
+    find(made, "lidar", 1.0)
+    assert not report.warnings
