@@ -102,10 +102,8 @@ def test_several_scans_decide_which_way_somebody_faces_and_turn_once() -> None:
 
 
 def test_nothing_has_moved_against_a_sensor_that_moves() -> None:
-    belief = PersonBelief(np.zeros(2))
-    belief.visit(np.array([[0.6, 0.0, 1.0]]), 0)
-    assert belief.moved
-    belief.visit(np.array([[1.2, 0.0, 1.0]]), 100_000_000, sensor_moves=True)
-    assert not belief.moved
-    belief.visit(np.array([[1.3, 0.0, 1.0]]), 200_000_000)
-    assert not belief.moved
+    belief, moved = PersonBelief(np.zeros(2)), []
+    for step, sensor_moves in enumerate((False, True, False)):
+        belief.visit(np.array([[0.6 + 0.3 * step, 0.0, 1.0]]), 100_000_000 * step, sensor_moves)
+        moved.append(belief.moved)
+    assert moved == [True, False, False]
