@@ -20,6 +20,8 @@ from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.upright.upright_bank import (
+    CHILD_TOP_M,
+    make_child_bank,
     make_upright_bank,
     stature_cost,
 )
@@ -112,7 +114,12 @@ class UprightFitter:
         self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False
     ) -> list[tuple[float, BodyState]]:
         """Return the bank's best bodies with their costs in metres; `quick`: of a fourth of it; `facing` as there."""
-        return make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS, facing, 2 if quick else 1)
+        model, every = self._fitter.model, 2 if quick else 1
+        starts = make_upright_bank(model).find_best(cloud, floor, STARTS, facing, every)
+        if cloud.points[:, 2].max() - floor > CHILD_TOP_M:
+            return starts
+        children = make_child_bank(model).find_best(cloud, floor, STARTS, facing, every)
+        return sorted([*starts, *children], key=lambda start: start[0])[:STARTS]
 
     def fit(
         self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False
