@@ -23,6 +23,7 @@ ARGUMENTS = {
         "auto",
         "z, y or -y: the axis of the cloud's frame that points up; auto: by /tf_static, or the name of the frame",
     ),
+    "fixed_frame": ("", "frame with z up that stands still (odom), where the sensor moves"),
 }
 
 
@@ -33,7 +34,7 @@ def start(values: Values) -> list[Node]:
         inputs |= {"depth": values["depth"], "camera_info": values["camera_info"]}
     else:
         inputs["points"] = find_topic(values["points"], CLOUD)
-    chosen = {name: values[name] for name in ("view", "up") if values[name] != "auto"}
+    chosen = {name: values[name] for name in ("view", "up", "fixed_frame") if values[name] not in ("", "auto")}
     return [make_node(values, "body_fitter", inputs, **chosen, **humans(values))]
 
 
