@@ -16,6 +16,7 @@ from flowing_puppet_ros.body.cloud.coverage import is_single_view
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
+from flowing_puppet_ros.body.segmentation.floor_grid import describe_problem
 from flowing_puppet_ros.body.segmentation.people import segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.segmentation.seen_free import SeenFree
@@ -27,7 +28,6 @@ from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget, FoundBody, JudgedFit, SearchedScan
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
-from flowing_puppet_ros.body.upright.scan_problems import describe_problem
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
 from flowing_puppet_ros.body.upright.sensor_height import SensorHeight
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
