@@ -19,7 +19,11 @@ ARGUMENTS = {
     "camera_info": ("camera_info", "calibration of the depth camera"),
     "initial": ("initial", "joints that start the fit (BodyArray), if another node publishes them"),
     "view": ("auto", "single: one sensor, at the origin of the cloud's frame; full: all sides; auto: found out"),
-    "up": ("auto", "z, y or -y: the axis of the cloud's frame that points up; auto: by the name of the frame"),
+    "up": (
+        "auto",
+        "z, y or -y: the axis of the cloud's frame that points up; auto: by /tf_static, or the name of the frame",
+    ),
+    "fixed_frame": ("", "frame with z up that stands still (odom), where the sensor moves"),
 }
 
 
@@ -30,7 +34,7 @@ def start(values: Values) -> list[Node]:
         inputs |= {"depth": values["depth"], "camera_info": values["camera_info"]}
     else:
         inputs["points"] = find_topic(values["points"], CLOUD)
-    chosen = {name: values[name] for name in ("view", "up") if values[name] != "auto"}
+    chosen = {name: values[name] for name in ("view", "up", "fixed_frame") if values[name] not in ("", "auto")}
     return [make_node(values, "body_fitter", inputs, **chosen, **humans(values))]
 
 

@@ -91,6 +91,7 @@ class SensorPlaces:
     def reset(self) -> None:
         """Forget the recording."""
         self._up_of_nameless = ""
+        self._looked_into: set[str] = set()
         self._anchor: F64 | None = None
         self._missed = False
 
@@ -167,9 +168,11 @@ class SensorPlaces:
 
     def find_alone(self, header: Any, stamp: int, points: F64, of_depth: bool) -> SensorPlace:
         """Return the place of the sensor in the frame of its data, turned so that z points up."""
-        to_z_up = rotation_to_z_up(parse_axis(self._find_up(header.frame_id, points, of_depth)))
+        own = rotation_to_z_up(parse_axis(self._find_up(header.frame_id, points, of_depth)))
         frame = header.frame_id.lstrip("/")
-        here = SensorPlace(to_z_up, np.zeros(3), np.zeros(3), np.eye(3))
+        mounted = self._find_mounted_up(frame)
+        to_z_up = own if mounted is None else rotation_to_z_up(mounted)
+        here = SensorPlace(to_z_up, np.zeros(3), np.zeros(3), own @ to_z_up.T)
         if of_depth or frame == self._sensor:
             return here
         if self._sensor:
@@ -178,8 +181,8 @@ class SensorPlaces:
                 why = self._frames.describe_missing(self._sensor, frame, stamp)
                 self._report.warn(f"{why}: the sensor is taken to be at the origin of {frame!r}")
                 return here
-            own = rotation_to_z_up(parse_axis("-y" if OPTICAL.search(self._sensor) else "z"))
-            return SensorPlace(to_z_up, np.zeros(3), to_z_up @ found[0], own @ found[1].T @ to_z_up.T)
+            sensor = rotation_to_z_up(parse_axis("-y" if OPTICAL.search(self._sensor) else "z"))
+            return SensorPlace(to_z_up, np.zeros(3), to_z_up @ found[0], sensor @ found[1].T @ to_z_up.T)
         one_sided = self._view == "single" and frame in NO_SENSOR_FRAMES
         if one_sided or (self._view != "full" and frame and frame == self._fixed):
             self._report.warn(
@@ -194,12 +197,29 @@ class SensorPlaces:
         height = 0.0 if found is None else float(place.viewpoint[2] - place.put(found[0])[2])
         return replace(place, height=height if height > MIN_SENSOR_HEIGHT_M else None)
 
+    def _find_mounted_up(self, frame: str) -> F64 | None:
+        """Return the direction (3,) that is up in a frame by what it is mounted on; None where it is on nothing.
+
+        The z axis of a robot's base points up (REP-103), however a sensor is held.
+        """
+        if self._up != "auto":
+            return None
+        base, turn = self._frames.find_mount(frame)
+        return None if base == frame or OPTICAL.search(base) else np.asarray(turn[2])
+
     def _find_up(self, frame: str, points: F64, of_depth: bool) -> str:
         """Return the axis that is up in a frame; for one without a name the first cloud decides."""
         if self._up != "auto":
             return self._up
         if of_depth or OPTICAL.search(frame):
             return "-y"
+        if frame and len(points) and frame not in self._looked_into:
+            self._looked_into.add(frame)
+            if not self._fixed and self._find_mounted_up(frame) is None and is_ahead_along_z(points):
+                self._report.warn(
+                    f"the clouds in {frame!r} lie ahead along z as in the frame of a camera, but z is taken as up: name"
+                    " the camera's optical frame, or set up:=-y"
+                )
         if frame or not len(points):
             return "z"
         if not self._up_of_nameless:

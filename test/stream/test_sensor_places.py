@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where sensors are in the frame in which people are tracked, and the sentences for what is not known."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -139,3 +140,38 @@ def test_the_people_of_a_cloud_are_looked_for_as_high_as_its_sensor_is(monkeypat
     component.handle("points", make_cloud(FACTORY, make_header(FACTORY, SECOND, "lidar"), POINTS))
     component.flush()
     assert [cloud.sensor_height for cloud in seen] == [pytest.approx(1.4)]
+
+
+def test_what_a_sensor_is_mounted_on_tells_which_way_is_up_without_a_fixed_frame() -> None:
+    tilted = np.array([[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]])  # looks down
+    frames = FrameTree()
+    frames.add(
+        message(make_transform(FACTORY, make_header(FACTORY, 0, "base"), "lidar", np.array([0, 0, 1.0]), tilted))
+    )
+    place = find(places(frames, fixed="")[0], "lidar", 1.0)
+    np.testing.assert_allclose(place.put(tilted.T @ np.array([3.0, 0.0, -1.0]))[2], -1.0)
+    np.testing.assert_allclose(place.to_sensor @ place.rotation, np.eye(3), atol=1e-12)
+    assert find(places(frames, fixed="", up="z")[0], "lidar", 1.0).put(np.array([0, 0, 1.0]))[2] == 1.0  # as it is set
+    frames = FrameTree()
+    frames.add(message(link(1, "odom", "lidar", 0.0)), moving=True)  # what moves against it tells nothing
+    np.testing.assert_array_equal(find(places(frames, fixed="")[0], "lidar", 1.0).rotation, np.eye(3))
+
+
+def test_nobody_is_tracked_from_one_way_up_to_another() -> None:
+    component = BodyFitterComponent(BodyFitterSettings(), FACTORY)
+    made, _ = places(FrameTree(), fixed="")
+    place = find(made, "lidar", 1.0)
+    turned_over = replace(place, rotation=np.diag([1.0, -1.0, -1.0]))
+    frames = [component._is_turned("lidar", each) for each in (place, place, turned_over, turned_over)]
+    assert frames == [False, False, True, False]
+
+
+def test_a_camera_whose_frame_is_not_named_as_one_is_told() -> None:
+    made, report = places(FrameTree(), fixed="")
+    ahead = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 5], (200, 3))
+    for _ in range(2):
+        made.find(make_header(FACTORY, 0, "camera"), 0, ahead, False)
+    assert len(report.warnings) == 1 and "up:=-y" in report.warnings[0]
+    made, report = places(FrameTree(), fixed="")
+    find(made, "lidar", 1.0)
+    assert not report.warnings

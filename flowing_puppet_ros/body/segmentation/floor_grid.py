@@ -14,6 +14,7 @@ from numba import njit
 from scipy.ndimage import distance_transform_edt, gaussian_filter, minimum_filter1d
 
 from flowing_puppet_ros.body.segmentation.column_index import lay_grid, sort_into_cells
+from flowing_puppet_ros.body.segmentation.planes import find_floor, subsample
 
 CELL_M, MAX_CELLS = 1.0, 200  # edge of a cell; cells a side, so that the grid ends there
 LOW_SHARE = 0.03
@@ -37,6 +38,16 @@ MIN_SEEN_CELLS, MIN_SEEN_SHARE = 2, 0.08  # cells, and their share, whose lowest
 FLOOR_THICKNESS_M, MIN_FLOOR_SHARE, MAX_CEILING_SHARE = 0.1, 0.25, 0.08
 """Distance from the floor up to which points are on it, the share of a scan's points that are on it at least, and the
 share that may be on what is lowest in a scan that is upside down, or below it in one that is not."""
+
+UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
+TILTED = (
+    "the floor seems to be tilted by {:.0f} degrees, so people are missed or lean: publish how the sensor is mounted on"
+    " /tf_static, or set fixed_frame; level the points of a file"
+)
+ONE_RING = "the cloud is a flat scan, of one ring of rays: people are found from several rings on only"
+TILT_CLEARANCE_M, MAX_TILT_RANGE_M = 0.1, 8.0  # half thickness of a floor, and how far from the sensor it is looked for
+MIN_TOLD_TILT_RAD, MAX_TOLD_TILT_RAD = np.radians(8.0), np.radians(60.0)  # steeper planes are walls
+MAX_RING_RAD, MIN_RING_POINTS = np.radians(0.7), 50  # extent of one ring across it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,6 +102,39 @@ def looks_upside_down(points: np.ndarray) -> bool:
         return False
     too_low = (height < -MIN_UPRIGHT_M).mean()
     return bool((np.abs(height) < FLOOR_THICKNESS_M).mean() < MAX_CEILING_SHARE or too_low > MAX_CEILING_SHARE)
+
+
+def describe_problem(points: np.ndarray, viewpoint: np.ndarray, nobody: bool) -> str:
+    """Return why people are missed in a scan with points (N, 3) m, z up, seen from `viewpoint` (3,) m; or "".
+
+    Where somebody is found the scan is neither flat nor upside down: of a room, the ceiling may be all that is level.
+    """
+    if not len(points):
+        return ""
+    if nobody and _is_one_ring(points - viewpoint):
+        return ONE_RING
+    if nobody and looks_upside_down(points):
+        return UPSIDE_DOWN
+    tilt = _measure_tilt(points, viewpoint)
+    return TILTED.format(np.degrees(tilt)) if tilt > MIN_TOLD_TILT_RAD else ""
+
+
+def _is_one_ring(rays: np.ndarray) -> bool:
+    """Return whether rays (N, 3) m from the sensor make one cone or plane about z."""
+    far = rays[np.linalg.norm(rays, axis=1) > TILT_CLEARANCE_M]  # nearer is the sensor itself
+    elevation = np.arctan2(far[:, 2], np.hypot(far[:, 0], far[:, 1]))
+    return len(far) >= MIN_RING_POINTS and bool(np.ptp(elevation) < MAX_RING_RAD)
+
+
+def _measure_tilt(points: np.ndarray, viewpoint: np.ndarray) -> float:
+    """Return how far the floor is from level, radians; 0 where it is not clear which plane is the floor."""
+    thin = subsample(points[np.linalg.norm(points - viewpoint, axis=1) < MAX_TILT_RANGE_M])
+    if len(thin) < MIN_RING_POINTS:
+        return 0.0
+    floor = find_floor(thin, TILT_CLEARANCE_M, np.random.default_rng(0), viewpoint, MAX_TOLD_TILT_RAD)
+    if floor is None or (np.abs(floor.height(thin)) < TILT_CLEARANCE_M).mean() < MIN_FLOOR_SHARE:
+        return 0.0
+    return float(np.arccos(np.clip(floor.normal[2], -1.0, 1.0)))
 
 
 def _find_open_below(points: np.ndarray, viewpoint: np.ndarray, rows: np.ndarray) -> np.ndarray:

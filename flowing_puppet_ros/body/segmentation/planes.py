@@ -128,7 +128,11 @@ def subsample(points: np.ndarray) -> np.ndarray:
 
 
 def find_floor(
-    points: np.ndarray, clearance: float, rng: np.random.Generator, sensor: np.ndarray | None = None
+    points: np.ndarray,
+    clearance: float,
+    rng: np.random.Generator,
+    sensor: np.ndarray | None = None,
+    max_tilt: float = MAX_TILT_RAD,
 ) -> Plane | None:
     """Return the nearly level plane that most points lie on and next to none lie below, or None.
 
@@ -137,10 +141,11 @@ def find_floor(
         clearance: half thickness of the plane, metres.
         rng: source of all randomness.
         sensor: (3,) m, a place above the floor; None where nobody knows.
+        max_tilt: radians, between its normal and z.
     """
     normals, offsets = _sample_planes(points, rng)
     normals, offsets = normals * np.sign(normals[:, 2:]), offsets * np.sign(normals[:, 2])
-    level = normals[:, 2] > np.cos(MAX_TILT_RAD)
+    level = normals[:, 2] > np.cos(max_tilt)
     height = points @ normals[level].T - offsets[level]
     count = (np.abs(height) < clearance).sum(axis=0)
     count[(height < -2 * clearance).mean(axis=0) > MAX_BELOW_FLOOR_SHARE] = 0

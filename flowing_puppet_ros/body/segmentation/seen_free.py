@@ -14,11 +14,16 @@ STRIDE = 8  # every so many rays are followed in a scan, others in the next
 MARGIN_M = 0.4  # before the end of a ray, of what is not known to be free
 MAX_COME_SHARE = 0.2
 """Share of a scan's points at places seen free from which on it is the sensor that moved, and nothing is known."""
+MOVING_SCANS = 50  # for which a sensor that moved is taken to go on
 MAX_DRIFT_M = 10.0  # of the sensor from the middle of the grid, beyond which it starts anew
 
 
 class SeenFree:
-    """Cells of the space about one sensor through which some ray passed in a scan without any point near."""
+    """Cells of the space about one sensor through which some ray passed in a scan without any point near.
+
+    Attributes:
+        moves: whether the sensor moved not long ago against the frame in which its scans are.
+    """
 
     def __init__(self) -> None:
         """Start without any."""
@@ -29,10 +34,16 @@ class SeenFree:
         self._near = self._hit = np.empty(0, np.uint8)
         self._low = np.zeros(3)
         self._scan = 0
+        self._moving_scans = 0
 
     def reset(self) -> None:
         """Forget everything."""
         self._free = None
+        self._moving_scans = 0
+
+    @property
+    def moves(self) -> bool:  # noqa: D102
+        return self._moving_scans > 0
 
     def add(self, points: F64, viewpoint: F64) -> Bools:
         """Return which (N,) of a scan's points (N, 3) m are where the scans before saw through, and remember it.
@@ -47,8 +58,11 @@ class SeenFree:
             self._low = corner
             self._scan = 0
         come = _look_up(points, self._free, self._low)
+        self._moving_scans = max(self._moving_scans - 1, 0)
         if come.sum() > MAX_COME_SHARE * len(come):
             self._free[:] = False
+            self._moving_scans = MOVING_SCANS
+        if self.moves:
             come[:] = False
         number = 1 + self._scan % 255
         if number == 1:

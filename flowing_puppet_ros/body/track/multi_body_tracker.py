@@ -115,6 +115,7 @@ class MultiBodyTracker:
         executor: Executor | None = None,
         first: Mapping[int, BodyFit] = MappingProxyType({}),
         judge: Judge | None = None,
+        sensor_moves: bool = False,
     ) -> list[TrackedBody]:
         """Track everybody to the people of the next cloud.
 
@@ -125,6 +126,7 @@ class MultiBodyTracker:
             executor: where full fits run; None: in line.
             first: bodies of new people that are known already, by their index in `people`.
             judge: tells whether a body is a person; who is none is not shown, and forgotten in the end.
+            sensor_moves: whether furniture seems to move, too.
 
         Returns:
             The bodies of everybody who is seen and has one, in the order of their ids.
@@ -156,7 +158,7 @@ class MultiBodyTracker:
                 self._report.count_unusable(fit)
                 continue
             if judge is not None and fit is not None and track.number not in started:
-                fit = track.weigh(person, fit, judge if track.number in due else None)
+                fit = track.weigh(person, fit, judge if track.number in due else None, sensor_moves)
             if fit is not None and track.prove(person, fit):
                 bodies.append(track.show(fit))
             cloud = SeededCloud(person, _person_seed(seed, track.number))

@@ -102,9 +102,12 @@ class PersonBelief:
         self.odds += (float(np.log(bounded / (1 - bounded))) - self.odds) / self.count
         self.confidence, self.many = confidence, points >= MIN_MANY_POINTS
 
-    def visit(self, points: F64, stamp: int) -> None:
-        """Take its points (N, 3) m at a time in nanoseconds."""
+    def visit(self, points: F64, stamp: int, sensor_moves: bool = False) -> None:
+        """Take its points (N, 3) m at a time in nanoseconds; where the sensor moves, everything does."""
         place = np.median(points, axis=0)
+        if sensor_moves:
+            self.first, self.moved = place[:2], False
+            return
         self.wander.add(points.mean(axis=0), stamp)
         self.moved = self.moved or bool(np.hypot(*(place[:2] - self.first)) > MIN_MOVE_M)
 

@@ -144,11 +144,11 @@ class PersonTrack:
         if self.rough:
             self.motion.allow_turn()
 
-    def weigh(self, person: PersonCloud, fit: BodyFit, judge: Judge | None) -> BodyFit:
+    def weigh(self, person: PersonCloud, fit: BodyFit, judge: Judge | None, sensor_moves: bool) -> BodyFit:
         """Ask a scan, if any, whether it is a person, unless too little is seen; return its body."""
         if self.belief is None:
             self.belief = PersonBelief(person.middle[:2])
-        self.belief.visit(person.points, self.stamp)
+        self.belief.visit(person.points, self.stamp, sensor_moves)
         if judge is not None and not self.tracker.hidden:
             judged = judge(person, fit, self.belief.asks_facing(len(person.points)))
             self.belief.add(judged.probability, judged.confidence, self.stamp, len(person.points))

@@ -18,14 +18,14 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.scene.rig_scene import shows_person
 from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
-from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
+from flowing_puppet_ros.body.segmentation.floor_grid import describe_problem
 from flowing_puppet_ros.body.segmentation.people import segment_people
 from flowing_puppet_ros.body.segmentation.planes import PlaneCache
 from flowing_puppet_ros.body.segmentation.seen_free import SeenFree
 from flowing_puppet_ros.body.settings import SegmentationSettings
 from flowing_puppet_ros.body.track.multi_body_tracker import MultiBodyTracker, MultiBodyTrackerSettings
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
-from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget, FoundBody, JudgedFit
+from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget, FoundBody, JudgedFit, SearchedScan
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
@@ -46,7 +46,10 @@ MAX_FIRST_FITS, MAX_LIVE_FITS = 8, 2
 that the first bodies do not wait for others, which come with the next."""
 SEARCH_EVERY = 3  # scans of a live stream in which somebody is tracked: the others are not searched for new people
 MAX_SCENE_POINTS = 300_000  # of a one-sided scene, evenly taken: more say nothing new about who is in it
-_UPSIDE_DOWN = "the floor seems to be above everything else: is the sensor upside down, or `up` set wrongly?"
+_MOVES = (
+    "much of what is seen seems to have moved, so the sensor moves against the frame in which people are tracked: set"
+    " fixed_frame (odom), or check its transforms; until then furniture is more easily taken for people"
+)
 _NO_FLOOR = (
     "no floor is seen: how high people stand is inferred from their build, so they are not reliable; set"
     " segmentation.sensor_height, or publish base_footprint on /tf"
@@ -161,7 +164,8 @@ class SceneTracker:
             first = {number: body.fit for number, body in enumerate(found) if body.fit is not None}
             seen = [body.person for body in found]
             judge = partial(self._judge, quick=live)
-            bodies = self._tracker.step(seen, cloud.stamp, seed, executor, first, judge)
+            moves = self._seen_free.moves
+            bodies = self._tracker.step(seen, cloud.stamp, seed, executor, first, judge, moves)
             return [replace(body, fit=self._doubt(body.fit)) for body in bodies], self._tracker.occluded_ids
         people = self._with_viewpoint(cloud, self._segment(cloud, known, self._planes))
         if settings.track:
@@ -186,8 +190,8 @@ class SceneTracker:
         if self._settings.scene and self.is_one_sided_scene(cloud):
             proven = self.fit_found(self.find_once(cloud), seed, progress)
             if not proven:
-                down = looks_upside_down(self._in_range(cloud)[1])
-                raise InputError(_NOBODY.format(len(cloud.points)) + (f"; {_UPSIDE_DOWN}" if down else ""))
+                problem = describe_problem(self._in_range(cloud)[1], cloud.viewpoint, nobody=True)
+                raise InputError("; ".join(filter(None, (_NOBODY.format(len(cloud.points)), problem))))
             return [TrackedBody(f"b{number}", fit) for number, fit in enumerate(proven, start=1)]
         people = self._segment(cloud) if self._settings.scene else []
         if not people and (not self._settings.scene or extent <= MAX_HEIGHT_M):
@@ -259,29 +263,15 @@ class SceneTracker:
         """Find the people of a single view; the known ones first. All, or of a live stream the likeliest."""
         rows, points = self._in_range(cloud)
         self._searched = rows
-        if not self._was_searched and len(points):
-            self._was_searched = True
-            if looks_upside_down(points):
-                self._report.warn(_UPSIDE_DOWN)
         normals = None if cloud.normals is None else cloud.normals[rows]
         # Who is tracked needs no search, and who comes can wait for a few scans.
         is_tracked = any(len(body) for body in known)
         only_known = live and is_tracked and self._since_search + 1 < SEARCH_EVERY and not self._finder.left_over
         self._since_search = self._since_search + 1 if only_known else 0
         come = self._seen_free.add(points, cloud.viewpoint) if remember and not only_known else None
-        search = partial(
-            self._finder.find,
-            self._lay_floor(cloud, points, remember) if len(points) else None,
-            normals,
-            cloud.viewpoint,
-            cloud.stamp,
-            known,
-            expected,
-            self._make_budget(remember, live, is_tracked),
-            remember,
-            come,
-            only_known,
-        )
+        scene = self._lay_floor(cloud, points, remember) if len(points) else None
+        scan = SearchedScan(scene, cloud.viewpoint, cloud.stamp, normals, known, expected, come)
+        search = partial(self._finder.find, scan, self._make_budget(remember, live, is_tracked), remember, only_known)
         # Who is tracked will need the range image.
         if live and is_tracked and usable_threads(self._fitter.settings.threads) > 1:
             with ThreadPoolExecutor(1) as beside:
@@ -289,9 +279,20 @@ class SceneTracker:
                 found, cloud = search(), drawn.result()
         else:
             found = search()
+        self._tell_problems(points, cloud.viewpoint, not found)
         people = cloud.with_fields([replace(body.person, rows=rows[body.person.rows]) for body in found])
         moved = [FoundBody(person, body.fit) for person, body in zip(people, found, strict=True)]
         return moved[: max(self._settings.segmentation.max_people, sum(body.fit is None for body in moved))]
+
+    def _tell_problems(self, points: F64, viewpoint: F64, nobody: bool) -> None:
+        """Say once what is wrong with the scans, if anything is, by the first points (N, 3) m."""
+        if not self._was_searched and len(points):
+            self._was_searched = True
+            problem = describe_problem(points, viewpoint, nobody)
+            if problem:
+                self._report.warn(problem)
+        if self._seen_free.moves:
+            self._report.warn(_MOVES)
 
     def _lay_floor(self, cloud: SceneCloud, points: F64, remember: bool) -> SceneHeights:
         """Return the heights of the points (N, 3) m, N > 0, in range; where no floor is seen, over the likeliest."""

@@ -41,6 +41,47 @@ class ExpectedPerson:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class SearchedScan:
+    """A scan in which people are looked for, and what is known of it.
+
+    Attributes:
+        scene: its N points, z up, within the range in which people are searched for; None without any.
+        viewpoint: (3,) position of the sensor, metres.
+        stamp: nanoseconds.
+        normals: (N, 3) or None; only passed on.
+        known: points (K, 3) in metres on each body that is expected in the scan, at its predicted position.
+        expected: where these may be who are not seen there: a candidate that only one of them can have reached is
+            theirs, and needs no fit. Nobody is where it is empty.
+        come: which (N,) points lie where the scans before saw through; None where nothing is known.
+    """
+
+    scene: SceneHeights | None
+    viewpoint: np.ndarray
+    stamp: int = 0
+    normals: np.ndarray | None = None
+    known: Sequence[np.ndarray] = ()
+    expected: Sequence[ExpectedPerson] = ()
+    come: np.ndarray | None = None
+
+    def make_person(
+        self, rows: np.ndarray, score: float = 1.0, owner: int | None = None, proven: bool = True
+    ) -> PersonCloud:
+        """Return the person in some rows (N,) of the scene."""
+        assert self.scene is not None
+        return PersonCloud(
+            self.scene.points[rows],
+            None if self.normals is None else self.normals[rows],
+            self.stamp,
+            self.viewpoint,
+            rows,
+            score,
+            owner,
+            self.scene.floor.locate(*np.median(self.scene.points[rows, :2], axis=0)),
+            proven=proven,
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class JudgedFit:
     """A body: the `probability` that it is a person, and the `confidence` that it is one and close.
 
@@ -161,25 +202,3 @@ def pop_nearest(middles: dict[int, np.ndarray], place: np.ndarray) -> int | None
         return None
     del middles[nearest]
     return nearest
-
-
-def make_person(
-    scene: SceneHeights,
-    normals: np.ndarray | None,
-    viewpoint: np.ndarray,
-    stamp: int,
-    rows: np.ndarray,
-    score: float = 1.0,
-    owner: int | None = None,
-) -> PersonCloud:
-    """Return the person in some rows (N,) of a scene, with the normals (M, 3) of its points, if any."""
-    return PersonCloud(
-        scene.points[rows],
-        None if normals is None else normals[rows],
-        stamp,
-        viewpoint,
-        rows,
-        score,
-        owner,
-        scene.floor.locate(*np.median(scene.points[rows, :2], axis=0)),
-    )

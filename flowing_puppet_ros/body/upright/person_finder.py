@@ -18,13 +18,12 @@ from flowing_puppet_ros.body.segmentation.people import person_score
 from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
 from flowing_puppet_ros.body.upright.found_body import (
     SAME_PERSON_M,
-    ExpectedPerson,
     FitBudget,
     FoundBody,
     JudgedFit,
     ScanView,
+    SearchedScan,
     find_only_reached,
-    make_person,
     pop_nearest,
     take_apart,
 )
@@ -112,36 +111,20 @@ class PersonFinder:
 
     @one_blas_thread()
     def find(
-        self,
-        scene: SceneHeights | None,
-        normals: np.ndarray | None,
-        viewpoint: np.ndarray,
-        stamp: int,
-        known: Sequence[np.ndarray] = (),
-        expected: Sequence[ExpectedPerson] = (),
-        budget: FitBudget | None = None,
-        remember: bool = True,
-        come: np.ndarray | None = None,
-        only_known: bool = False,
+        self, scan: SearchedScan, budget: FitBudget | None = None, remember: bool = True, only_known: bool = False
     ) -> list[FoundBody]:
         """Find the people in a scan; the same scans give the same answer.
 
         Args:
-            scene: its N points, z up, within the range in which people are searched for; None without any.
-            normals: (N, 3) or None; only passed on.
-            viewpoint: (3,) position of the sensor, metres.
-            stamp: of the scan in nanoseconds.
-            known: points (K, 3) in metres on each body that is expected in the scan, at its predicted position.
-            expected: where these may be who are not seen there: a candidate that only one of them can have reached is
-                theirs, and needs no fit. Nobody is where it is empty.
+            scan: what is seen, and who is expected.
             budget: of fits, to the likeliest candidates first; None: as many as are set.
             remember: whether what is no person is remembered, and what was none is left out.
-            come: which (N,) points lie where the scans before saw through; None where nothing is known.
             only_known: nobody else is looked for, unless one of those who are expected is not there.
         """
         self.last_rejected = []
         self.left_over = False
         self._view = None
+        scene, viewpoint, known, expected = scan.scene, scan.viewpoint, scan.known, scan.expected
         if scene is None or len(scene.points) < self._settings.min_points:
             return []
         points = scene.points
@@ -152,7 +135,7 @@ class PersonFinder:
         candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known)
         if only_known and len(owned) < sum(len(body) > 0 for body in known):
             candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
-        make = partial(make_person, scene, normals, viewpoint, stamp)
+        make = scan.make_person
         people = [
             FoundBody(make(rows, owner=owner), None)
             for owner, rows in owned.items()
@@ -161,7 +144,7 @@ class PersonFinder:
         self._owned = np.zeros(len(points), dtype=bool)
         for body in people:
             self._owned[body.person.rows] = True
-        view = self._view = ScanView(scene, ScanRays(points, viewpoint), stamp, remember, come)
+        view = self._view = ScanView(scene, ScanRays(points, viewpoint), scan.stamp, remember, scan.come)
         seen = {body.person.owner for body in people}
         unseen = {owner: middle for owner, middle in enumerate(middles) if owner not in seen}
         taken = [middle for owner, middle in enumerate(middles) if owner in seen]
@@ -186,7 +169,7 @@ class PersonFinder:
         for candidate in bent:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
                 taken.append(candidate.middle)
-                people.append(FoundBody(replace(make(candidate.rows, score=0.0), proven=False), None))
+                people.append(FoundBody(make(candidate.rows, score=0.0, proven=False), None))
         return people
 
     def _fit_offered(

@@ -15,8 +15,10 @@ from flowing_puppet_ros.model import weights
 
 MODEL = "clouds"  # name of the shipped file
 MIN_ODDS, MAX_ODDS = 0.02, 0.98  # of each forest
-ACCURACY_NAMES = ("cost", "distance", "supported", "explained", "hidden", "log_points", "confidence", "stature")
-"""Evidence that tells how close the joints are."""
+ACCURACY_NAMES = (
+    "cost", "distance", "supported", "explained", "hidden", "log_points", "confidence", "stature", "foreign", "lowest",
+)  # fmt: skip
+"""Evidence that tells how close the joints are; how low the lowest point is tells whether the legs are seen."""
 _ACCURACY_COLUMNS = [EVIDENCE_NAMES.index(name) for name in ACCURACY_NAMES]
 
 

@@ -8,7 +8,7 @@ height, comes from the floor and from the bank, not from the points.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -30,6 +30,9 @@ LEAN_RAD, LEAN_DEVIATION_RAD = np.radians(2.0), np.radians(7.0)
 model draws all trunks upright."""
 MEAN_STATURE_M, STATURE_DEVIATION_M, STATURE_COST_M = 1.72, 0.1, 0.002
 """Statures of people, and the mean distance that one squared deviation from them is worth."""
+MAX_DEVIATIONS = 3.0  # of a stature, beyond which it costs no more
+CHILD_TOP_M, CHILD_STATURES_M = 1.5, (1.05, 1.45)
+"""Height of the top of a cloud over the floor up to which children are tried, too, and their statures."""
 ROUGH_POINTS, FINE_POINTS = 90, 300  # surface points of a body
 ROUGH_TARGETS, FINE_TARGETS = 60, 250  # of the cloud
 FINE_BODIES, MAX_SAME_YAW = 96, 2
@@ -115,33 +118,60 @@ def _take_of_each_yaw(order: np.ndarray, yaw: np.ndarray, count: int) -> list[in
 
 
 def stature_cost(stature: np.ndarray) -> np.ndarray:
-    """Return the cost (P,) m of statures (P,) m."""
-    return STATURE_COST_M * ((stature - MEAN_STATURE_M) / STATURE_DEVIATION_M) ** 2
+    """Return the cost (P,) m of statures (P,) m; beyond adults', children are as likely as one another."""
+    return STATURE_COST_M * np.minimum(((stature - MEAN_STATURE_M) / STATURE_DEVIATION_M) ** 2, MAX_DEVIATIONS**2)
 
 
 @lru_cache(maxsize=3)
 @one_blas_thread()
 def make_upright_bank(model: StitchedPuppet) -> UprightBank:
     """Draw the bank; made once for a model."""
-    rng = np.random.default_rng(0)
-    rows = farthest_points(model.vertices(model.rest_state()), FINE_POINTS)
-    states: list[BodyState] = []
-    points, normals, statures = [], [], []
-    for state, vertices in _draw_bodies(model, rng):
-        if len(states) == POSES:
+    bodies: list[tuple[BodyState, np.ndarray]] = []
+    for state, vertices in _draw_bodies(model, np.random.default_rng(0)):
+        if len(bodies) == POSES:
             break
         joints = dict(zip(model.joint_names, model.joints(vertices), strict=True))
         if not _is_upright(joints):
             continue
         hips = (joints["left_hip"] + joints["right_hip"]) / 2
         down = np.array([-hips[0], -hips[1], -vertices[:, 2].min()])
-        states.append(BodyState(state.center + down, state.rotation, state.pose, state.shape))
-        points.append((vertices + down)[rows])
+        bodies.append((BodyState(state.center + down, state.rotation, state.pose, state.shape), vertices + down))
+    return _turn_bodies(model, bodies)
+
+
+@lru_cache(maxsize=3)
+@one_blas_thread()
+def make_child_bank(model: StitchedPuppet) -> UprightBank:
+    """Make children of the bank's adults: in the same poses, as small as the model can be made; once for a model.
+
+    A stature is linear in the shape, so that the least unusual small shape is along its gradient.
+    """
+    adults = make_upright_bank(model)
+    rest = model.rest_state().shape
+    base, units = model.measure_height(rest), np.eye(rest.shape[1])
+    slope = np.array([model.measure_height(rest + unit) - base for unit in units])
+    wanted = np.linspace(*CHILD_STATURES_M, POSES)[np.random.default_rng(0).permutation(POSES)]
+    bodies = []
+    for state, stature, small in zip(adults.states, adults.stature, wanted, strict=True):
+        shape = state.shape + (small - stature) * slope / (slope @ slope)
+        child = BodyState(state.center * (small / stature), state.rotation, state.pose, shape)
+        vertices = model.vertices(child)
+        down = np.array([0.0, 0.0, -vertices[:, 2].min()])
+        bodies.append((replace(child, center=child.center + down), vertices + down))
+    return _turn_bodies(model, bodies)
+
+
+def _turn_bodies(model: StitchedPuppet, bodies: list[tuple[BodyState, np.ndarray]]) -> UprightBank:
+    """Make a bank of bodies that face along x and their vertices (V, 3) m."""
+    rows = farthest_points(model.vertices(model.rest_state()), FINE_POINTS)
+    points, normals, statures = [], [], []
+    for state, vertices in bodies:
+        points.append(vertices[rows])
         normals.append(vertex_normals(vertices, model.faces)[rows])
         statures.append(model.measure_height(state.shape))
     turns = so3.exp(np.array([0.0, 0.0, 2 * np.pi / YAWS]) * np.arange(YAWS)[:, None])
     turned = [np.concatenate([np.stack(each) @ turn.T for turn in turns]) for each in (points, normals)]
-    return UprightBank(states, turns, turned[0], turned[1], np.array(statures))
+    return UprightBank([state for state, _ in bodies], turns, turned[0], turned[1], np.array(statures))
 
 
 def _draw_bodies(model: StitchedPuppet, rng: np.random.Generator) -> Iterator[tuple[BodyState, np.ndarray]]:

@@ -20,6 +20,8 @@ from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
 from flowing_puppet_ros.body.upright.upright_bank import (
+    CHILD_TOP_M,
+    make_child_bank,
     make_upright_bank,
     stature_cost,
 )
@@ -85,8 +87,8 @@ class UprightFitter:
         self._threads = usable_threads(min(fitter.settings.threads, max_threads))
 
     def warm_up(self) -> None:
-        """Make the bank beforehand."""
-        make_upright_bank(self._fitter.model)
+        """Make the bank beforehand, children included."""
+        make_child_bank(self._fitter.model)
 
     def make_cloud(
         self,
@@ -111,8 +113,16 @@ class UprightFitter:
     def find_rough(
         self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False
     ) -> list[tuple[float, BodyState]]:
-        """Return the bank's best bodies with their costs in metres; `quick`: of a fourth of it; `facing` as there."""
-        return make_upright_bank(self._fitter.model).find_best(cloud, floor, STARTS, facing, 2 if quick else 1)
+        """Return the bank's best bodies with their costs in metres; `quick`: of a fourth of it; `facing` as there.
+
+        Of children a sixteenth: most of what is low is none.
+        """
+        model, every = self._fitter.model, 2 if quick else 1
+        starts = make_upright_bank(model).find_best(cloud, floor, STARTS, facing, every)
+        if cloud.points[:, 2].max() - floor > CHILD_TOP_M:
+            return starts
+        children = make_child_bank(model).find_best(cloud, floor, STARTS, facing, every**2)
+        return sorted([*starts, *children], key=lambda start: start[0])[:STARTS]
 
     def fit(
         self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False

@@ -10,6 +10,7 @@ import numpy as np
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBody
 from flowing_puppet_ros.evaluate.scene.scene_meshes import HALF_SIZE_M, Disc
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import (
+    SceneKind,
     SyntheticScene,
     cover_people,
     draw_height,
@@ -34,29 +35,27 @@ def draw_sequence(
     scanner: str,
     people: int,
     scans: int,
-    lookalikes: int = 0,
-    covered: float = 0.0,
+    kind: SceneKind = SceneKind(),  # noqa: B008
 ) -> Iterator[SyntheticScene]:
     """Draw `scans` scans, 0.1 s apart, of one place with people of whom most walk; the sensor stands still.
 
-    The others stand as people in motion capture do, who sway. `lookalikes` as in `draw_scene`, and of those who stand a
-    share `covered`.
+    The others stand as people in motion capture do, who sway; a share of these is covered.
     """
-    height = draw_height(rng, place, scanner)
-    meshes, blocked = make_place(rng, place, lookalikes)
+    height = draw_height(rng, place, scanner, kind.height)
+    meshes, blocked = make_place(rng, place, kind.lookalikes)
     standing = place_people(source, rng, place, people, blocked, find_view(scanner))
     motions: list[list[TrueBody]] = []
     for body in standing:
         walked = _draw_walk(source, rng, place, body, blocked, scans) if rng.random() < WALKING_SHARE else None
         # Their own random numbers: whoever walks does so alike, whether those who stand sway or not.
         motions.append(walked or source.sway(rng.spawn(1)[0], body, scans, RATE_HZ))
-        if covered and walked is None:
-            meshes += cover_people(rng.spawn(1)[0], [body], covered)
+        if kind.covered and walked is None:
+            meshes += cover_people(rng.spawn(1)[0], [body], kind.covered)
     down = np.array([0.0, 0.0, -height])
     for number in range(scans):
         bodies = [motion[number] for motion in motions]
         visible = [(body.vertices, source.triangles) for body in bodies]
-        points, owner = scan_scene(meshes, visible, rng, scanner, height)
+        points, owner = scan_scene(meshes, visible, rng, scanner, height, kind.rain)
         yield SyntheticScene(points, owner, [body.translate(down) for body in bodies], -height)
 
 

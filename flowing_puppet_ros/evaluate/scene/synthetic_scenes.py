@@ -34,6 +34,8 @@ SENSOR_HEIGHT_M = {"room": (0.5, 2.2), "street": (1.5, 2.2), "hall": (0.6, 3.0)}
 DISTANCE_M = {"room": (2.0, 8.0), "street": (3.0, 20.0), "hall": (3.0, 16.0)}  # of the people
 MIN_PERSON_GAP_M = 0.55  # between the middles of two people
 MAX_RANGE_M = 60.0  # of the scanners
+MIN_DROP_M, MEAN_DROP_M = 0.5, 4.0
+"""Distance of the nearest drop, and of a drop beyond it in the mean: farther ones send little back."""
 MAX_TRUNK_TILT_RAD, MIN_UPRIGHT_SHARE = np.radians(35.0), 0.85
 """Tilt of the trunk, and height over the stature, of people who stand or walk."""
 MIN_COVER_M, MAX_COVER_M, COVER_GAP_M = (0.3, 1.0, 0.6), (1.8, 4.0, 1.4), 0.5
@@ -59,33 +61,47 @@ class SyntheticScene:
     floor: float
 
 
+@dataclass(frozen=True, slots=True)
+class SceneKind:
+    """What makes a scene harder, beside what every place has; without it the same random numbers follow.
+
+    Attributes:
+        lookalikes: other things that stand as people do.
+        covered: share of the people before whom something as high as a table or a car stands.
+        rain: share of the rays that end on a drop, unless something nearer stops them.
+        height: metres, of the sensor over the floor; None: drawn.
+    """
+
+    lookalikes: int = 0
+    covered: float = 0.0
+    rain: float = 0.0
+    height: float | None = None
+
+
 def draw_scene(
     source: BodySource,
     rng: np.random.Generator,
     place: str,
     scanner: str,
     people: int,
-    lookalikes: int = 0,
-    covered: float = 0.0,
+    kind: SceneKind = SceneKind(),
 ) -> SyntheticScene:
-    """Draw a scene with `people` standing or walking people and scan it; as many as find a free place are in it.
-
-    Beside what every place has, `lookalikes` other things are in it that stand as people do, and something as high as a
-    table or a car stands before a share of the people, who are `covered` by it.
-    """
-    height = draw_height(rng, place, scanner)
-    meshes, blocked = make_place(rng, place, lookalikes)
+    """Draw a scene with `people` standing or walking people and scan it; as many as find a free place are in it."""
+    height = draw_height(rng, place, scanner, kind.height)
+    meshes, blocked = make_place(rng, place, kind.lookalikes)
     bodies = place_people(source, rng, place, people, blocked, find_view(scanner))
-    if covered:
-        meshes += cover_people(rng.spawn(1)[0], bodies, covered)
-    points, owner = scan_scene(meshes, [(body.vertices, source.triangles) for body in bodies], rng, scanner, height)
+    if kind.covered:
+        meshes += cover_people(rng.spawn(1)[0], bodies, kind.covered)
+    visible = [(body.vertices, source.triangles) for body in bodies]
+    points, owner = scan_scene(meshes, visible, rng, scanner, height, kind.rain)
     down = np.array([0.0, 0.0, -height])
     return SyntheticScene(points, owner, [body.translate(down) for body in bodies], -height)
 
 
-def draw_height(rng: np.random.Generator, place: str, scanner: str) -> float:
-    """Draw the height of a scanner over the floor of a place, metres."""
-    return float(rng.uniform(*(DOME_HEIGHT_M if scanner == "dome" else SENSOR_HEIGHT_M[place])))
+def draw_height(rng: np.random.Generator, place: str, scanner: str, given: float | None = None) -> float:
+    """Draw the height of a scanner over the floor of a place, metres, unless it is given."""
+    drawn = float(rng.uniform(*(DOME_HEIGHT_M if scanner == "dome" else SENSOR_HEIGHT_M[place])))
+    return drawn if given is None else given
 
 
 def find_view(scanner: str) -> float:
@@ -164,9 +180,17 @@ def is_upright(body: TrueBody, names: Sequence[str]) -> bool:
 
 
 def scan_scene(
-    meshes: Sequence[Mesh], people: Sequence[Mesh], rng: np.random.Generator, scanner: str, height: float
+    meshes: Sequence[Mesh],
+    people: Sequence[Mesh],
+    rng: np.random.Generator,
+    scanner: str,
+    height: float,
+    rain: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Scan meshes from (0, 0, `height`) m; return points (N, 3) in the sensor's frame and whose they are (N,)."""
+    """Scan meshes from (0, 0, `height`) m; return points (N, 3) in the sensor's frame and whose they are (N,).
+
+    A share of the rays, `rain`, meets a drop.
+    """
     o3d = import_extra("open3d", "scans", "a scan of synthetic people")
 
     scene = o3d.t.geometry.RaycastingScene(nthreads=1)
@@ -180,6 +204,10 @@ def scan_scene(
     rays = np.concatenate([origins, directions], axis=1, dtype=np.float32)
     hits = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=1)
     distance, geometry = hits["t_hit"].numpy().astype(np.float64), hits["geometry_ids"].numpy().astype(np.int64)
+    if rain:
+        drops = draw_drops(rng.spawn(1)[0], len(distance), rain)
+        geometry[drops < distance] = len(people)
+        distance = np.minimum(distance, drops)
     seen = np.isfinite(distance) & (distance < MAX_RANGE_M)
     ranged = distance[seen]
     deviation = noise if scanner != "depth" else 0.0012 * ranged**2
@@ -189,6 +217,12 @@ def scan_scene(
         ranged, seen = ranged[near], np.flatnonzero(seen)[near]
     owner = geometry[seen]
     return directions[seen] * ranged[:, None], np.where(owner < len(people), owner, -1)
+
+
+def draw_drops(rng: np.random.Generator, rays: int, share: float) -> np.ndarray:
+    """Return the distance (`rays`,) of the drop that each ray would meet, metres; infinite for all but a share."""
+    away = MIN_DROP_M + rng.exponential(MEAN_DROP_M, rays)
+    return np.where(rng.random(rays) < share, away, np.inf)
 
 
 def make_rays(rng: np.random.Generator, scanner: str) -> tuple[np.ndarray, float]:

@@ -27,6 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--max-fits", type=int, default=10, help="bodies fitted to what looks like a person, a scan [10]"
     )
+    parser.add_argument(
+        "--keep-forests", action="store_true", help="learn only how close joints are, to the shipped forests"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of all random draws [0]")
     parser.add_argument("--out", type=Path, required=True, help=f"folder for people_{MODEL}.npz and its model card")
 
@@ -37,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
     fitter = BodyFitter(StitchedPuppet.load(), FitterSettings())
     scenes = read_scenes(arguments.scenes, rotation_to_z_up(parse_axis(arguments.up)))
     examples = collect_examples(fitter, scenes, arguments.max_fits, arguments.seed)
-    model = learn_model(examples, arguments.seed)
+    model = learn_model(examples, arguments.seed, PersonModel.load() if arguments.keep_forests else None)
     path = arguments.out / f"people_{MODEL}.npz"
     np.savez_compressed(path, **model.to_arrays())  # type: ignore[arg-type]
     path.with_suffix(".md").write_text(format_card(examples, model, arguments), encoding="utf-8")

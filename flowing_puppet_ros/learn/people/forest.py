@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,11 @@ CLOSE_M = 0.10  # mean error of the joints of a body that is close
 REGULARISATION = 1.0  # of the logistic regression
 
 
-def learn_model(examples: CandidateExamples, seed: int) -> PersonModel:
-    """Learn from examples; the same examples and seed give the same model."""
-    from sklearn.linear_model import LogisticRegression
+def learn_model(examples: CandidateExamples, seed: int, kept: PersonModel | None = None) -> PersonModel:
+    """Learn from examples; the same examples and seed give the same model.
 
+    Of a model that is `kept`, only what tells how close the joints are is learned anew.
+    """
     fitted = examples.fitted
     tracked = np.isfinite(examples.tracked).all(axis=1)
     evidence = np.concatenate([examples.evidence[fitted], examples.tracked[tracked]])
@@ -33,18 +35,27 @@ def learn_model(examples: CandidateExamples, seed: int) -> PersonModel:
         np.concatenate([each[fitted], each[tracked]])
         for each in (examples.is_person, examples.scan, examples.joint_error)
     )
-    calibration = _calibrate(log_odds(predict_unseen(evidence, truth, scan, seed)), truth)
+    accuracy = _learn_accuracy(evidence, error)
+    if kept is not None:
+        return replace(kept, accuracy=accuracy)
+    return PersonModel(
+        _flatten(make_forest(seed).fit(examples.shape, examples.is_person)),
+        _flatten(make_forest(seed).fit(evidence, truth)),
+        _calibrate(log_odds(predict_unseen(evidence, truth, scan, seed)), truth),
+        accuracy,
+    )
+
+
+def _learn_accuracy(evidence: np.ndarray, error: np.ndarray) -> np.ndarray:
+    """Return the weights and the constant (K,) of the log odds that bodies are close, by their mean error (N,) m."""
+    from sklearn.linear_model import LogisticRegression
+
     known = np.isfinite(error)
     inputs, close = select_accuracy(evidence[known]), error[known] < CLOSE_M
     mean, scale = inputs.mean(axis=0), np.maximum(inputs.std(axis=0), 1e-9)
     accuracy = LogisticRegression(C=REGULARISATION).fit((inputs - mean) / scale, close)
     weight = accuracy.coef_[0] / scale
-    return PersonModel(
-        _flatten(make_forest(seed).fit(examples.shape, examples.is_person)),
-        _flatten(make_forest(seed).fit(evidence, truth)),
-        calibration,
-        np.append(weight, accuracy.intercept_[0] - weight @ mean),
-    )
+    return np.append(weight, accuracy.intercept_[0] - weight @ mean)
 
 
 def _calibrate(judged: np.ndarray, truth: np.ndarray) -> np.ndarray:

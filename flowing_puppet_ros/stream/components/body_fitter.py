@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import BodyFitter, Progress
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES
 from flowing_puppet_ros.body.scene.scene_cloud import RegionSettings, SceneCloud, crop_to_region
@@ -62,8 +63,9 @@ class BodyFitterSettings(SceneSettings):
     model: str = setting("neutral", "body model", choices=("neutral", "female", "male"))
     up: str = setting(
         "auto",
-        "axis of the cloud's frame that points up; auto: -y in frames named *optical or *optical_frame and for"
-        " clouds without a frame_id that lie ahead along z as those of cameras do, else z",
+        "axis of the cloud's frame that points up; auto: z of what the sensor is mounted on by /tf_static, else -y in"
+        " frames named *optical or *optical_frame and for clouds without a frame_id that lie ahead along z as those of"
+        " cameras do, else z",
         choices=("auto", *UP_AXES),
     )
     fixed_frame: str = setting(
@@ -140,6 +142,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             settings.floor_frame,
         )
         self._is_fixed = False
+        self._turns: dict[str, F64] = {}
         self._rig = DepthRig(settings.rig, self._places, self.report, factory) if settings.rig.cameras else None
         if self._rig is not None:  # people are found by depth and silhouettes
             self.inputs = self._rig.ports
@@ -324,7 +327,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
             rig, decode = self._rig, self._decode
             scene, place, is_known = decode(cloud, of_depth) if rig is None else rig.merge(cloud, decode)
             scene = replace(scene, stamp=self._clock.advance(stamp))
-            if is_known and place.is_fixed != self._is_fixed:
+            if is_known and (place.is_fixed != self._is_fixed or self._is_turned(cloud.header.frame_id, place)):
                 self._is_fixed = place.is_fixed
                 self._people.reset()
                 self._joined.reset_people()
@@ -339,6 +342,13 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         self.counters["bodies"] += len(found.bodies)
         self.counters["people in colour only"] += len(found.coarse)
         return self._outputs.make(cloud.header, found.bodies, found.occluded, self._subscribed, found.coarse)
+
+    def _is_turned(self, frame: str, place: SensorPlace) -> bool:
+        """Return whether what is up in a frame of clouds is known better since its last cloud."""
+        if place.is_fixed:
+            return False
+        before, self._turns[frame] = self._turns.get(frame), place.rotation
+        return before is not None and not np.array_equal(before, place.rotation)
 
     def _find_people(
         self, scene: SceneCloud, header: Any, stamp: int, place: SensorPlace, is_known: bool

@@ -44,6 +44,11 @@ def decode_pixels(message: Any) -> tuple[F64, F64 | None, I64]:
         # The median takes long, and is needed only where some points may be too far from it.
         if np.abs(known).max() >= _MAX_DISTANCE_M / 2:
             good[good] = _are_all(np.abs(known - np.median(known, axis=0)) < _MAX_DISTANCE_M)
+            if not good.any():
+                raise InputError(
+                    f"the {len(known)} points of the cloud lie {_MAX_DISTANCE_M:g} m and more apart: they should be in"
+                    " metres"
+                )
     places = np.flatnonzero(good)
     if not all(name in types for name in _NORMALS):
         return points[good], None, places

@@ -201,6 +201,16 @@ class FrameTree:
         """Return the topmost known ancestor of `frame`, or `frame` itself when it has none."""
         return self._list_ancestors(frame)[-1]
 
+    def find_mount(self, frame: str) -> tuple[str, F64]:
+        """Return the topmost frame to which `frame` is fixed, and the rotation (3, 3) from it to that one."""
+        turn = np.eye(3)
+        for each in self._list_ancestors(frame):
+            link = self._links.get(each)
+            if link is None or not link.is_static:
+                return each, turn
+            turn = _read_pose(link.poses[-1])[1] @ turn
+        raise AssertionError("the last ancestor has no parent")
+
     def _list_ancestors(self, frame: str) -> list[str]:
         """Return a frame and its ancestors, the root last."""
         found = [frame]

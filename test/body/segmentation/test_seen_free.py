@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from flowing_puppet_ros.body.segmentation.seen_free import SeenFree
+from flowing_puppet_ros.body.segmentation.seen_free import MOVING_SCANS, SeenFree
 
 
 def scan_wall(person_y: float | None, sensor: np.ndarray, noise: int) -> tuple[np.ndarray, np.ndarray]:
@@ -34,7 +34,11 @@ def test_a_moved_sensor_in_its_own_frame_shows_nothing_and_in_a_fixed_one_the_sa
     points, _ = scan_wall(None, np.zeros(3), 0)
     for _ in range(8):
         own.add(points, np.zeros(3))
-    assert not own.add(points - [1.5, 0.0, 0.0], np.zeros(3)).any()  # all of it seems to have come
+    moves = [own.moves]
+    for _ in range(MOVING_SCANS + 1):  # in the first of them all seems to have come
+        assert not own.add(points - [1.5, 0.0, 0.0], np.zeros(3)).any()
+        moves.append(own.moves)
+    assert moves == [False, *[True] * MOVING_SCANS, False]
     fixed = SeenFree()
     for step in range(12):
         place = np.array([0.1 * step, 0.0, 0.0])

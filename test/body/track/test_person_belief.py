@@ -99,3 +99,11 @@ def test_several_scans_decide_which_way_somebody_faces_and_turn_once() -> None:
     walking = PersonBelief(np.zeros(2))
     walking.visit(np.array([[0.6, 0.0, 1.0]]), 0)  # a walk shows it
     assert not walking.asks_facing(60)
+
+
+def test_nothing_has_moved_against_a_sensor_that_moves() -> None:
+    belief, moved = PersonBelief(np.zeros(2)), []
+    for step, sensor_moves in enumerate((False, True, False)):
+        belief.visit(np.array([[0.6 + 0.3 * step, 0.0, 1.0]]), 100_000_000 * step, sensor_moves)
+        moved.append(belief.moved)
+    assert moved == [True, False, False]

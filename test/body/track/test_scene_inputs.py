@@ -6,10 +6,10 @@ import pytest
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
-from flowing_puppet_ros.body.segmentation.candidates import SceneHeights
 from flowing_puppet_ros.body.segmentation.floor_grid import looks_upside_down
 from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track.scene_tracker import MAX_SCENE_POINTS, SceneSettings, SceneTracker
+from flowing_puppet_ros.body.upright.found_body import SearchedScan
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.reporting import Report
@@ -55,6 +55,14 @@ def test_a_sensor_that_hangs_head_first_is_told() -> None:
     assert not looks_upside_down(yard()[20_000:])  # the floor was cut away
 
 
+def test_a_flat_scan_and_a_tilted_sensor_are_told() -> None:
+    angle = np.linspace(0, 2 * np.pi, 1800)
+    assert "one ring" in find(np.column_stack([8 * np.cos(angle), 5 * np.sin(angle), np.full(1800, 0.0)]))[1][0]
+    pitch = np.radians(20.0)
+    turn = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
+    assert "tilted by 20 degrees" in find(yard() @ turn)[1][0]
+
+
 def test_a_scan_in_the_frame_of_a_map_is_refused_in_a_sentence() -> None:
     with pytest.raises(InputError, match=r"the nearest point .* beyond the segmentation\.max_range of 30 m"):
         find(yard() + np.array([500.0, 300.0, 20.0]))
@@ -66,8 +74,9 @@ def test_millions_of_points_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None
 
     sizes = []
 
-    def find_nobody(_: PersonFinder, scene: SceneHeights, *rest: object) -> list[object]:
-        sizes.append(len(scene.points))
+    def find_nobody(_: PersonFinder, scan: SearchedScan, *rest: object) -> list[object]:
+        assert scan.scene is not None
+        sizes.append(len(scan.scene.points))
         return []
 
     monkeypatch.setattr(PersonFinder, "find", find_nobody)

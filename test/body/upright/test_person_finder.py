@@ -13,6 +13,7 @@ from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights
 from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track.scene_tracker import MAX_FIRST_FITS, SceneSettings, SceneTracker
+from flowing_puppet_ros.body.upright.found_body import SearchedScan
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank
 from flowing_puppet_ros.evaluate.body.synthetic_scans import make_box
@@ -53,7 +54,7 @@ def test_the_person_is_found_at_their_height_and_the_cupboard_is_not(
     for threads in (1, 2):
         fitter = BodyFitter(StitchedPuppet.load(), FitterSettings(threads=threads))
         finder = PersonFinder(fitter, PersonFinderSettings())
-        (body,) = finder.find(SceneHeights.of(points, ORIGIN), None, ORIGIN, 0)
+        (body,) = finder.find(SearchedScan(SceneHeights.of(points, ORIGIN), ORIGIN))
         assert body.fit is not None
         found.append((body.person, body.fit))
         assert len(finder.last_rejected) >= 1  # the cupboard, among others
@@ -115,9 +116,10 @@ def test_who_stands_in_a_large_cluster_is_found_again_as_the_one_who_is_known(
     fence = np.column_stack([np.full(3000, PLACE[0] + 0.25), PLACE[1] + 0.25 + gap, heights])
     finder = PersonFinder(BodyFitter(StitchedPuppet.load(), FitterSettings()), PersonFinderSettings())
     joined = np.concatenate([points, fence])
-    (first,) = finder.find(SceneHeights.of(joined, ORIGIN), None, ORIGIN, 0)
+    (first,) = finder.find(SearchedScan(SceneHeights.of(joined, ORIGIN), ORIGIN))
     assert first.fit is not None and first.person.owner is None
-    again = finder.find(SceneHeights.of(joined, ORIGIN), None, ORIGIN, 100_000_000, [first.fit.vertices[::8]])
+    known = [first.fit.vertices[::8]]
+    again = finder.find(SearchedScan(SceneHeights.of(joined, ORIGIN), ORIGIN, 100_000_000, known=known))
     assert [body.person.owner for body in again] == [0]
     assert again[0].person.rows is not None and (owner[again[0].person.rows[:-1]] == 0).mean() > 0.5
 
@@ -150,7 +152,7 @@ def test_a_full_fit_that_faces_the_other_way_does_not_turn_the_body(scan: tuple[
     feet, shins = (points[(owner == 0) & (height > low) & (height < low + 0.1)] for low in (0.0, 0.2))
     toes = (feet.mean(axis=0) - shins.mean(axis=0))[:2]
     finder = PersonFinder(BodyFitter(StitchedPuppet.load(), FitterSettings()), PersonFinderSettings())
-    (body,) = finder.find(SceneHeights.of(points, ORIGIN), None, ORIGIN, 0)
+    (body,) = finder.find(SearchedScan(SceneHeights.of(points, ORIGIN), ORIGIN))
     assert body.fit is not None and body.person.floor is not None
     cloud = finder.upright.make_cloud(body.person.points, ORIGIN, None)
     turned = finder.upright.turn_round(body.fit.state, cloud, body.person.floor).fit

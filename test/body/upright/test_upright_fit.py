@@ -8,6 +8,7 @@ from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.body.settings import FitterSettings
+from flowing_puppet_ros.body.upright.upright_bank import make_child_bank
 from flowing_puppet_ros.body.upright.upright_fit import (
     FLOOR_WEIGHT,
     SOLE_VERTICES,
@@ -47,6 +48,19 @@ def test_few_points_tell_place_and_height_and_nothing_about_limbs(fitter: BodyFi
     assert (kept.visibility.joints[wrists] == Visibility.INFERRED).all()
     assert not kept.reliable
     np.testing.assert_array_equal(kept.vertices, fit.vertices)
+
+
+def test_a_child_is_as_tall_as_it_is(fitter: BodyFitter) -> None:
+    model = fitter.model
+    small = 1.2 / model.measure_height(model.rest_state().shape)
+    points, floor = see(model, 300)
+    points = np.column_stack([points[:, :2] * small, floor + (points[:, 2] - floor) * small])
+    upright = UprightFitter(fitter)
+    found = upright.fit(upright.make_cloud(points, SENSOR, None), floor)
+    assert abs(found.stature - 1.2) < 0.06
+    bank = make_child_bank(model)
+    assert bank.stature.min() > 1.0 and bank.stature.max() < 1.5
+    assert abs(model.vertices(bank.states[7])[:, 2].min()) < 1e-9
 
 
 @pytest.mark.slow

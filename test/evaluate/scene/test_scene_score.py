@@ -91,6 +91,15 @@ def test_scanners_see_the_near_side_of_what_stands_before_them(scanner: str) -> 
     assert len(around) and (np.hypot(*around[:, :2].T) > 6.5).all()
 
 
+def test_some_rays_meet_drops_before_what_they_would_meet() -> None:
+    wall, post = make_prism((0.0, 0.0), 7.0, 0, 3.0, 64), make_prism((4.0, 0.0), 0.3, 0, 2.0, 64)
+    dry, _ = scan_scene([wall], [post], np.random.default_rng(0), "spinning-16", 1.2)
+    wet, owner = scan_scene([wall], [post], np.random.default_rng(0), "spinning-16", 1.2, rain=0.1)
+    drops = np.linalg.norm(wet, axis=1) < 3.4
+    assert not (np.linalg.norm(dry, axis=1) < 3.4).any()
+    assert 0.03 < drops.mean() < 0.1 and (owner[drops] == -1).all()
+
+
 def test_who_stands_is_told_from_who_walks() -> None:
     people = []
     for step in range(4):

@@ -100,3 +100,10 @@ def test_points_that_no_sensor_reaches_are_left_out_wherever_the_frame_is() -> N
     points, normals = decode_cloud(message)
     np.testing.assert_allclose(points, person, atol=1e-3)
     assert normals is not None and normals.shape == (200, 3)
+
+
+def test_points_in_millimetres_are_refused_in_a_sentence() -> None:
+    points = np.random.default_rng(0).uniform(-5000, 5000, (100, 3)) * [1, 1, 0] + [0, 0, 1200]
+    points[:, 0] += np.where(points[:, 0] > 0, 3000, -3000)
+    with pytest.raises(InputError, match="should be in metres"):
+        decode_cloud(make_cloud(FACTORY, FACTORY.make("std_msgs/msg/Header"), points))

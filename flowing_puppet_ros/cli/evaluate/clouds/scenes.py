@@ -40,7 +40,7 @@ from flowing_puppet_ros.evaluate.scene.scene_score import (
     tabulate_bins,
 )
 from flowing_puppet_ros.evaluate.scene.scene_sequences import draw_sequence
-from flowing_puppet_ros.evaluate.scene.synthetic_scenes import PLACES, SCANNERS, SyntheticScene, draw_scene
+from flowing_puppet_ros.evaluate.scene.synthetic_scenes import PLACES, SCANNERS, SceneKind, SyntheticScene, draw_scene
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import make_out_folder
@@ -49,11 +49,12 @@ FRAME_NS = 100_000_000  # between the scans of a sequence
 
 
 class _Scan(NamedTuple):
-    """A scan to find people in: `points` (N, 3) m, z up, the sensor where the labels say."""
+    """A scan to find people in: `points` (N, 3) m, z up, the sensor where the labels say, and its height if told."""
 
     name: str
     points: np.ndarray
     truth: LabelledScene
+    sensor_height: float | None = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,6 +83,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--covered", type=float, default=0.0, help="share of people with a table or car before them [%(default)s]"
     )
+    parser.add_argument(
+        "--rain", type=float, default=0.0, metavar="SHARE", help="share of the rays that meet a drop [%(default)s]"
+    )
+    parser.add_argument("--sensor-height", type=float, metavar="M", help="over the floor; without it, drawn")
+    parser.add_argument(
+        "--tell-height", action="store_true", help="the sensor's height is known, whether a floor is seen or not"
+    )
     parser.add_argument("--scene-seed", type=int, default=1, help="seed of the synthetic scenes [%(default)s]")
     parser.add_argument(
         "--mocap", type=Path, metavar="NPZ", help="motion capture that synthetic people's poses are from"
@@ -98,7 +106,10 @@ def run(arguments: argparse.Namespace) -> int:
     """Find the people in every scan, print the figures and return the exit status."""
     if arguments.write is not None:
         return _write_scenes(arguments)
-    scans = list(_read_scans(arguments)) if arguments.scans else [_as_scan(*pair) for pair in _draw(arguments)]
+    if arguments.scans:
+        scans = list(_read_scans(arguments))
+    else:
+        scans = [_as_scan(*drawn, arguments.tell_height) for drawn in _draw(arguments)]
     for folder in [arguments.out] if arguments.out is not None else []:
         make_out_folder(folder)
     model = StitchedPuppet.load()
@@ -137,7 +148,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _find(tracker: SceneTracker, scan: _Scan, number: int, sequence: bool) -> list[TrackedBody]:
-    cloud = SceneCloud(scan.points - scan.truth.sensor, None, FRAME_NS * (number + 1), single_view=True)
+    points, stamp = scan.points - scan.truth.sensor, FRAME_NS * (number + 1)
+    cloud = SceneCloud(points, None, stamp, single_view=True, sensor_height=scan.sensor_height)
     try:
         return tracker.step(cloud, number)[0] if sequence else tracker.fit_once(cloud, number)
     except InputError:
@@ -175,19 +187,20 @@ def _draw(arguments: argparse.Namespace) -> Iterator[tuple[str, SyntheticScene, 
         place = arguments.places[number % len(arguments.places)]
         scanner = arguments.scanners[(number // len(arguments.places)) % len(arguments.scanners)]
         rng = np.random.default_rng([arguments.scene_seed, number])
-        more = (arguments.lookalikes, arguments.covered)
+        kind = SceneKind(arguments.lookalikes, arguments.covered, arguments.rain, arguments.sensor_height)
         drawn = (
-            draw_sequence(source, rng, place, scanner, arguments.people, arguments.length, *more)
+            draw_sequence(source, rng, place, scanner, arguments.people, arguments.length, kind)
             if arguments.length > 1
-            else [draw_scene(source, rng, place, scanner, arguments.people, *more)]
+            else [draw_scene(source, rng, place, scanner, arguments.people, kind)]
         )
         for step, scene in enumerate(drawn):
             suffix = f"-{step:03d}" if arguments.length > 1 else ""
             yield f"{number:03d}-{place}-{scanner}{suffix}", scene, source
 
 
-def _as_scan(name: str, scene: SyntheticScene, source: BodySource) -> _Scan:
-    return _Scan(name, scene.points, label_scene(_label(scene, source), scene.points, name))
+def _as_scan(name: str, scene: SyntheticScene, source: BodySource, tell_height: bool) -> _Scan:
+    truth = label_scene(_label(scene, source), scene.points, name)
+    return _Scan(name, scene.points, truth, -scene.floor if tell_height else None)
 
 
 def _label(scene: SyntheticScene, source: BodySource) -> dict[str, Any]:
