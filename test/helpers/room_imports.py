@@ -2,7 +2,15 @@
 """What each room (folder of the package) imports from other rooms, exactly; `test_contract` holds it."""
 
 MAY_IMPORT: dict[str, set[str]] = {
-    "annotate": {"draw", "flow", "image.detector", "image.formats", "image.networks", "image.tracking", "model.ds"},
+    "annotate": {
+        "draw",
+        "flow",
+        "image.detector",
+        "image.formats",
+        "image.networks",
+        "image.tracking",
+        "model.ds",
+    },
     "bag": {"bag.foreign", "bag.storage", "image.formats", "multiview", "stream", "stream.messages"},
     "bag.cameras": {
         "bag",
@@ -98,6 +106,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "evaluate",
         "evaluate.body",
         "evaluate.moving",
+        "evaluate.props",
         "evaluate.rgbd",
         "evaluate.scene",
         "image.networks",
@@ -162,7 +171,15 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "draw": {"flow"},
     "evaluate": {"image.formats", "model"},
-    "evaluate.bag": {"bag", "body.scans", "evaluate", "image.formats", "multiview", "stream", "stream.messages"},
+    "evaluate.bag": {
+        "bag",
+        "body.scans",
+        "evaluate",
+        "image.formats",
+        "multiview",
+        "stream",
+        "stream.messages",
+    },
     "evaluate.body": {"body.cloud", "body.fit", "body.measurements", "body.scans", "learn.anny", "model"},
     "evaluate.image": {
         "evaluate",
@@ -191,6 +208,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "stream.components",
         "stream.messages",
     },
+    "evaluate.props": {"evaluate.body", "evaluate.rgbd", "evaluate.scene", "learn.anny", "model"},
     "evaluate.rgbd": {
         "body",
         "body.fit",
@@ -282,7 +300,15 @@ MAY_IMPORT: dict[str, set[str]] = {
     "learn.detector": {"evidence.image", "image.detector", "image.formats", "learn", "model", "model.ds"},
     "learn.ds": {"learn.anny", "model", "model.ds"},
     "learn.likelihood": {"evidence.image", "image.formats", "learn", "model", "model.ds"},
-    "learn.people": {"body", "body.cloud", "body.fit", "body.scans", "body.segmentation", "body.upright", "model"},
+    "learn.people": {
+        "body",
+        "body.cloud",
+        "body.fit",
+        "body.scans",
+        "body.segmentation",
+        "body.upright",
+        "model",
+    },
     "learn.sp": {"learn.anny", "model"},
     "learn.thesis_loop": {
         "evidence.image",
@@ -314,7 +340,16 @@ MAY_IMPORT: dict[str, set[str]] = {
         "report.pictures",
         "stream.messages",
     },
-    "report.pictures": {"bag", "draw", "evaluate.bag", "flow", "model", "model.ds", "multiview", "stream.messages"},
+    "report.pictures": {
+        "bag",
+        "draw",
+        "evaluate.bag",
+        "flow",
+        "model",
+        "model.ds",
+        "multiview",
+        "stream.messages",
+    },
     "stream": {"body.scans", "stream.messages"},
     "stream.components": {
         "body",

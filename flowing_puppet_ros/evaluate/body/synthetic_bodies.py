@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from flowing_puppet_ros.errors import InputError
-from flowing_puppet_ros.learn.anny.body import AnnyBody, RestBody
+from flowing_puppet_ros.learn.anny.body import AGE, AnnyBody, RestBody
 from flowing_puppet_ros.learn.anny.poses import FROM_MOCAP, MOCAP_JOINTS, PoseSampler
 from flowing_puppet_ros.model import rotation, weights
 
@@ -21,6 +21,7 @@ TILT_DEVIATION = np.radians(8.0)  # rad, of the pelvis from upright, about each 
 MOCAP_RATE_HZ = 20.0
 MOCAP_UNIT_M = 0.0254 / 0.45
 MIN_SPEED_M = 0.01  # mean motion of a joint per frame; slower motion capture does not test tracking
+CHILD_AGE = (0.3, 0.42)  # of Anny, whose adults are from 0.6 on
 STANDING_BONES, MAX_STANDING_M = ("LeftFoot", "RightFoot", "Hips"), 0.15
 """Bones of people who stand, and how far from their first place these are at most."""
 STANDING_WINDOWS = 5  # of motion capture, of which the one that moves least is taken
@@ -96,6 +97,12 @@ class BodySource:
     def draw_person(self, rng: np.random.Generator) -> RestBody:
         """Draw the shape of a person."""
         return self._anny.make_rest_body(self._anny.sample_phenotype(rng))
+
+    def draw_child(self, rng: np.random.Generator) -> RestBody:
+        """Draw the shape of a child of about 1.1 to 1.45 m, with a child's proportions."""
+        phenotype = self._anny.sample_phenotype(rng)
+        phenotype[AGE] = rng.uniform(*CHILD_AGE)
+        return self._anny.make_rest_body(phenotype)
 
     def pose_person(self, person: RestBody, angles: Mapping[str, np.ndarray], turn: np.ndarray) -> TrueBody:
         """Pose a person by rotation vectors (3,) rad by bone, from the rest pose; `turn` (3, 3) is the pelvis's."""

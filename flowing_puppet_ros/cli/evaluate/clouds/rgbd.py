@@ -22,11 +22,12 @@ from flowing_puppet_ros.evaluate.moving.fitter_run import run_fitter
 from flowing_puppet_ros.evaluate.moving.lost_depth import LOSSES, lose_depth
 from flowing_puppet_ros.evaluate.moving.ring_evidence import compare_evidence
 from flowing_puppet_ros.evaluate.moving.robot_view import SENSINGS, RobotView
+from flowing_puppet_ros.evaluate.props.scenes import PROPS, draw_props
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
 from flowing_puppet_ros.evaluate.rgbd.methods import FusionMethod, RgbdMethod, SearchMethod
 from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summarise_rgbd, tabulate_calibration
 from flowing_puppet_ros.evaluate.rgbd.tracking import MotionScore, summarise_motions, track_motion
-from flowing_puppet_ros.evaluate.rgbd.views import CUTS, RgbdStudio, make_pair, make_registered
+from flowing_puppet_ros.evaluate.rgbd.views import CUTS, RgbdFrame, RgbdStudio, make_pair, make_registered
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
 from flowing_puppet_ros.image.networks.choice import load_networks
 from flowing_puppet_ros.image.networks.sources import IMAGE_SIDE_PX
@@ -80,6 +81,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--lost-depth", nargs="+", choices=LOSSES, metavar="LOSS", help="whole people of whom depth is missing:"
         f" {', '.join(LOSSES)}; with --cameras, compare these cameras' depth, silhouettes and both together",
     )  # fmt: skip
+    parser.add_argument(
+        "--props", nargs="+", choices=PROPS, metavar="PROP", help="whole people with things that touch them: seated on"
+        " stool, chair, armchair or sofa, a couple on one, at a desk, in a wheelchair, a child on a chair; behind a"
+        " chair, leaning on a table's edge; with a box, backpack or bag",
+    )  # fmt: skip
     parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture that the poses are from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for rgbd.csv and rgbd.json")
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
@@ -94,6 +100,8 @@ def run(arguments: argparse.Namespace) -> int:
         return 0
     if "one" in (arguments.lost_depth or ()) and arguments.cameras is None:
         raise InputError("--lost-depth one takes the depth of all cameras but one away; give --cameras")
+    if arguments.props and (arguments.lost_depth or arguments.motions or arguments.cameras or arguments.people > 1):
+        raise InputError("--props draws whole people by itself: leave out --lost-depth, --motions, --cameras, --people")
     if arguments.mocap is None:
         raise InputError("drawn people stand and walk as motion capture does; give --mocap expmap_20hz.npz")
     if arguments.count < 1 or arguments.people < 1 or arguments.people_seed < 0 or not 0 <= arguments.noise <= 100:
@@ -114,13 +122,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(format_json({"cameras": rings}) if arguments.json else format_table(rings))
         return 0
     scores: list[RgbdScore] = []
-    kinds = arguments.lost_depth or arguments.cuts
+    kinds = arguments.lost_depth or arguments.props or arguments.cuts
     for kind, number in tqdm(list(product(kinds, range(arguments.count))), file=sys.stderr, disable=arguments.json):
-        cut = "whole" if arguments.lost_depth else kind
-        rng = np.random.default_rng([arguments.people_seed, CUTS.index(cut), number])
-        frame = studio.draw_frame(rng, cut, arguments.people, arguments.noise, arguments.any_pose)
-        if arguments.lost_depth:
-            (frame,) = lose_depth([frame], kind, rng, fitter.model)
+        frame = _draw_frame(arguments, studio, fitter.model, kind, number)
         fits, to_world, seconds = method.find(frame)
         each = seconds / len(fits)
         scores += [score_body(fitter.model, fit, to_world, frame, k, kind, each) for k, fit in enumerate(fits)]
@@ -132,6 +136,19 @@ def run(arguments: argparse.Namespace) -> int:
         write_json(arguments.out / "rgbd.json", {**printed, "bodies": table})
     print(format_json(printed) if arguments.json else "\n\n".join(map(format_table, printed.values())))
     return 0
+
+
+def _draw_frame(
+    arguments: argparse.Namespace, studio: RgbdStudio, model: StitchedPuppet, kind: str, number: int
+) -> RgbdFrame:
+    """Return a frame of one of CUTS, LOSSES or PROPS."""
+    if arguments.props:
+        rng = np.random.default_rng([arguments.people_seed, 200 + PROPS.index(kind), number])
+        return draw_props(studio, rng, kind, arguments.noise)
+    cut = "whole" if arguments.lost_depth else kind
+    rng = np.random.default_rng([arguments.people_seed, CUTS.index(cut), number])
+    frame = studio.draw_frame(rng, cut, arguments.people, arguments.noise, arguments.any_pose)
+    return lose_depth([frame], kind, rng, model)[0] if arguments.lost_depth else frame
 
 
 def _track_motions(arguments: argparse.Namespace, fitter: BodyFitter, studio: RgbdStudio) -> list[dict[str, float]]:
