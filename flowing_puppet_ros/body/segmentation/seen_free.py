@@ -19,11 +19,7 @@ MAX_DRIFT_M = 10.0  # of the sensor from the middle of the grid, beyond which it
 
 
 class SeenFree:
-    """Cells of the space about one sensor through which some ray passed in a scan without any point near.
-
-    Attributes:
-        moves: whether the sensor moved not long ago against the frame in which its scans are.
-    """
+    """Cells of the space about one sensor through which some ray passed in a scan without any point near."""
 
     def __init__(self) -> None:
         """Start without any."""
@@ -42,7 +38,8 @@ class SeenFree:
         self._moving_scans = 0
 
     @property
-    def moves(self) -> bool:  # noqa: D102
+    def moves(self) -> bool:
+        """Whether the sensor moved not long ago against the frame in which its scans are."""
         return self._moving_scans > 0
 
     def add(self, points: F64, viewpoint: F64) -> Bools:
