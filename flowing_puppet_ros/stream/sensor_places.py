@@ -25,6 +25,7 @@ OPTICAL = re.compile(r"optical(_frame)?$")
 NO_SENSOR_FRAMES = frozenset({"map", "odom", "world", "earth"})
 """Frames of REP-105 and of simulators in which no sensor stands at the origin."""
 MIN_CAMERA_DISTANCE_M = 0.1
+MAX_CAMERA_DISTANCE_M = 30.0
 MAX_FIELD_OF_VIEW = 1.2  # tangent of half of it: 100 degrees from side to side
 MIN_SENSOR_HEIGHT_M = 0.05  # over a frame that can be on the floor
 ANCHOR_GRID_M = 100.0
@@ -215,7 +216,9 @@ class SensorPlaces:
             return "-y"
         if frame and len(points) and frame not in self._looked_into:
             self._looked_into.add(frame)
-            if not self._fixed and self._find_mounted_up(frame) is None and is_ahead_along_z(points):
+            alone = not self._fixed and self._find_mounted_up(frame) is None
+            # What is farther from the sensor than any camera sees has a wrong unit, which is told elsewhere.
+            if alone and is_ahead_along_z(points) and points[:, 2].min() < MAX_CAMERA_DISTANCE_M:
                 self._report.warn(
                     f"the clouds in {frame!r} lie ahead along z as in the frame of a camera, but z is taken as up: name"
                     " the camera's optical frame, or set up:=-y"

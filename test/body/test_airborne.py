@@ -82,4 +82,4 @@ def test_drops_are_no_part_of_the_scene_in_which_people_are_looked_for(monkeypat
     monkeypatch.setattr(PersonFinder, "find", find)
     tracker = SceneTracker(BodyFitter(StitchedPuppet.load(), FitterSettings(threads=1)), SceneSettings(view="single"))
     tracker.step(SceneCloud(np.concatenate([points, rain]), None, 1), 0)
-    assert len(searched[0].points) < len(points) + 0.2 * len(rain)  # type: ignore[attr-defined]
+    assert len(searched[0].scene.points) < len(points) + 0.2 * len(rain)  # type: ignore[attr-defined]
