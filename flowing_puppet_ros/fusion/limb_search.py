@@ -18,6 +18,7 @@ from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.fit.hypotheses import BodyHypotheses
 from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
 from flowing_puppet_ros.body.search.particles import Particles, particles_to_state, states_to_particles
+from flowing_puppet_ros.evidence.cloud.nearest import find_beside
 from flowing_puppet_ros.fusion.lift import LiftedJoints
 from flowing_puppet_ros.fusion.limb_depths import (
     HALF_SEEN_CONFIDENCE,
@@ -283,7 +284,7 @@ def _is_left_out(place: F64, points: F64, vertices: F64) -> bool:
     near = points[np.linalg.norm(points - place, axis=1) < LEFT_OUT_RADIUS_M]
     if len(near) < MIN_LEFT_OUT:
         return False
-    away = np.linalg.norm(near[:, None] - vertices, axis=2).min(axis=1) > LEFT_OUT_GAP_M
+    away = ~find_beside(near, vertices, LEFT_OUT_GAP_M)
     return bool(np.count_nonzero(away) >= max(MIN_LEFT_OUT, MIN_LEFT_OUT_SHARE * len(near)))
 
 

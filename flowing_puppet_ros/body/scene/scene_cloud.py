@@ -117,8 +117,11 @@ class SceneCloud:
         made = []
         for person in people:
             rows = slice(None) if person.rows is None else person.rows
-            seen = replace(person, field=image.make_field(rows))
+            if self.image is None and person.rows is None:
+                made.append(person)
+                continue
+            points = person.points
             if self.image is not None and person.normals is None:
-                seen = replace(seen, points=smooth_depth(image, self.points, rows))
-            made.append(seen if self.image is not None or person.rows is not None else person)
+                points = smooth_depth(image, self.points, rows)
+            made.append(replace(person, points=points, field=image.make_field(rows)))
         return made
