@@ -15,6 +15,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.image.person_mask import PersonMask
 
 type Point = tuple[float, float, float]  # x, y, confidence
 
@@ -64,13 +65,15 @@ class JointModel(Protocol):
 class Keypoints:
     """One detected person: `names` (K,), `xy` (K, 2) px with NaN where unknown, `confidence` (K,) in [0, 1].
 
-    `track_id` is the id under which the detector itself tracks the person; empty if it does not.
+    `track_id` is the id under which the detector itself tracks the person; empty if it does not. `mask` is where the
+    person is in the image, None from a detector that does not say it.
     """
 
     names: tuple[str, ...]
     xy: F64
     confidence: F64
     track_id: str = ""
+    mask: PersonMask | None = None
 
     def __post_init__(self) -> None:
         """Convert to float64; InputError when the lengths disagree."""

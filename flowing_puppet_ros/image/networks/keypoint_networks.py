@@ -187,7 +187,8 @@ class KeypointNetworks:
             found |= _place_extremities(landmarks, found, crossed=turned[-1] is not seen[-1])
         known = {name: place if sure >= MIN_CONFIDENCE else UNKNOWN for name, (place, sure) in found.items()}
         sure = [found[name][1] if np.isfinite(place).all() else 0.0 for name, place in known.items()]
-        return Keypoints(tuple(known), np.array(list(known.values())), np.array(sure))
+        mask = landmarks.mask if agree else None
+        return Keypoints(tuple(known), np.array(list(known.values())), np.array(sure), mask=mask)
 
     def _look_in_mirror(self, image: Image, pose: NetworkPose) -> tuple[list[NetworkPose], NetworkPose]:
         """Return a person by MoveNet, unless it finds nobody, and by BlazePose in the mirror image."""

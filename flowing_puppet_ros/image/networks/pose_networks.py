@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, Image
+from flowing_puppet_ros.arrays import F64, U8, Array, Image
 from flowing_puppet_ros.image.formats.skeletons import COCO_17, MEDIAPIPE_33
 from flowing_puppet_ros.image.networks.decoders import decode_movenet
 from flowing_puppet_ros.image.networks.files import BLAZEPOSE, MOVENET, read_file
@@ -25,6 +25,7 @@ from flowing_puppet_ros.image.networks.poses import (
     fit_to_canvas,
 )
 from flowing_puppet_ros.image.networks.runtime import LiteRtNetwork, Network
+from flowing_puppet_ros.image.person_mask import PersonMask
 
 SIDE_PX = 256
 LANDMARKS = 33
@@ -64,11 +65,15 @@ class MoveNet:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Landmarks:
-    """Landmarks of one person: `points` (33, 2) px, `visibility` (33,) and `presence` of the person, in [0, 1]."""
+    """Landmarks of one person: `points` (33, 2) px, `visibility` (33,) and `presence` of the person, in [0, 1].
+
+    `mask` is where the person is in the image, None from a network that does not say it.
+    """
 
     points: F64
     visibility: F64
     presence: float
+    mask: PersonMask | None = None
 
     @property
     def pose(self) -> NetworkPose:
@@ -94,7 +99,10 @@ class BlazePose:
         outputs = self._network.run(square[None].astype(np.float32) / 255)
         values = np.asarray(outputs[0], np.float64).reshape(-1, 5)[:LANDMARKS]
         return Landmarks(
-            warp.to_image(values[:, :2] - 0.5), _sigmoid(values[:, 3]), float(np.asarray(outputs[1]).ravel()[0])
+            warp.to_image(values[:, :2] - 0.5),
+            _sigmoid(values[:, 3]),
+            float(np.asarray(outputs[1]).ravel()[0]),
+            PersonMask(_to_bytes(outputs[2].reshape(SIDE_PX, SIDE_PX)), warp.matrix),
         )
 
 
@@ -106,3 +114,8 @@ def find_angle(pose: NetworkPose) -> float:
 
 def _sigmoid(values: F64) -> F64:
     return np.asarray(1 / (1 + np.exp(-np.clip(values, -30, 30))))
+
+
+def _to_bytes(shares: Array) -> U8:
+    """Return probabilities in [0, 1] as 0 to 255."""
+    return np.asarray(np.rint(255 * np.clip(shares, 0.0, 1.0)), dtype=np.uint8)

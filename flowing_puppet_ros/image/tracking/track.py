@@ -7,7 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, I64, Bools
+from flowing_puppet_ros.arrays import F64, I64, Bools, Flow
+from flowing_puppet_ros.image.person_mask import PersonMask
 from flowing_puppet_ros.image.tracking.heading import HeadingFilter
 from flowing_puppet_ros.image.tracking.settings import TrackerSettings
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
@@ -21,6 +22,7 @@ SCALE_GAIN = 0.1  # share of the new scale estimate taken at each detection
 MIN_OVERRIDE_M = 0.06  # `Track.override_joint` ignores smaller moves
 APPEARANCE_GAIN = 0.2  # share of the newly seen colours taken at each detection
 MISSING_SHARE = 0.3  # of a joint's quality that it loses at each detection of its person which does not have it
+MAX_MASK_AGE = 8  # images for which the flow alone carries a mask
 OPEN_GATE_AGE = 1_000  # images without a detection after which any detected position passes the gate
 
 
@@ -35,7 +37,8 @@ class Track:
     `detector_id` is the detector's own id of the last matched detection that had one.
     `unseen` and `missed` count images and detector runs without a match. `appearance` are the colours of the torso (see
     `appearance`) or None; `overlapped` is set if another torso overlapped with it since the last detection. `heading`
-    tells from which side the person is seen, None where only front and back are told apart.
+    tells from which side the person is seen, None where only front and back are told apart. `mask` is where the person
+    is in the image, as a network has said at most `mask_age` images ago.
     """
 
     id: str
@@ -59,6 +62,8 @@ class Track:
     appearance: F64 | None = None
     overlapped: bool = False
     heading: HeadingFilter | None = None
+    mask: PersonMask | None = None
+    mask_age: int = 0
 
     @classmethod
     def start(
@@ -160,6 +165,15 @@ class Track:
         self.variance[joint] = float(detection_variance(self.quality[joint], self.scale, settings))
         self.age[joint] = self.outlier_count[joint] = 0
         self.outlier_position[joint] = np.nan
+
+    def carry_mask(self, forward: Flow, image_size: tuple[int, int]) -> None:
+        """Move the mask along the flow from the image before, or drop it when it is old.
+
+        `forward` (h, w, 2) is in pixels of its own grid, and `image_size` (width, height).
+        """
+        self.mask_age += 1
+        if self.mask is not None:
+            self.mask = None if self.mask_age > MAX_MASK_AGE else self.mask.carry(forward, image_size)
 
     def update_appearance(self, colours: F64) -> None:
         """Follow the colours of the torso slowly."""

@@ -19,6 +19,7 @@ from flowing_puppet_ros.flow.puppet_flow import PuppetFlow
 from flowing_puppet_ros.flow.settings import FlowSettings
 from flowing_puppet_ros.ids import letters_of_seed
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
+from flowing_puppet_ros.image.person_mask import PersonMask, label_people
 from flowing_puppet_ros.image.tracking.appearance import TorsoAppearance, find_overlapping, torso_appearances
 from flowing_puppet_ros.image.tracking.association import Detection, associate, joint_distance
 from flowing_puppet_ros.image.tracking.heading import HeadingFilter
@@ -60,7 +61,8 @@ class TrackedPuppet:
     `drawing` is the model of the side, turned by `side_heading`, whose puppet is drawn; `contours` (K_i, 2) per part,
     `depth` (P,) the drawing order of each part, 0 farthest. `energy` is the negative log of the body prior plus the
     flow's misfit and the distance of the detection, up to a constant; lower is better. `detected` (J, 3) is this
-    image's detection as x, y and confidence, and `detection` its index, or None.
+    image's detection as x, y and confidence, and `detection` its index, or None. `mask` is where a network has said
+    that the person is, carried along the flow; None without one.
     """
 
     id: str
@@ -79,6 +81,7 @@ class TrackedPuppet:
     shape: PuppetShape
     detected: F64 | None
     detection: int | None
+    mask: PersonMask | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -103,6 +106,10 @@ class TrackResult:
         grid = ImageScale(self.grid.image, (width, height))
         shapes, headings = ([getattr(each, name) for each in self.puppets] for name in ("shape", "side_heading"))
         return render_part_map(self._model, shapes, headings, grid)
+
+    def render_person_masks(self) -> U8:
+        """Draw on the working grid (h, w) who is where: the place in `puppets` + 1; 0 where nobody is known to be."""
+        return label_people([puppet.mask for puppet in self.puppets], self.grid.work, self.grid.image)
 
     def puppet_flow(self) -> PuppetFlow | None:
         """Return the puppet flow from the previous image, on the grid of `flow`; None if that is None."""
@@ -177,6 +184,8 @@ class FlowingPuppetTracker:
                 warnings.append("the picture changes as at a cut between shots: tracking restarts")
                 self.tracks, pair, restarted = [], None, True
             else:
+                for track in self.tracks:
+                    track.carry_mask(pair[0], frame.grid.image)
                 propagation = propagate_tracks(self.model, self.tracks, pair, frame.grid, self.settings)
         self._count_image()
         if detect is not None:
@@ -191,6 +200,8 @@ class FlowingPuppetTracker:
             for track in self.tracks:
                 if track.detection is not None:
                     track.detector_id = ids[track.detection] or track.detector_id
+                    if (mask := detections[track.detection].mask) is not None:
+                        track.mask, track.mask_age = mask, 0
         self.tracks = [track for track in self.tracks if self._is_alive(track, frame.grid.image)]
         for track in self.tracks:
             track.complete_and_redraw(self.model)
@@ -344,6 +355,7 @@ class FlowingPuppetTracker:
             shape=shape,
             detected=track.detected,
             detection=track.detection,
+            mask=track.mask,
         )
 
 

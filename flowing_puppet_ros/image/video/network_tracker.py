@@ -143,8 +143,12 @@ class NetworkTracker:
         def detect(tracks: Sequence[Track], between: FlowPair | None) -> DetectedInTracks:
             if run is None or between is None:
                 return None, None  # after a cut the people of the image before are not there
-            move = partial(propagate_points, flows=[reduce_flow(between[0])], size=(image.shape[1], image.shape[0]))
-            return [replace(person, xy=move(person.xy)) for person in run.people.result()], run.searched
+            size = image.shape[1], image.shape[0]
+            move = partial(propagate_points, flows=[reduce_flow(between[0])], size=size)
+            return [
+                replace(person, xy=move(person.xy), mask=person.mask and person.mask.carry(between[0], size))
+                for person in run.people.result()
+            ], run.searched
 
         return self._forget_after_cut(self._tracker.step(image, stamp_ns, flow=flow, detect=detect))
 

@@ -83,6 +83,7 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
     outputs: tuple[Port, ...] = (
         Port("puppets", PUPPETS),
         Port("part_labels", IMAGE, lazy=True),
+        Port("person_masks", IMAGE, lazy=True),
         Port("overlay", IMAGE, lazy=True, transport=COMPRESSED),
         Port("flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
         Port("puppet_flow/preview", IMAGE, lazy=True, transport=COMPRESSED),
@@ -248,7 +249,11 @@ class PuppetTrackerComponent(Component[PuppetTrackerSettings]):
     def _publish(self, header: Any, earlier: Any, image: U8, result: TrackResult) -> Output:
         named = [replace(puppet, id=self.publish_id(puppet.id)) for puppet in result.puppets]
         puppets = make_puppets(self.factory, header, self._model, named)
-        outputs: Output = [("puppets", puppets)]
+        outputs: Output = []
+        # Before the puppets, since whoever uses both waits for these.
+        if "person_masks" in self._subscribed:
+            outputs.append(("person_masks", make_image(self.factory, header, result.render_person_masks(), "mono8")))
+        outputs.append(("puppets", puppets))
         if self._humans.enabled:
             made = make_image_messages(self.factory, header, image, puppets.puppets)
             outputs += self._humans.make(header, list(made), made)

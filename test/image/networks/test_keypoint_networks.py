@@ -18,11 +18,13 @@ from flowing_puppet_ros.image.networks.choice import are_installed, load_network
 from flowing_puppet_ros.image.networks.keypoint_networks import FoundPerson, KeypointNetworks, brighten
 from flowing_puppet_ros.image.networks.pose_networks import Landmarks
 from flowing_puppet_ros.image.networks.poses import NetworkPose
+from flowing_puppet_ros.image.person_mask import PersonMask
 from test.helpers.painted_people import ground
 
 installed = pytest.mark.skipif(not are_installed(), reason="no keypoint networks: `flowing-puppet networks --install`")
 GOLDEN = Path(__file__).parents[3] / "bags" / "golden" / "golden.mcap"
 SIZE = (640, 480)
+MASK = PersonMask.of_grid(np.full((48, 64), 255, np.uint8), SIZE)
 WIDTH = 60.0  # shoulders px
 HEIGHTS = {"nose": -0.7, "eye": -0.8, "ear": -0.75, "shoulder": 0, "elbow": 0.8, "wrist": 1.5, "hip": 1.4, "knee": 2.6,
            "ankle": 3.7, "index": 1.8, "heel": 3.9, "foot_index": 4.0, "foot": 4.0}  # fmt: skip
@@ -89,7 +91,7 @@ class Seeing:
             points[MEDIAPIPE_33.index(name), 0] += -shift if mirrored else shift
         if self.exchanged:
             points = points[[MEDIAPIPE_33.index(_other(name)) for name in MEDIAPIPE_33]]
-        return Landmarks(points, np.full(33, self.visibility), self.presence)
+        return Landmarks(points, np.full(33, self.visibility), self.presence, MASK)
 
 
 def _other(name: str) -> str:
@@ -347,3 +349,11 @@ def test_the_real_networks_find_a_person_of_a_recording_where_they_are_in_the_mi
             assert np.hypot(*(at(found, f"{side}_{part}")[0] - place)) < 0.5 * shoulders
             there, _ = at(mirrored, f"{'right' if side == 'left' else 'left'}_{part}")
             assert np.hypot(*((width - 1 - there[0], there[1]) - place)) < 0.5 * shoulders
+
+
+def test_a_mask_is_the_persons_only_if_the_landmarks_are() -> None:
+    (person,) = find(Seeing([pose(320)], [pose(320)]))
+    assert person.keypoints.mask is MASK
+    elsewhere = Seeing([pose(320)], [pose(320)], presence=0.1)
+    (person,) = find(elsewhere)
+    assert person.keypoints.mask is None

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tracker on drawn people that move in known ways."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -9,6 +10,8 @@ import pytest
 from drawn_people import NAMES, SCALE, SIZE, CapsuleModel, Floats, detection, draw, error, pose, tracker  # type: ignore[import-not-found]
 
 from flowing_puppet_ros.ids import letters_of_seed
+from flowing_puppet_ros.image.person_mask import PersonMask
+from flowing_puppet_ros.image.tracking.track import MAX_MASK_AGE
 
 
 def test_flow_alone_carries_a_moving_forearm() -> None:
@@ -104,6 +107,33 @@ def test_wild_detections_that_disagree_are_not_persistent() -> None:
     for time, shift in enumerate([(60, -50), (-70, 40), (50, 60), (-60, -60)], start=4):
         result = follower.step(still, time, [detection(wild(pose(0), shift))])
         assert error(result, pose(0), "left_wrist") < 5
+
+
+def test_the_flow_carries_a_mask_until_it_is_too_old() -> None:
+    follower = tracker()
+    places = [(100.0 + 3 * time, 118.0) for time in range(MAX_MASK_AGE + 2)]
+    start = pose(0, places[0])
+    height, width = draw(start).shape[:2]
+    person = (
+        np.abs(draw(start).astype(int) - draw(start + np.array([0.0, 500.0]))).max(axis=2) > 0
+    )  # against the background alone
+    values = np.where(person, np.uint8(255), np.uint8(0))
+    shown = PersonMask.of_grid(values, (width, height))
+    for time, place in enumerate(places):
+        detected = [replace(detection(start), mask=shown)] if time == 0 else None
+        (puppet,) = follower.step(draw(pose(0, place)), time, detected).puppets
+        assert (puppet.mask is None) == (time > MAX_MASK_AGE)
+        if puppet.mask is not None:
+            columns = np.nonzero(puppet.mask.draw((width, height), (width, height)) >= 128)[1]
+            assert columns.mean() == pytest.approx(np.nonzero(values)[1].mean() + 3 * time, abs=3)
+            assert puppet.mask.area == pytest.approx(shown.area, rel=0.15)
+    # Where a detector does not say it, the one before goes on.
+    follower.step(draw(start), 20, [replace(detection(start), mask=shown)])
+    result = follower.step(draw(start), 21, [detection(start)])
+    assert result.puppets[0].mask is not None
+    labels = result.render_person_masks()
+    assert labels.max() == 1
+    assert labels.shape == result.grid.work[::-1]
 
 
 def test_two_people_keep_their_ids_whatever_the_order_of_detections() -> None:

@@ -18,11 +18,12 @@ from flowing_puppet_ros.image.networks import choice
 from flowing_puppet_ros.image.networks.choice import are_installed
 from flowing_puppet_ros.image.networks.keypoint_networks import FoundPerson
 from flowing_puppet_ros.image.networks.sources import NOT_INSTALLED
+from flowing_puppet_ros.image.person_mask import PersonMask
 from flowing_puppet_ros.image.video import live_tracker
 from flowing_puppet_ros.image.video.network_tracker import NetworkTracker
 from flowing_puppet_ros.stream.components.puppet_tracker import PuppetTrackerComponent, PuppetTrackerSettings
 from flowing_puppet_ros.stream.messages.geometry import make_header
-from flowing_puppet_ros.stream.messages.images import make_image
+from flowing_puppet_ros.stream.messages.images import decode_labels, make_image
 from flowing_puppet_ros.stream.messages.message_types import PUPPETS
 
 FACTORY = BagMessageFactory()
@@ -30,6 +31,8 @@ GOLDEN = Path(__file__).parents[3] / "bags" / "golden" / "golden.mcap"
 NAMES = ("neck", "belly", "face", "right_shoulder", "left_shoulder", "right_hip", "left_hip")
 JOINTS = np.array([[80, 40], [80, 75], [80, 25], [65, 45], [95, 45], [70, 100], [90, 100]], float)
 STEP_NS = 33_333_333
+SHOWN = np.zeros((60, 80), dtype=np.uint8)
+SHOWN[8:55, 30:50] = 255
 
 
 class Fixed:
@@ -42,7 +45,8 @@ class Fixed:
         self, image: np.ndarray, known: Sequence[Keypoints] = (), everybody: bool = True, max_people: int = 6
     ) -> list[FoundPerson]:
         self.asked += 1
-        return [FoundPerson(Keypoints(NAMES, JOINTS, np.full(7, 0.9)), 0.9)]
+        mask = PersonMask.of_grid(SHOWN, (image.shape[1], image.shape[0]))
+        return [FoundPerson(Keypoints(NAMES, JOINTS, np.full(7, 0.9), mask=mask), 0.9)]
 
 
 @pytest.fixture
@@ -119,6 +123,21 @@ def test_the_source_can_change_while_the_tracker_runs(monkeypatch: pytest.Monkey
     component.set_expected("detections", True)
     play(component, plain(2))
     assert fixed.asked == 4, "while somebody publishes detections the networks rest"
+
+
+def test_masks_are_told_before_the_puppets_where_somebody_wants_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live_tracker, "load_networks", lambda source, **_: Fixed())
+    component = PuppetTrackerComponent(settings(), FACTORY)
+    told = []
+    for number in range(4):
+        component.set_subscribed("person_masks", number > 1)
+        image = make_image(FACTORY, make_header(FACTORY, 10**9 + number * STEP_NS, "camera"), plain(1)[0], "rgb8")
+        told.append([(port, message) for port, message in component.handle("image", image)])
+    assert [[port for port, _ in each] for each in told] == [["puppets"]] * 2 + [["person_masks", "puppets"]] * 2
+    (_, mask), (_, puppets) = told[3]
+    assert mask.header == puppets.header
+    labels = decode_labels(mask)
+    assert (labels[60, 80], labels[60, 20]) == (1, 0)
 
 
 def test_a_network_file_that_is_not_there_is_one_sentence(nothing_installed: None) -> None:
