@@ -20,7 +20,7 @@ from flowing_puppet_ros.evidence.cloud.depth_smoothing import smooth_depth
 from flowing_puppet_ros.evidence.cloud.range_image import RangeImage
 from flowing_puppet_ros.fusion.joint_fit import FEW_STEPS, HIDDEN_SHARE, MIN_LIMB_CONFIDENCE, JointFitter
 from flowing_puppet_ros.fusion.lift import LiftedJoints, find_lifted_onto_others, lift_joints
-from flowing_puppet_ros.fusion.ownership import assign_points
+from flowing_puppet_ros.fusion.ownership import OUTSIDE, assign_points, find_shown
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, list_bones, trunk_rows
 from flowing_puppet_ros.fusion.seen_cloud import SeenCloud
 from flowing_puppet_ros.model.sp import BodyState
@@ -160,7 +160,9 @@ class PeopleFitter:
         """
         bodies = list(known) or [None] * len(puppets)
         expected = [None if body is None else self.find_joints(body) for body in bodies]
-        puppets, own = list(puppets), [clear] * len(puppets)
+        puppets, masks = list(puppets), [find_shown(cloud, puppet, self._bones) for puppet in puppets]
+        own = [clear if mask is None else clear & (mask != OUTSIDE) for mask in masks]
+        shown = [None if mask is None else mask[clear] for mask in masks]
         claims: list[Claim | None] = []
         extra = [self.list_body(self.find_joints(body)) for body in others]
         for _round in range(CLAIM_ROUNDS if any(body is None for body in bodies) else 1):
@@ -172,7 +174,7 @@ class PeopleFitter:
                 for claim, joints in zip(claims, expected, strict=True)
             ]
             owner = np.full(len(cloud.points), -1, dtype=np.int32)
-            owner[clear] = assign_points(cloud.points[clear], [*limbs, *extra])
+            owner[clear] = assign_points(cloud.points[clear], [*limbs, *extra], shown)
             own = [owner == number for number in range(len(puppets))]
         found = [
             replace(claim, joints=lift_joints(self.model, claim.puppet, cloud, points, joints), own=points)

@@ -11,6 +11,7 @@ import numpy as np
 
 from flowing_puppet_ros.arrays import F64, Bools
 from flowing_puppet_ros.image.formats.keypoints import Keypoints, joints_from_keypoints
+from flowing_puppet_ros.image.person_mask import PersonMask
 from flowing_puppet_ros.model.ds.puppet import DeformableStructures
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
@@ -24,6 +25,8 @@ LONG_BONES = (
 """Whose length in the image tells the distance, on both sides."""
 LONG_SHARE = 0.25
 """Share of the bones that may appear longer than they are: most are foreshortened, and seem farther away."""
+SLACK_SHARE = 0.8
+"""Of the joints, that move no farther beside a mask that moves with the others than its slack."""
 _TRUNK = ("neck", "belly", "face", "right_shoulder", "left_shoulder", "right_hip", "left_hip")
 
 
@@ -36,17 +39,28 @@ class PuppetJoints:
         pixels: (J, 2) in the body model's order, NaN where unknown.
         confidence: (J,) 0 to 1, 0 where unknown.
         hidden: (J,) whether the puppet's own parts hide the joint from the camera.
+        mask: where in the image the person is, if a network has said so.
     """
 
     id: str
     pixels: F64
     confidence: F64
     hidden: Bools
+    mask: PersonMask | None = None
 
     @property
     def known(self) -> Bools:
         """Which joints (J,) have a place, however doubtful."""
         return np.isfinite(self.pixels).all(axis=1)
+
+    def move_to(self, pixels: F64) -> PuppetJoints:
+        """Return the puppet with its joints at `pixels` (J, 2); its mask moves with most of them."""
+        steps = (pixels - self.pixels)[self.known]
+        if self.mask is None or not len(steps):
+            return replace(self, pixels=pixels)
+        step = np.median(steps, axis=0)
+        slack = float(np.quantile(np.hypot(*(steps - step).T), SLACK_SHARE))
+        return replace(self, pixels=pixels, mask=self.mask.move(step, slack))
 
     def swap_sides(self, model: StitchedPuppet) -> PuppetJoints:
         """Return the puppet with left called right."""
@@ -72,6 +86,7 @@ def place_joints(
     pixels: F64,
     confidence: F64,
     hidden: Sequence[str] = (),
+    mask: PersonMask | None = None,
 ) -> PuppetJoints | None:
     """Return a puppet's joints in the body model's order, None when too few are known.
 
@@ -85,6 +100,7 @@ def place_joints(
         pixels: (K, 2), NaN where unknown.
         confidence: (K,) 0 to 1.
         hidden: names of the joints that the puppet's own parts hide.
+        mask: where in the image the person is, if that is known.
     """
     flat = _load_flat_model()
     joints, certain = joints_from_keypoints(flat, Keypoints(tuple(names), pixels, np.maximum(confidence, 1e-3)))
@@ -98,14 +114,15 @@ def place_joints(
         knee, ankle = (model.joint_names.index(f"{side}_{name}") for name in ("knee", "ankle"))
         found[ankle] = found[ankle] + ANKLE_DROP * (found[ankle] - found[knee])
     weight[~np.isfinite(found).all(axis=1)] = 0.0
-    made = PuppetJoints(identity, found, weight, behind)
+    made = PuppetJoints(identity, found, weight, behind, mask)
     return made if np.count_nonzero(made.known) >= MIN_PUPPET_JOINTS else None
 
 
 def carry_puppets(earlier: Sequence[PuppetJoints], later: Sequence[PuppetJoints], share: float) -> list[PuppetJoints]:
     """Return the puppets at a time between or beyond two images: `share` 0 is the earlier one, 1 the later one.
 
-    Joints move evenly. A puppet that only one of the images has stays where it is, if that image is the nearer one.
+    Joints move evenly, and masks with them. A puppet that only one of the images has stays where it is, if that image
+    is the nearer one.
     """
     before = {puppet.id: puppet for puppet in earlier if puppet.id}
     after = {puppet.id for puppet in later if puppet.id}
@@ -116,7 +133,7 @@ def carry_puppets(earlier: Sequence[PuppetJoints], later: Sequence[PuppetJoints]
         if known is not None:
             moved = known.pixels + share * (puppet.pixels - known.pixels)
             base = puppet if nearer_is_later else known
-            found.append(replace(base, pixels=np.where(np.isfinite(moved), moved, base.pixels)))
+            found.append(base.move_to(np.where(np.isfinite(moved), moved, base.pixels)))
         elif nearer_is_later:
             found.append(puppet)
     if not nearer_is_later:

@@ -18,6 +18,7 @@ from watched_people import (  # type: ignore[import-not-found]
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings, PeopleFitter
+from flowing_puppet_ros.image.person_mask import PersonMask
 from flowing_puppet_ros.model.sp import StitchedPuppet
 
 pytestmark = pytest.mark.slow
@@ -117,6 +118,28 @@ def test_the_result_does_not_depend_on_threads_and_nobody_is_where_no_points_are
         found.append(people.fit_people(cloud, [puppet, nobody], seen.image))
     assert [name for name, _ in found[0]] == ["a1"]
     assert found[0][0][1].vertices.tobytes() == found[1][0][1].vertices.tobytes()
+
+
+def test_a_board_that_touches_the_legs_is_not_the_persons_where_a_mask_tells(
+    model: StitchedPuppet, people: PeopleFitter
+) -> None:
+    person = stand_at(joints_of(), 2.4)
+    knee = person.joints["left_knee"]
+    across, up = np.meshgrid(np.linspace(-0.2, -0.06, 60), np.linspace(-0.5, 0.25, 300))
+    board = Standing({}, knee + np.column_stack([np.zeros(across.size), across.ravel(), up.ravel()]))
+    seen, camera = watch([person, board]), make_colour_camera()
+    puppet = find_puppet(model, person, camera, "a1", 3.0)
+    cloud = seen.seen_by(camera)
+    shown = np.zeros(seen.depth.shape, dtype=np.uint8)
+    shown[np.isfinite(seen.depth)] = np.where(seen.owner == 0, 255, 0)
+    clear = people.find_clear(cloud.points)[0]
+    taken = {}
+    for mask in (None, PersonMask.of_grid(shown, camera.size)):
+        ((claim,), _) = people.claim(cloud, [replace(puppet, mask=mask)], clear)
+        assert claim.own[seen.owner == 0].mean() > 0.95
+        taken[mask is None] = int((claim.own & (seen.owner == 1)).sum())
+    assert taken[True] > 100
+    assert taken[False] < 0.2 * taken[True]
 
 
 def test_no_puppets_and_no_planes_are_no_error(model: StitchedPuppet, people: PeopleFitter) -> None:

@@ -41,6 +41,8 @@ from flowing_puppet_ros.stream.messages.message_types import (
     MessageFactory,
 )
 
+COLOUR_INPUTS = ("puppets", "person_masks", "puppets/camera_info")
+"""What a body fitter takes of a colour camera."""
 _DETECTIONS = next(port for port in PuppetTrackerComponent.inputs if port.name == "detections")
 
 
@@ -182,7 +184,7 @@ def _make_scene_fitter(
     factory: MessageFactory,
 ) -> Instance:
     """Return a body fitter for a topic of clouds, or for depth images with their camera_info."""
-    remapped = dict.fromkeys(("points", "depth", "camera_info", "silhouettes", "puppets", "puppets/camera_info"), "")
+    remapped = dict.fromkeys(("points", "depth", "camera_info", "silhouettes", *COLOUR_INPUTS), "")
     if isinstance(source, DepthTopic):
         topic = base_topic(source.image)
         remapped |= {"depth": source.image, "camera_info": source.info}
@@ -235,6 +237,6 @@ def _join_colour(
     if colour.rectified:
         chosen = {"fusion.rectified": True, **settings.get("body_fitter", {})}
         fitter.component = BodyFitterComponent(_make_settings(BodyFitterSettings, "", {"": chosen}), factory)
-    fitter.remapped |= {"puppets": tracker.resolve("puppets"), "puppets/camera_info": colour.info}
-    for port in ("puppets", "puppets/camera_info"):
+    fitter.remapped |= {port: tracker.resolve(port) for port in COLOUR_INPUTS} | {"puppets/camera_info": colour.info}
+    for port in COLOUR_INPUTS:
         fitter.component.set_expected(port, True)

@@ -110,7 +110,7 @@ def _fit_puppets(view: DepthView, frame: ScanFrame, source: Path, fitter: BodyFi
 
 
 def _place(model: StitchedPuppet, identity: str, keypoints: Keypoints) -> PuppetJoints | None:
-    return place_joints(model, identity, keypoints.names, keypoints.xy, keypoints.confidence)
+    return place_joints(model, identity, keypoints.names, keypoints.xy, keypoints.confidence, mask=keypoints.mask)
 
 
 def _refuse_colour(source: Path, options: FitOptions) -> None:

@@ -51,7 +51,7 @@ from flowing_puppet_ros.stream.pairing.stamp_buffer import CloudLine, StampBuffe
 from flowing_puppet_ros.stream.pairing.stuck_stamps import CloudClock
 from flowing_puppet_ros.stream.sensor_places import SensorPlace, SensorPlaces
 
-COLOUR_PORTS = ("puppets", "puppets/camera_info", "/tf_static", "/tf")
+COLOUR_PORTS = ("puppets", "person_masks", "puppets/camera_info", "/tf_static", "/tf")
 MAX_WAITING = 12
 """Clouds that wait at most in a live node."""
 
@@ -114,6 +114,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         Port("depth", IMAGE, "sensor", transport=COMPRESSED_DEPTH),
         Port("camera_info", CAMERA_INFO, "sensor"),
         Port("puppets", PUPPETS, optional=True),
+        Port("person_masks", IMAGE, optional=True),
         Port("puppets/camera_info", CAMERA_INFO, "sensor", optional=True),
         Port("/tf_static", TRANSFORMS, "latched", optional=True),
         Port("/tf", TRANSFORMS, optional=True),
@@ -131,7 +132,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         people = PeopleFitter(self._fitter, settings.fusion)
         self._people = CloudPeople(people, settings, settings.fusion, self.report, self.publish_id)
         self._frames = FrameTree()
-        self._puppets = PuppetPairs(self._model, settings.fusion, self._frames)
+        self._puppets = PuppetPairs(self._model, settings.fusion, self._frames, self.report)
         self._places = SensorPlaces(
             self._frames,
             settings.up,
@@ -311,7 +312,7 @@ class BodyFitterComponent(Component[BodyFitterSettings]):
         # Without a calibration no puppet can be used, however long a cloud waits for it.
         calibrated = self._puppets.is_calibrated or "puppets/camera_info" in self._expected
         puppets = calibrated and "puppets" in self._expected and self._puppets.is_awaited(first, last)
-        return not puppets or self._puppets.is_ready(frame, stamp)
+        return not puppets or self._puppets.is_ready(frame, stamp, "person_masks" in self._expected)
 
     def describe_rejected(self) -> dict[str, Any] | None:
         """Return what was looked at in the last cloud and is no person."""

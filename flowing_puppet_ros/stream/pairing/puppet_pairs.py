@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -15,9 +16,11 @@ from flowing_puppet_ros.fusion.people_fitter import FusionSettings
 from flowing_puppet_ros.fusion.puppet_joints import PuppetJoints, carry_puppets, place_joints
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.multiview.camera import Camera
+from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.messages.camera_info import describe_images
 from flowing_puppet_ros.stream.messages.geometry import FrameTree, stamp_ns
 from flowing_puppet_ros.stream.messages.puppets import decode_puppet_joints
+from flowing_puppet_ros.stream.pairing.person_masks import add_masks
 from flowing_puppet_ros.stream.pairing.time_synchronizer import BACKWARD_JUMP_NS
 
 MAX_KEPT = 120  # messages of puppets
@@ -37,8 +40,15 @@ class PairedPuppets:
 class PuppetPairs:
     """Keeps what came of a colour camera until the clouds that it belongs to are there."""
 
-    def __init__(self, model: StitchedPuppet, settings: FusionSettings, frames: FrameTree | None = None) -> None:
+    def __init__(
+        self,
+        model: StitchedPuppet,
+        settings: FusionSettings,
+        frames: FrameTree | None = None,
+        report: Report | None = None,
+    ) -> None:
         """Read joints for the body `model`; `frames` take what comes on /tf and /tf_static."""
+        self._report = report or Report()
         self._model = model
         self._settings = settings
         self._frames = frames or FrameTree()
@@ -48,13 +58,24 @@ class PuppetPairs:
     def reset(self) -> None:
         """Drop the puppets; keep calibration and frames."""
         self._messages: list[tuple[int, Any]] = []
+        self._masks: dict[int, Any] = {}
+        self._newest_mask: int | None = None  # or of the first puppets, before any has come
 
     def add(self, port: str, message: Any) -> None:
-        """Take a message of `puppets`, `puppets/camera_info`, /tf_static or /tf; InputError when it cannot be used."""
+        """Take a message of `puppets`, `person_masks`, `puppets/camera_info`, /tf_static or /tf.
+
+        Raises:
+            InputError: when it cannot be used.
+        """
         if port in ("/tf_static", "/tf"):
             self._frames.add(message, moving=port == "/tf")
         elif port == "puppets/camera_info":
             self._info = message
+        elif port == "person_masks":
+            self._newest_mask = stamp_ns(message)
+            self._masks[self._newest_mask] = message
+            for stamp in sorted(self._masks)[:-MAX_KEPT]:
+                del self._masks[stamp]
         else:
             stamp = stamp_ns(message)
             if self._messages and stamp < self._messages[-1][0] - BACKWARD_JUMP_NS:
@@ -71,21 +92,32 @@ class PuppetPairs:
         newest = self._messages[-1][0] if self._messages else first
         return (last - newest) * 1e-9 <= self._settings.wait
 
-    def is_ready(self, frame: str, stamp: int) -> bool:
-        """Return whether no later message of puppets or transforms can change what `find` tells of a cloud.
+    def is_ready(self, frame: str, stamp: int, masked: bool = False) -> bool:
+        """Return whether no later message of puppets, masks or transforms can change what `find` tells of a cloud.
 
-        `frame` and `stamp`, nanoseconds, are the cloud's.
+        `frame` and `stamp`, nanoseconds, are the cloud's, and `masked` is whether masks are expected.
         """
         if not self._messages or self._messages[-1][0] < stamp:
+            return False
+        if masked and self._is_mask_awaited(next(each for each, _ in self._messages if each >= stamp)):
             return False
         eye = "" if self._info is None else self._info.header.frame_id.lstrip("/")
         connected = eye not in ("", frame.lstrip("/")) and self._frames.is_connected(frame, eye)
         return not connected or not self._frames.is_awaited(frame, eye, stamp)
 
+    def _is_mask_awaited(self, stamp: int) -> bool:
+        """Return whether the mask of the puppets of this stamp will soon come; none does of who has fallen silent."""
+        if self._newest_mask is None:
+            self._newest_mask = stamp
+            return True
+        return stamp not in self._masks and self._newest_mask <= stamp <= self._newest_mask + self._settings.wait * 1e9
+
     def drop_until(self, stamp: int) -> None:
         """Drop the puppets that no cloud after this stamp can need: all but the last before it."""
         before = sum(each <= stamp for each, _ in self._messages)
         self._messages = self._messages[max(before - 1, 0) :]
+        first = self._messages[0][0] if self._messages else stamp
+        self._masks = {each: message for each, message in self._masks.items() if each >= first}
 
     def find(self, header: Any, stamp: int, rotation: F64, translation: F64) -> PairedPuppets:
         """Return the puppets at the time of a cloud.
@@ -102,7 +134,7 @@ class PuppetPairs:
             InputError: in one sentence, when there are no puppets or nothing says how camera and cloud belong together.
         """
         before = [pair for pair in self._messages if pair[0] <= stamp][-1:]
-        after = [pair for pair in self._messages if pair[0] >= stamp][:1]
+        after = [] if before and before[0][0] == stamp else [pair for pair in self._messages if pair[0] > stamp][:1]
         gaps = [abs(stamp - each) * 1e-9 for each, _ in (*before, *after)]
         if not gaps or min(gaps) > self._settings.max_lag:
             raise InputError(
@@ -114,9 +146,9 @@ class PuppetPairs:
         usable = [pair for pair, gap in zip((*before, *after), gaps, strict=True) if gap <= self._settings.max_lag]
         nearest = min(usable, key=lambda pair: (abs(stamp - pair[0]), pair[0]))[1]
         camera = self._make_camera(header, stamp, nearest, (rotation, translation))
-        people = [self._decode(message, camera) for _, message in usable]
-        if len(usable) == 1 or usable[0][0] == usable[-1][0]:
-            return PairedPuppets(camera, people[0])
+        people = [self._add_masks(each, self._decode(message, camera), camera) for each, message in usable]
+        if len(usable) == 1:
+            return PairedPuppets(camera, people[0] if usable[0][0] == stamp else _drop_masks(people[0]))
         share = (stamp - usable[0][0]) / (usable[1][0] - usable[0][0])
         return PairedPuppets(camera, carry_puppets(people[0], people[1], share))
 
@@ -146,6 +178,15 @@ class PuppetPairs:
             return Camera.from_info(matrix, [], info.width, info.height, rotation, translation)
         return Camera.from_info(info.k, info.d, info.width, info.height, rotation, translation, info.distortion_model)
 
+    def _add_masks(self, stamp: int, puppets: list[PuppetJoints], camera: Camera) -> list[PuppetJoints]:
+        """Return the puppets of an image with their masks, if there is a label image of its stamp."""
+        try:
+            return add_masks(puppets, self._masks[stamp], camera.size) if stamp in self._masks else puppets
+        except InputError as error:
+            self._report.warn(str(error))
+            self._report.counters["unusable masks"] += 1
+            return puppets
+
     def _decode(self, message: Any, camera: Camera) -> list[PuppetJoints]:
         found = []
         width, height = camera.size
@@ -163,6 +204,11 @@ class PuppetPairs:
             if made is not None:
                 found.append(made)
         return found
+
+
+def _drop_masks(puppets: Sequence[PuppetJoints]) -> list[PuppetJoints]:
+    """Return puppets without the masks of another time: nothing tells how they have moved."""
+    return [replace(puppet, mask=None) for puppet in puppets]
 
 
 def _is_outside(share: F64) -> bool:

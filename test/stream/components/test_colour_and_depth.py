@@ -93,6 +93,24 @@ def test_everybody_has_a_body_under_the_id_of_the_puppet_at_once_whatever_comes_
     assert bytes(published[0]) == bytes(published[1])
 
 
+def test_a_cloud_waits_for_masks_that_are_expected_and_goes_on_without_those_of_another_image(
+    model: StitchedPuppet,
+) -> None:
+    person = [stand_at(joints_of(), 2.5)]
+    component = make()
+    component.set_expected("person_masks", True)
+    component.handle("puppets/camera_info", info(SECOND, 2.0))
+    component.handle("camera_info", info(SECOND, 1.0))
+    header = make_header(FACTORY, SECOND, "eye")
+    assert bodies_in(component.handle("puppets", puppets(model, SECOND, person))) == []
+    assert bodies_in(component.handle("depth", depth(SECOND, person))) == []
+    square = make_image(FACTORY, header, np.zeros((100, 100), np.uint8), "mono8")
+    (array,) = bodies_in(component.handle("person_masks", square))
+    assert [body.id for body in array.bodies] == ["a1"]
+    (sentence,) = component.report.drain_warnings()
+    assert "100x100 on person_masks" in sentence
+
+
 def test_without_a_puppet_nobody_in_view_has_a_body(model: StitchedPuppet) -> None:
     person = [stand_at(joints_of(), 2.5)]
     component = make()

@@ -10,7 +10,9 @@ from flowing_puppet_ros.bag.typestore import BagMessageFactory
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.fusion.people_fitter import FusionSettings
 from flowing_puppet_ros.model.sp import StitchedPuppet
+from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.messages.geometry import make_header, make_transform
+from flowing_puppet_ros.stream.messages.images import make_image
 from flowing_puppet_ros.stream.messages.message_types import CAMERA_INFO, PUPPETS, TRANSFORMS
 from flowing_puppet_ros.stream.pairing.puppet_pairs import PuppetPairs
 
@@ -136,3 +138,65 @@ def test_what_cannot_be_paired_is_one_sentence(model: StitchedPuppet, changed: d
     stamp = changed.get("at", SECOND)
     with pytest.raises(InputError, match=sentence.replace("(", r"\(")):
         made.find(header(stamp, changed.get("frame", "eye")), stamp, np.eye(3), np.zeros(3))
+
+
+def mask(stamp: int, left: int, width: int = 100, shape: tuple[int, int] = (480, 640)) -> Any:
+    """Return a label image in which somebody is at columns from `left` on."""
+    labels = np.zeros(shape, dtype=np.uint8)
+    labels[:, left : left + width] = 1
+    return make_image(FACTORY, make_header(FACTORY, stamp, "eye"), labels, "mono8")
+
+
+def test_masks_move_with_the_joints_between_two_images(model: StitchedPuppet) -> None:
+    made = pairs(model, puppets(SECOND, 100), puppets(SECOND + SECOND // 10, 140))
+    made.add("person_masks", mask(SECOND, 80))
+    made.add("person_masks", mask(SECOND + SECOND // 10, 120))
+    for at, left in ((1.0, 80.0), (1.025, 90.0), (1.075, 110.0), (1.1, 120.0)):
+        (found,) = made.find(header(round(at * SECOND)), round(at * SECOND), np.eye(3), np.zeros(3)).puppets
+        assert found.mask is not None
+        edge = found.mask.measure_distance(np.array([[left - 20, 100.0], [left + 20, 100.0]]))
+        np.testing.assert_allclose(edge, [20, -20], atol=1.5)
+    # Nothing tells how they go on after the last image.
+    later = round(1.2 * SECOND)
+    assert made.find(header(later), later, np.eye(3), np.zeros(3)).puppets[0].mask is None
+
+
+def test_clouds_wait_for_masks_but_not_for_those_who_fall_silent(model: StitchedPuppet) -> None:
+    made = pairs(model, puppets(SECOND, 100))
+    assert made.is_ready("eye", SECOND)
+    assert not made.is_ready("eye", SECOND, masked=True)
+    made.add("person_masks", mask(SECOND, 80))
+    assert made.is_ready("eye", SECOND, masked=True)
+    made.add("puppets", puppets(2 * SECOND, 100))
+    assert not made.is_ready("eye", 2 * SECOND, masked=True)
+    made.add("puppets", puppets(4 * SECOND, 100))
+    assert made.is_ready("eye", 4 * SECOND, masked=True)  # fusion.wait is 2 s
+    made.drop_until(4 * SECOND)
+    made.add("puppets", puppets(5 * SECOND, 100))
+    assert made.is_ready("eye", 5 * SECOND, masked=True)
+    made.add("person_masks", mask(5 * SECOND, 80))
+    made.add("puppets", puppets(6 * SECOND, 100))
+    assert not made.is_ready("eye", 6 * SECOND, masked=True)
+
+
+def test_nobody_waits_long_for_masks_that_never_come(model: StitchedPuppet) -> None:
+    made = pairs(model)
+    ready = []
+    for second in range(1, 7):
+        made.add("puppets", puppets(second * SECOND, 100))
+        ready.append(made.is_ready("eye", second * SECOND, masked=True))
+        made.drop_until(second * SECOND)
+    assert ready == [False, False, False, True, True, True]
+
+
+def test_a_mask_of_another_image_is_one_sentence_and_the_puppets_stay(model: StitchedPuppet) -> None:
+    report = Report()
+    made = PuppetPairs(model, FusionSettings(), report=report)
+    made.add("puppets/camera_info", info())
+    made.add("puppets", puppets(SECOND, 100))
+    made.add("person_masks", mask(SECOND, 80, shape=(480, 480)))
+    (found,) = made.find(header(SECOND), SECOND, np.eye(3), np.zeros(3)).puppets
+    assert found.mask is None
+    (sentence,) = report.drain_warnings()
+    assert "480x480 on person_masks" in sentence
+    assert report.counters["unusable masks"] == 1
