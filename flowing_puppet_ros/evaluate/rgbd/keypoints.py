@@ -8,12 +8,16 @@ precisely and less surely; what lies outside the image is not given.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64
+from flowing_puppet_ros.arrays import F64, U8
 from flowing_puppet_ros.evaluate.rgbd.rendering import RenderedView
+from flowing_puppet_ros.image.formats.keypoints import Keypoints
+from flowing_puppet_ros.image.networks.pose_networks import BlazePose
+from flowing_puppet_ros.image.networks.poses import as_pose
+from flowing_puppet_ros.image.person_mask import PersonMask
 from flowing_puppet_ros.multiview.camera import Camera
 
 LIMB_JOINTS = tuple(
@@ -36,12 +40,14 @@ class SeenKeypoints:
         confidence: (12,) 0 to 1, 0 for those that are not given.
         visible: (12,) bool, the truth: nothing hides the joint.
         in_view: (12,) bool, the truth: inside the image, and nothing but the person's own body hides it.
+        mask: where a network says that the person is, None without one.
     """
 
     pixels: F64
     confidence: F64
     visible: np.ndarray
     in_view: np.ndarray
+    mask: PersonMask | None = None
 
 
 def find_visible(joints: F64, camera: Camera, view: RenderedView, person: int) -> tuple[np.ndarray, np.ndarray]:
@@ -76,3 +82,9 @@ def draw_keypoints(
         & (pixels < (width - 0.5, height - 0.5)).all(axis=1)
     )
     return SeenKeypoints(np.where(given[:, None], pixels, np.nan), np.where(given, confidence, 0.0), visible, in_view)
+
+
+def segment_person(network: BlazePose, rgb: U8, person: SeenKeypoints) -> SeenKeypoints:
+    """Return the keypoints of a person in an image (H, W, 3) with the mask that a network finds where they are."""
+    pose = as_pose(Keypoints(LIMB_JOINTS, person.pixels, person.confidence))
+    return person if pose is None else replace(person, mask=network.locate(rgb, pose).mask)

@@ -103,7 +103,8 @@ class FusionMethod:
             keypoints = person.keypoints
             placed = np.array([keypoints.xy[list(keypoints.names).index(name)] for name in LIMB_JOINTS])
             number, away = _find_nearest(placed, frame)
-            puppet = place_joints(model, str(number), keypoints.names, keypoints.xy, keypoints.confidence)
+            places = keypoints.names, keypoints.xy, keypoints.confidence
+            puppet = place_joints(model, str(number), *places, mask=keypoints.mask)
             if puppet is not None and away < puppets.get(number, (np.inf, None))[0]:
                 puppets[number] = (away, puppet)
         return [puppet for _, puppet in puppets.values()]
@@ -136,7 +137,7 @@ def as_puppet(names: tuple[str, ...], identity: str, person: SeenKeypoints) -> P
     pixels, confidence = np.full((len(names), 2), np.nan), np.zeros(len(names))
     rows = [names.index(name) for name in LIMB_JOINTS]
     pixels[rows], confidence[rows] = person.pixels, person.confidence
-    return PuppetJoints(identity, pixels, confidence, np.zeros(len(names), dtype=bool))
+    return PuppetJoints(identity, pixels, confidence, np.zeros(len(names), dtype=bool), person.mask)
 
 
 def _find_nearest(pixels: F64, frame: RgbdFrame) -> tuple[int, float]:

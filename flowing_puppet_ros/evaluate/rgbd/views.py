@@ -21,9 +21,16 @@ from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource, TrueBo
 from flowing_puppet_ros.evaluate.body.synthetic_scans import make_box
 from flowing_puppet_ros.evaluate.rgbd.clothing import Wardrobe, paint_surroundings
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS, DepthSensor, sense_depth
-from flowing_puppet_ros.evaluate.rgbd.keypoints import LIMB_JOINTS, SeenKeypoints, draw_keypoints, find_visible
+from flowing_puppet_ros.evaluate.rgbd.keypoints import (
+    LIMB_JOINTS,
+    SeenKeypoints,
+    draw_keypoints,
+    find_visible,
+    segment_person,
+)
 from flowing_puppet_ros.evaluate.rgbd.rendering import PaintedMesh, RayCamera, RenderedView
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import draw_upright
+from flowing_puppet_ros.image.networks.pose_networks import BlazePose
 from flowing_puppet_ros.model import rotation
 from flowing_puppet_ros.multiview.camera import Camera
 
@@ -123,8 +130,18 @@ class RgbdFrame:
 class RgbdStudio:
     """Draws frames of people; the same generator gives the same frame."""
 
-    def __init__(self, source: BodySource, cameras: RgbdPair | None = None, sensor: str = "structured") -> None:
-        """Take the people's source, the cameras in the rig's frame (registered if None), and a name of SENSORS."""
+    def __init__(
+        self,
+        source: BodySource,
+        cameras: RgbdPair | None = None,
+        sensor: str = "structured",
+        segmenter: BlazePose | None = None,
+    ) -> None:
+        """Take the people's source, the cameras in the rig's frame (registered if None), and a name of SENSORS.
+
+        The `segmenter`, if there is one, makes the masks of the people in the drawn images.
+        """
+        self._segmenter = segmenter
         self.source, self.cameras = source, make_registered() if cameras is None else cameras
         self.sensor: DepthSensor = SENSORS[sensor]
         self._wardrobe = Wardrobe(source)
@@ -222,18 +239,19 @@ class RgbdStudio:
         if not self.cameras.registered or colour_bodies is not None:
             clothed = [*(self._wardrobe.dress(body, k) for k, body in enumerate(later)), *room]
             colour = self._render(self._colour_rays, cameras.colour, clothed)
-        rgb = colour.rgb + IMAGE_GRAIN * for_image.standard_normal(colour.rgb.shape)
+        grainy = colour.rgb + IMAGE_GRAIN * for_image.standard_normal(colour.rgb.shape)
+        rgb = np.clip(np.rint(grainy), 0, 255).astype(np.uint8)
         joints = np.array([body.joints[self._limbs] for body in bodies]).reshape(-1, len(self._limbs), 3)
         scaled = noise * cameras.colour.focal / NOISE_FOCAL_PX
         keypoints, seen = [], []
         for k, body in enumerate(later):
             there = body.joints[self._limbs]
             flags = find_visible(there, cameras.colour, colour, k)
-            keypoints.append(draw_keypoints(for_keypoints, there, cameras.colour, *flags, scaled))
+            drawn = draw_keypoints(for_keypoints, there, cameras.colour, *flags, scaled)
+            keypoints.append(drawn if self._segmenter is None else segment_person(self._segmenter, rgb, drawn))
             seen.append(self._see_exactly(joints[k], cameras.depth, view, k))
         return RgbdFrame(
-            depth, np.clip(np.rint(rgb), 0, 255).astype(np.uint8), cameras, list(bodies), joints, keypoints, seen,
-            view.person, view.depth,
+            depth, rgb, cameras, list(bodies), joints, keypoints, seen, view.person, view.depth,
         )  # fmt: skip
 
     @staticmethod

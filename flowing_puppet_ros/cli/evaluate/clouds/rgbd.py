@@ -30,6 +30,7 @@ from flowing_puppet_ros.evaluate.rgbd.tracking import MotionScore, summarise_mot
 from flowing_puppet_ros.evaluate.rgbd.views import CUTS, RgbdFrame, RgbdStudio, make_pair, make_registered
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
 from flowing_puppet_ros.image.networks.choice import load_networks
+from flowing_puppet_ros.image.networks.pose_networks import BlazePose
 from flowing_puppet_ros.image.networks.sources import IMAGE_SIDE_PX
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import make_out_folder
@@ -86,6 +87,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " stool, chair, armchair or sofa, a couple on one, at a desk, in a wheelchair, a child on a chair; behind a"
         " chair, leaning on a table's edge; with a box, backpack or bag",
     )  # fmt: skip
+    parser.add_argument(
+        "--masks", action="store_true", help="with masks of the people, by the installed network in the drawn images"
+    )
     parser.add_argument("--mocap", type=Path, metavar="NPZ", help="motion capture that the poses are from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder for rgbd.csv and rgbd.json")
     parser.add_argument("--json", action="store_true", help="print the figures as one JSON object")
@@ -112,7 +116,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         make_out_folder(arguments.out)
     cameras = make_pair() if arguments.unregistered else make_registered()
-    studio = RgbdStudio(BodySource(arguments.mocap), cameras, arguments.sensor)
+    segmenter = BlazePose.load() if arguments.masks else None
+    studio = RgbdStudio(BodySource(arguments.mocap), cameras, arguments.sensor, segmenter)
     if arguments.motions is not None:
         motions = _track_motions(arguments, fitter, studio)
         print(format_json({"motions": motions}) if arguments.json else format_table(motions))
