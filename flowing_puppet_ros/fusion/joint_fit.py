@@ -34,15 +34,15 @@ from flowing_puppet_ros.fusion.limb_search import LimbSearcher, find_on_surface
 from flowing_puppet_ros.fusion.puppet_joints import find_other_sides, trunk_rows
 from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
 
-PULLED = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.2, sigma_end=0.03, iterations=14)
+PULLED = RefineWeights(pose=1e-7, pairwise=1e-7, shape=3e-6, sigma_start=0.2, sigma_end=0.03, iterations=14)
 """With joints, from far away."""
 EXCHANGED = replace(PULLED, iterations=8, alternate=2)
 """The same with left and right exchanged, enough to see whether it is worth more."""
 QUICK = replace(PULLED, iterations=8, alternate=2)
 """With joints, quickly."""
-FREE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.06, sigma_end=0.03, iterations=8)
+FREE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=3e-6, sigma_start=0.06, sigma_end=0.03, iterations=8)
 """Without joints, at the end."""
-CLOSE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=1e-6, sigma_start=0.08, sigma_end=0.04, iterations=6, alternate=2)
+CLOSE = RefineWeights(pose=1e-7, pairwise=1e-7, shape=3e-6, sigma_start=0.08, sigma_end=0.04, iterations=6, alternate=2)
 """With joints, after a limb has been hung anew."""
 MAX_FIT_POINTS = 4000
 MAX_SWAP_RATIO = 0.9
