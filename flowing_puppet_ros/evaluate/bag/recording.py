@@ -36,7 +36,7 @@ from flowing_puppet_ros.stream.messages.message_types import (
     TRANSFORMS,
 )
 
-RESULT_LEAVES = ("overlay", "part_labels", "preview", "hull", "body_vertices")
+RESULT_LEAVES = ("overlay", "part_labels", "person_masks", "preview", "hull", "body_vertices")
 """Last words of the image and cloud topics that hold results rather than sensor data."""
 
 Joints = dict[str, np.ndarray]
