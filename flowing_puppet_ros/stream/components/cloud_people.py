@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
+from flowing_puppet_ros.arrays import F64
 from flowing_puppet_ros.body.fit.fitter import Progress
 from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
@@ -20,6 +24,10 @@ from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.pairing.puppet_pairs import PairedPuppets
 from flowing_puppet_ros.stream.sensor_places import SensorPlace
 
+OFFSET_BODIES, MIN_OFFSET_JOINTS, SURE_CONFIDENCE = 20, 6, 0.5
+"""Bodies of which the mean offset of their puppets tells whether colour and depth fit, and sure joints of each."""
+MAX_OFFSET_RAD = 0.015
+"""Of the mean; a network's joints are 0.005 beside a body's at most, in the median of a body."""
 MIN_OUTSIDE_SHARE = 0.1
 """Of a cloud's points, outside of the camera's view, from which on people are found there without puppets."""
 
@@ -36,6 +44,41 @@ class FoundPeople:
         """Return them in the frame of the message."""
         bodies = [body.move(*place.back) for body in self.bodies]
         return FoundPeople(bodies, self.occluded, [person.move(*place.back) for person in self.coarse])
+
+
+class OffsetCheck:
+    """Notices puppets that lie beside the bodies which the cloud shows: then camera and cloud do not fit.
+
+    The joints only start a body and draw it aside a little; points decide. So a wrong calibration, transform or clock
+    moves puppets and bodies apart, always in the same direction.
+    """
+
+    def __init__(self) -> None:
+        """Start without bodies."""
+        self._offsets: deque[F64] = deque(maxlen=OFFSET_BODIES)
+
+    def clear(self) -> None:
+        """Forget the bodies."""
+        self._offsets.clear()
+
+    def add(self, paired: PairedPuppets, bodies: Sequence[TrackedBody]) -> str:
+        """Take the bodies of a cloud with their puppets; return what is to be said, or ""."""
+        fits = {body.id: body.fit for body in bodies}
+        for puppet in paired.puppets:
+            sure = puppet.known & ~puppet.hidden & (puppet.confidence >= SURE_CONFIDENCE)
+            if puppet.id in fits and np.count_nonzero(sure) >= MIN_OFFSET_JOINTS:
+                pixels, _ = paired.camera.project(fits[puppet.id].joints[sure])
+                self._offsets.append(np.median(puppet.pixels[sure] - pixels, axis=0))
+        if len(self._offsets) < OFFSET_BODIES:
+            return ""
+        right, down = np.mean(self._offsets, axis=0)
+        if np.hypot(right, down) <= MAX_OFFSET_RAD * paired.camera.focal:
+            return ""
+        return (
+            f"puppets lie {right:+.0f} px to the right of and {down:+.0f} px below the bodies that the cloud shows, in"
+            f" the mean of {OFFSET_BODIES}: colour and depth do not fit; check puppets/camera_info, the transform between"
+            " both sensors, and their stamps"
+        )
 
 
 class CloudPeople:
@@ -60,6 +103,7 @@ class CloudPeople:
         self._fused = FusedTracker(people, settings.tracker, settings.tracker.hold, report, publish_id)
         self._model = people.fitter.model
         self._colour_only = fusion.colour_only
+        self._offset = OffsetCheck()
         self._report = report
         self._publish_id = publish_id
 
@@ -67,6 +111,7 @@ class CloudPeople:
         """Forget everybody."""
         self.scene.reset()
         self._fused.reset()
+        self._offset.clear()
 
     def fit_once(self, scene: SceneCloud, seed: int, progress: Progress | None) -> list[TrackedBody]:
         """Return the bodies in a cloud of which nobody is tracked."""
@@ -97,6 +142,8 @@ class CloudPeople:
             bodies, own = self._fused.step(seen, scene.draw_image(), paired.puppets, scene.stamp)
         else:
             bodies, own = self._fused.step_alone(seen, scene.draw_image(), paired.puppets)
+        if told := self._offset.add(paired, bodies):
+            self._report.warn(told)
         occluded = self._fused.occluded_ids
         with_body = {body.id for body in bodies}
         coarse = place_others(self._model, [each for each in puppets if each.id not in with_body], seen)

@@ -111,6 +111,24 @@ def test_a_cloud_waits_for_masks_that_are_expected_and_goes_on_without_those_of_
     assert "100x100 on person_masks" in sentence
 
 
+@pytest.mark.parametrize(("shift", "told"), [(0.0, False), (30.0, True)])
+def test_puppets_that_lie_beside_the_bodies_are_one_sentence(model: StitchedPuppet, shift: float, told: bool) -> None:
+    people = [stand_at(joints_of(), 2.5, 0.6), stand_at(joints_of(0.2, 0.2, 0.2), 2.3, -0.6, turn=0.0)]
+    component = make()
+    component.handle("puppets/camera_info", info(SECOND, 2.0))
+    component.handle("camera_info", info(SECOND, 1.0))
+    for number in range(11):
+        stamp = SECOND + number * SECOND // 30
+        seen = puppets(model, stamp, people)
+        for joint in (joint for puppet in seen.puppets for joint in puppet.joints):
+            joint.x += shift  # of a colour image of 2 px per pixel of depth
+        component.handle("puppets", seen)
+        component.handle("depth", depth(stamp, people))
+    component.flush()
+    sentences = [text for text in component.report.drain_warnings() if "colour and depth do not fit" in text]
+    assert len(sentences) == told
+
+
 def test_without_a_puppet_nobody_in_view_has_a_body(model: StitchedPuppet) -> None:
     person = [stand_at(joints_of(), 2.5)]
     component = make()
