@@ -76,8 +76,8 @@ class OffsetCheck:
             return ""
         return (
             f"puppets lie {right:+.0f} px to the right of and {down:+.0f} px below the bodies that the cloud shows, in"
-            f" the mean of {OFFSET_BODIES}: colour and depth do not fit; check puppets/camera_info, the transform between"
-            " both sensors, and their stamps"
+            f" the mean of {OFFSET_BODIES}: colour and depth do not fit; check puppets/camera_info, the transform"
+            " between both sensors, and their stamps"
         )
 
 
