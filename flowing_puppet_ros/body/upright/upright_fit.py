@@ -9,6 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from flowing_puppet_ros.body.bank.body_bank import stature_cost
+from flowing_puppet_ros.body.bank.upright_bank import (
+    CHILD_TOP_M,
+    make_child_bank,
+    make_upright_bank,
+)
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.cloud.normals import downsample
@@ -19,12 +25,6 @@ from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
 from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.upright.upright_bank import (
-    CHILD_TOP_M,
-    make_child_bank,
-    make_upright_bank,
-    stature_cost,
-)
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
@@ -127,7 +127,7 @@ class UprightFitter:
     def fit(
         self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False
     ) -> UprightFit:
-        """Fit the best upright body to a cloud; `floor` is z of the floor, m; `facing` (2,) as in `UprightBank`.
+        """Fit the best upright body to a cloud; `floor` is z of the floor, m; `facing` (2,) as in `BodyBank`.
 
         A `quick` one is that of the best of a part of the bank, in a tenth of the time.
         """

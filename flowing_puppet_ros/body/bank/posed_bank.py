@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A bank of people who sit, crouch, kneel, bend or lift their arms, drawn from the model.
+
+The model draws hardly anybody who sits. So bodies that it draws are leant, their thighs, shanks or arms are swung to
+where those of such people are, and a few Gauss-Newton steps under the model's priors let the flesh follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from flowing_puppet_ros.body.bank.body_bank import BodyBank, turn_bodies
+from flowing_puppet_ros.body.bank.upright_bank import SHAPE_SCALE
+from flowing_puppet_ros.body.refine.gauss_newton import GaussNewton, RefineWeights
+from flowing_puppet_ros.body.search.energy import JointTargets
+from flowing_puppet_ros.model import rotation as so3
+from flowing_puppet_ros.model.sp import BodyState, StitchedPuppet
+from flowing_puppet_ros.process.threads import one_blas_thread, parallel_map, usable_threads
+
+type Range = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class PosedWay:
+    """How some people are, in ranges of degrees.
+
+    Attributes:
+        share: of the bank.
+        lean: of the trunk ahead.
+        thigh: of both thighs, or of the left and of the right one, ahead of straight down.
+        aside: of the thighs to their sides.
+        shank: of both shanks, or of the left and of the right one, ahead of straight down.
+        lifted: arms that are lifted over the head, none, one or two.
+        feet: height of the soles over the floor, metres.
+    """
+
+    share: float
+    lean: Range
+    thigh: tuple[Range, Range]
+    aside: Range
+    shank: tuple[Range, Range]
+    lifted: int = 0
+    feet: Range = (0.0, 0.0)
+
+
+def _alike(low: float, high: float) -> tuple[Range, Range]:
+    return (low, high), (low, high)
+
+
+WAYS = {
+    "seated": PosedWay(0.36, (-22, 30), _alike(76, 100), (0, 24), _alike(-30, 30)),
+    "seated, feet up": PosedWay(0.06, (-20, 15), _alike(78, 98), (0, 15), _alike(-15, 40), feet=(0.03, 0.2)),
+    "on the floor": PosedWay(0.06, (-25, 20), _alike(80, 98), (0, 25), _alike(60, 95)),
+    "knees up": PosedWay(0.07, (-15, 30), _alike(115, 150), (0, 22), _alike(25, 65)),
+    "squatting": PosedWay(0.08, (5, 50), _alike(85, 125), (0, 30), _alike(-40, -10)),
+    "on the heels": PosedWay(0.05, (-5, 30), _alike(50, 80), (0, 20), _alike(-95, -65)),
+    "on one knee": PosedWay(0.05, (-5, 35), ((75, 95), (-10, 20)), (0, 15), ((-15, 12), (-95, -70))),
+    "on both knees": PosedWay(0.04, (-5, 25), _alike(-10, 15), (0, 15), _alike(-98, -75)),
+    "bent": PosedWay(0.13, (28, 90), _alike(-12, 15), (0, 15), _alike(-22, 8)),
+    "one arm up": PosedWay(0.05, (-6, 10), _alike(-10, 12), (0, 10), _alike(-15, 5), lifted=1),
+    "both arms up": PosedWay(0.05, (-6, 10), _alike(-10, 12), (0, 10), _alike(-15, 5), lifted=2),
+}
+POSES = 140
+KNEELING_RAD = -np.radians(60.0)  # of a shank, from which on the foot lies as it does
+ARM_RAD = np.radians(45.0)  # of the parts of lifted arms, from straight up
+MAX_HAND_M = 0.0  # of hands that are not lifted, over the neck
+SOFTEN = RefineWeights(stitch=0.1, pose=1e-6, shape=1e-3, pairwise=5e-7, iterations=8)
+TARGET_WEIGHT = 0.02  # of the joints, against the priors
+SIDES = ("left", "right")
+
+
+@lru_cache(maxsize=3)
+@one_blas_thread()
+def make_posed_bank(model: StitchedPuppet) -> BodyBank:
+    """Draw the bank; made once for a model."""
+    rng = np.random.default_rng(0)
+    counts = np.round(POSES * np.array([way.share for way in WAYS.values()])).astype(np.int64)
+    bodies: list[tuple[BodyState, np.ndarray]] = []
+    gauss_newton = GaussNewton(model)
+    for way, count in zip(WAYS.values(), counts, strict=True):
+        drawn = _draw_plain(model, rng, int(count))
+        targets = [_swing(model, body, way, rng) for body in drawn]
+        feet = rng.uniform(*way.feet, count)
+
+        def soften(pair: tuple[BodyState, JointTargets]) -> BodyState:
+            return gauss_newton.run(pair[0], None, pair[1], SOFTEN)
+
+        for state, height in zip(parallel_map(soften, targets, usable_threads(2)), feet, strict=True):
+            vertices = model.vertices(state)
+            joints = dict(zip(model.joint_names, model.joints(vertices), strict=True))
+            hips = (joints["left_hip"] + joints["right_hip"]) / 2
+            down = np.array([-hips[0], -hips[1], height - vertices[:, 2].min()])
+            moved = BodyState(state.center + down, state.rotation, state.pose, state.shape)
+            bodies.append((moved, vertices + down))
+    return turn_bodies(model, bodies)
+
+
+def _draw_plain(model: StitchedPuppet, rng: np.random.Generator, count: int) -> list[BodyState]:
+    """Draw bodies whose hands are below the neck."""
+    found: list[BodyState] = []
+    neck, wrists = model.joint_names.index("neck"), [model.joint_names.index(f"{side}_wrist") for side in SIDES]
+    while len(found) < count:
+        many = model.sample_many(rng, 2 * count, shape_scale=SHAPE_SCALE)
+        for arrays in zip(many.center, many.rotation, many.pose, many.shape, model.vertices(many), strict=True):
+            joints = model.joints(arrays[4])
+            if joints[wrists, 2].max() < joints[neck, 2] + MAX_HAND_M:
+                found.append(BodyState(*arrays[:4]))
+    return found[:count]
+
+
+def _swing(
+    model: StitchedPuppet, state: BodyState, way: PosedWay, rng: np.random.Generator
+) -> tuple[BodyState, JointTargets]:
+    """Return a body that is leant, its limbs swung, and where its joints are then."""
+    limbs = _Limbs(model, state)
+    limbs.turn("torso", "pelvis", so3.exp(np.radians([rng.normal(0, 3), rng.uniform(*way.lean), 0.0])))
+    for side, sign, thigh, shank in zip(SIDES, (1, -1), way.thigh, way.shank, strict=True):
+        aside, below = np.radians(rng.uniform(*way.aside)) * sign, np.radians(rng.uniform(*shank))
+        limbs.aim(f"{side}_upper_leg", f"{side}_hip", f"{side}_knee", _point(np.radians(rng.uniform(*thigh)), aside))
+        limbs.aim(f"{side}_lower_leg", f"{side}_knee", f"{side}_ankle", _point(below, 0.3 * aside))
+        if below < KNEELING_RAD:
+            limbs.aim(f"{side}_foot", f"{side}_ankle", f"{side}_toe", _point(below, 0.0))
+    for side in rng.permutation(np.array(SIDES))[: way.lifted]:
+        for part, near, far in (("upper_arm", "shoulder", "elbow"), ("lower_arm", "elbow", "wrist")):
+            ahead, aside = rng.uniform(-ARM_RAD, ARM_RAD, 2)
+            limbs.aim(f"{side}_{part}", f"{side}_{near}", f"{side}_{far}", -_point(-ahead, -aside))
+    weight = np.zeros(len(model.joint_names))
+    chosen = (
+        "pelvis",
+        "neck",
+        *(f"{side}_{name}" for side in SIDES for name in ("hip", "knee", "ankle", "elbow", "wrist")),
+    )
+    weight[[model.joint_names.index(name) for name in chosen]] = TARGET_WEIGHT
+    return limbs.state, JointTargets(limbs.joints, weight)
+
+
+def _point(ahead: float, aside: float) -> np.ndarray:
+    """Return the direction (3,) so far ahead of straight down, turned so far to the left."""
+    along = np.array([np.sin(ahead), 0.0, -np.cos(ahead)])
+    return np.asarray(so3.exp(np.array([aside * np.cos(ahead), 0.0, aside * np.sin(ahead)])) @ along)
+
+
+class _Limbs:
+    """A body whose limbs are turned about their joints, everything farther out with them."""
+
+    def __init__(self, model: StitchedPuppet, state: BodyState) -> None:
+        self._model = model
+        self.state = BodyState(state.center.copy(), state.rotation.copy(), state.pose, state.shape)
+        self.joints = model.joints(model.vertices(state))
+
+    def turn(self, part: str, joint: str, turn: np.ndarray) -> None:
+        """Turn a part and all that hangs on it by `turn` (3, 3) about a joint."""
+        tree, state = self._model.tree, self.state
+        rows = {tree.names.index(part)}
+        for number, parent in enumerate(tree.parents):
+            if parent in rows:
+                rows.add(number)
+        middle = self.joints[self._model.joint_names.index(joint)].copy()
+        for row in rows:
+            state.center[row] = middle + turn @ (state.center[row] - middle)
+            state.rotation[row] = turn @ state.rotation[row]
+        self.joints = self._model.joints(self._model.vertices(state))
+
+    def aim(self, part: str, near: str, far: str, direction: np.ndarray) -> None:
+        """Turn a part so that its far joint is in a direction (3,) from its near one."""
+        names = self._model.joint_names
+        now = self.joints[names.index(far)] - self.joints[names.index(near)]
+        now = now / np.linalg.norm(now)
+        axis = np.cross(now, direction)
+        sine = float(np.linalg.norm(axis))
+        if sine > 1e-9:
+            self.turn(part, near, so3.exp(axis / sine * np.arctan2(sine, now @ direction)))
