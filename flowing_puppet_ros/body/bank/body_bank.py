@@ -24,6 +24,10 @@ ROUGH_POINTS, FINE_POINTS = 90, 300  # surface points of a body
 ROUGH_TARGETS, FINE_TARGETS = 60, 250  # of the cloud
 FINE_BODIES, MAX_SAME_YAW = 96, 2
 TURNED = 3  # of the best bodies, that face the other way than the best
+TOP_M = 0.35  # below the top of a cloud, of what a body is placed by
+TOP_COST, OVER_TOP_M, BELOW_TOP_M, MAX_TOP_COST_M = 0.2, 0.12, 0.05, 0.06
+"""Cost of a metre by which such a body is higher or lower than the cloud, beyond what the gap between two rings hides,
+and the most that counts."""
 SEEN_MARGIN_M = 0.08  # above and below a cloud within which a body's surface is taken for seen
 
 
@@ -52,21 +56,23 @@ class BodyBank:
         count: int,
         facing: np.ndarray | None = None,
         every: int = 1,
+        by_top: bool = False,
     ) -> list[tuple[float, BodyState]]:
         """Return the best bodies on a cloud with their costs in metres, at most two of a yaw and `count` of all.
 
         A few of them face the other way than the best: few points hardly tell front from back, and only the refined
         bodies show which it is. `floor` is z of the floor, metres. Where it is known to which side, `facing` (2,), all
-        face there. Of the poses and of the yaws, one out of `every` so many is compared.
+        face there. Of the poses and of the yaws, one out of `every` so many is compared. Bodies are placed by all that
+        is seen of them, or `by_top`, by what is highest, which is theirs where they sit on something.
         """
         poses = len(self.states)
         rows = np.arange(len(self.points)).reshape(YAWS, poses)[::every, ::every].ravel()
         if facing is not None:
             rows = rows[(self.turns[:, :2, 0] @ facing > 0)[rows // poses]]
         targets = cloud.points[farthest_points(cloud.points, FINE_TARGETS)]
-        rough, _ = self._judge(cloud, floor, rows, targets[:ROUGH_TARGETS], ROUGH_POINTS)
+        rough, _ = self._judge(cloud, floor, rows, targets[:ROUGH_TARGETS], ROUGH_POINTS, by_top)
         rows = rows[np.argsort(rough, kind="stable")[:FINE_BODIES]]
-        cost, shift = self._judge(cloud, floor, rows, targets, FINE_POINTS)
+        cost, shift = self._judge(cloud, floor, rows, targets, FINE_POINTS, by_top)
         order = np.argsort(cost, kind="stable")
         yaw = rows // poses
         apart = np.abs((yaw - yaw[order[0]] + YAWS // 2) % YAWS - YAWS // 2) * (2 * np.pi / YAWS)
@@ -80,19 +86,33 @@ class BodyBank:
         ]
 
     def _judge(
-        self, cloud: SingleViewCloud, floor: float, rows: np.ndarray, targets: np.ndarray, surface: int
+        self,
+        cloud: SingleViewCloud,
+        floor: float,
+        rows: np.ndarray,
+        targets: np.ndarray,
+        surface: int,
+        by_top: bool,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the costs (P,) m of bodies moved to the cloud, and by how much (P, 3) m they were moved."""
         points, normals = self.points[rows, :surface], self.normals[rows, :surface]
         middle = targets.mean(axis=0)
         low, high = targets[:, 2].min() - floor - SEEN_MARGIN_M, targets[:, 2].max() - floor + SEEN_MARGIN_M
         seen = (normals @ (middle - cloud.view.viewpoint) < 0) & (points[:, :, 2] > low) & (points[:, :, 2] < high)
-        sums = (points[:, :, :2] * seen[:, :, None]).sum(axis=1)
+        placed, at, top = seen, middle, float(cloud.points[:, 2].max())
+        if by_top:
+            placed = seen & (points[:, :, 2] > top - floor - TOP_M)
+            at = cloud.points[cloud.points[:, 2] > top - TOP_M].mean(axis=0)
+        sums = (points[:, :, :2] * placed[:, :, None]).sum(axis=1)
         shift = np.full((len(rows), 3), floor)
-        shift[:, :2] = middle[:2] - sums / np.maximum(seen.sum(axis=1), 1)[:, None]
+        shift[:, :2] = at[:2] - sums / np.maximum(placed.sum(axis=1), 1)[:, None]
         moved = points + shift[:, None, :]
         misfit, facing = cloud.view.misfit(moved, normals)
         cost = distances(targets, moved, facing).mean(axis=1) + misfit
+        if by_top:
+            over = self.points[rows, :, 2].max(axis=1) - (top - floor)
+            beyond = np.maximum(over - OVER_TOP_M, 0) + np.maximum(-over - BELOW_TOP_M, 0)
+            cost += np.minimum(TOP_COST * beyond, MAX_TOP_COST_M)
         return cost + stature_cost(self.stature)[rows % len(self.states)], shift
 
 

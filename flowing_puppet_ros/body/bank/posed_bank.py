@@ -7,6 +7,7 @@ where those of such people are, and a few Gauss-Newton steps under the model's p
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -65,6 +66,8 @@ WAYS = {
 }
 POSES = 140
 KNEELING_RAD = -np.radians(60.0)  # of a shank, from which on the foot lies as it does
+MIN_STRETCHED, MAX_LEAN_RAD = 0.75, np.radians(35.0)
+"""Height of the hips over the lower ankle, for each of the legs' length, and lean of the trunk, of who stands."""
 ARM_RAD = np.radians(45.0)  # of the parts of lifted arms, from straight up
 MAX_HAND_M = 0.0  # of hands that are not lifted, over the neck
 SOFTEN = RefineWeights(stitch=0.1, pose=1e-6, shape=1e-3, pairwise=5e-7, iterations=8)
@@ -96,6 +99,21 @@ def make_posed_bank(model: StitchedPuppet) -> BodyBank:
             moved = BodyState(state.center + down, state.rotation, state.pose, state.shape)
             bodies.append((moved, vertices + down))
     return turn_bodies(model, bodies)
+
+
+def is_posed(joints: Mapping[str, np.ndarray]) -> bool:
+    """Return whether somebody with these joints (3,) m is as those of the bank, not as who stands or walks."""
+    hips = (joints["left_hip"] + joints["right_hip"]) / 2
+    trunk = (joints["left_shoulder"] + joints["right_shoulder"]) / 2 - hips
+    legs = [
+        np.linalg.norm(joints[f"{side}_hip"] - joints[f"{side}_knee"])
+        + np.linalg.norm(joints[f"{side}_knee"] - joints[f"{side}_ankle"])
+        for side in SIDES
+    ]
+    stretched = (hips[2] - min(joints[f"{side}_ankle"][2] for side in SIDES)) / max(legs)
+    lifted = max(joints[f"{side}_wrist"][2] for side in SIDES) > joints["head_top"][2]
+    leans = trunk[2] < np.cos(MAX_LEAN_RAD) * np.linalg.norm(trunk)
+    return bool(stretched < MIN_STRETCHED or leans or lifted)
 
 
 def _draw_plain(model: StitchedPuppet, rng: np.random.Generator, count: int) -> list[BodyState]:

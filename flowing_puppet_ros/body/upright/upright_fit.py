@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from flowing_puppet_ros.body.bank.body_bank import stature_cost
+from flowing_puppet_ros.body.bank.posed_bank import make_posed_bank
 from flowing_puppet_ros.body.bank.upright_bank import (
     CHILD_TOP_M,
     make_child_bank,
@@ -87,8 +88,9 @@ class UprightFitter:
         self._threads = usable_threads(min(fitter.settings.threads, max_threads))
 
     def warm_up(self) -> None:
-        """Make the bank beforehand, children included."""
+        """Make the banks beforehand."""
         make_child_bank(self._fitter.model)
+        make_posed_bank(self._fitter.model)
 
     def make_cloud(
         self,
@@ -123,6 +125,10 @@ class UprightFitter:
             return starts
         children = make_child_bank(model).find_best(cloud, floor, STARTS, facing, every**2)
         return sorted([*starts, *children], key=lambda start: start[0])[:STARTS]
+
+    def find_posed(self, cloud: SingleViewCloud, floor: float, quick: bool = False) -> list[tuple[float, BodyState]]:
+        """Return the best bodies of those who sit, bend, crouch or lift arms, with costs in metres; as `find_rough`."""
+        return make_posed_bank(self._fitter.model).find_best(cloud, floor, STARTS, every=2 if quick else 1, by_top=True)
 
     def fit(
         self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False

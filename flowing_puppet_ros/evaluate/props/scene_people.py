@@ -37,7 +37,7 @@ def draw_posed(source: BodySource, rng: np.random.Generator, pose: str) -> tuple
         size = np.array([*rng.uniform(*STEP_SIZE_M, 2), height])
         # The feet stay on it, somewhere.
         feet = (size[:2] - STEP_SIZE_M[0]) / 2 * rng.uniform(-1, 1, 2)
-        return _turn(rng, [body.translate(np.array([0.0, 0.0, height]))], [stand_box(*feet, 0.0, size)])
+        return _turn(rng, [body.translate(np.array([0.0, 0.0, height]))], [stand_box(feet[0], feet[1], 0.0, size)])
     body = draw_lifting(source, rng) if pose == "arms-up" else draw_low(source, rng, pose)
     return _turn(rng, [body], [])
 
@@ -48,7 +48,7 @@ def draw_empty_seat(source: BodySource, rng: np.random.Generator) -> tuple[list[
     place = Place.of(source, bodies[0])
     if rng.random() < LOADED_SHARE:
         size = rng.uniform((0.2, 0.25, 0.15), (0.4, 0.45, MAX_LOAD_M))
-        meshes.append(stand_box(*place.middle, place.seat, size, rng.uniform(-0.4, 0.4)))
+        meshes.append(stand_box(place.middle[0], place.middle[1], place.seat, size, rng.uniform(-0.4, 0.4)))
         if rng.random() < 0.3:
             meshes.append(
                 make_prism(place.middle, rng.uniform(0.08, 0.15), place.seat + size[2], place.seat + size[2] + 0.25)

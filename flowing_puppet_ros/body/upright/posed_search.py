@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""People who sit, bend, crouch or lift their arms, where no upright body explains what is seen.
+
+What they sit on is part of the candidate. So the best bodies are placed by what is highest, and only the points beside
+the fitted body are the person's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
+from flowing_puppet_ros.body.fit.fitter import BodyFit
+from flowing_puppet_ros.body.segmentation.candidates import Candidate
+from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
+from flowing_puppet_ros.body.upright.found_body import JudgedFit, ScanView
+from flowing_puppet_ros.body.upright.person_model import POSED, PersonModel
+from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate, RejectedPlaces
+from flowing_puppet_ros.body.upright.scan_rays import ScanRays
+from flowing_puppet_ros.body.upright.upright_fit import UprightFit, UprightFitter
+from flowing_puppet_ros.body.upright.verification import FitEvidence, weigh_fit
+from flowing_puppet_ros.errors import InputError
+from flowing_puppet_ros.evidence.cloud.nearest import find_beside
+from flowing_puppet_ros.model.sp import StitchedPuppet
+
+REACH_M, CLAIM_M, MIN_CLAIM_HEIGHT_M = 1.0, 0.1, 0.06
+"""Distance from a candidate's middle up to which points may be the person's, from the body up to which they are, and
+their height over the floor."""
+MAX_OWNED_SHARE = 0.3  # of a candidate's points that somebody else may have
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedFit:
+    """A body, the points that it claims as a candidate, and what the scan says about it."""
+
+    found: UprightFit
+    claimed: Candidate
+    evidence: FitEvidence
+
+
+def fit_posed(
+    upright: UprightFitter,
+    model: StitchedPuppet,
+    candidate: Candidate,
+    view: ScanView,
+    free: np.ndarray,
+    min_points: int,
+    quick: bool = False,
+) -> PosedFit | None:
+    """Fit the best posed body to a candidate; None where none can be fitted, or claims fewer than `min_points`.
+
+    `free` (N,) tells which points of the scan nobody else has.
+    """
+    scene = view.scene
+    seen = see_candidate(upright, scene.points[candidate.rows], view.rays)
+    if seen is None:
+        return None
+    starts = upright.find_posed(seen[0], candidate.floor, quick)
+    found = upright.refine(starts[: 1 if quick else None], seen[0], candidate.floor)
+    near = scene.index.find_near(scene.points, candidate.middle, REACH_M)[0]
+    near = np.sort(near[free[near] & (scene.height[near] > MIN_CLAIM_HEIGHT_M)])
+    rows = near[find_beside(scene.points[near], found.fit.vertices, CLAIM_M)]
+    if len(rows) < min_points:
+        return None
+    claimed = Candidate.of(scene, rows)
+    seen = see_candidate(upright, scene.points[rows], view.rays)
+    if seen is None:
+        return None
+    return PosedFit(found, claimed, weigh_fit(found, seen[0], claimed, scene, view.rays, seen[1], model))
+
+
+def see_candidate(
+    upright: UprightFitter, points: np.ndarray, rays: ScanRays
+) -> tuple[SingleViewCloud, np.ndarray] | None:
+    """Return the cloud of points (N, 3) m, and the rays (M,) near them; None where the sensor stands in them."""
+    window = rays.find_window(points)
+    try:
+        return upright.make_cloud(points, rays.viewpoint, rays.find_unknown(points, window)), window
+    except InputError:
+        return None
+
+
+class PosedSearch:
+    """Finds posed people among candidates, and remembers what was none."""
+
+    def __init__(
+        self, upright: UprightFitter, model: StitchedPuppet, min_filter: float, min_probability: float, keep: float
+    ) -> None:
+        """Fit with `upright`; limits as in `PersonFinderSettings`, what was nobody is kept for `keep` seconds."""
+        self._upright, self._body_model = upright, model
+        self._min_filter, self._min_probability = min_filter, min_probability
+        self._rejected = RejectedPlaces(keep)
+
+    def clear(self) -> None:
+        """Forget what was nobody."""
+        self._rejected.clear()
+
+    def find(
+        self,
+        candidates: Sequence[Candidate],
+        view: ScanView,
+        owned: np.ndarray,
+        fits: int,
+        min_points: int,
+        quick: bool,
+    ) -> tuple[list[tuple[JudgedFit, Candidate]], list[RejectedCandidate]]:
+        """Return posed people with their points, and what was fitted and is nobody.
+
+        Args:
+            candidates: in the scan.
+            view: the scan.
+            owned: (N,) which of its points somebody has.
+            fits: bodies to fit, the likeliest first.
+            min_points: of a person.
+            quick: whether fewer bodies are compared.
+        """
+        chosen = self._choose([each for each in candidates if owned[each.rows].mean() < MAX_OWNED_SHARE], view)
+        found, rejected = [], []
+        for candidate, likely in chosen[:fits]:
+            fitted = fit_posed(self._upright, self._body_model, candidate, view, ~owned, min_points, quick)
+            judged = None if fitted is None else self.weigh(fitted.found.fit, fitted.evidence)
+            if fitted is not None and judged is not None and judged.probability >= self._min_probability:
+                found.append((judged, fitted.claimed))
+                continue
+            probability = likely if judged is None else judged.probability
+            rejected.append(RejectedCandidate.of(candidate, probability, "no body explains it"))
+            if view.remember:
+                self._rejected.add(candidate, view.stamp)
+        return found, rejected
+
+    def weigh(self, fit: BodyFit, evidence: FitEvidence) -> JudgedFit:
+        """Return what the evidence says about a body."""
+        model = PersonModel.load(POSED)
+        likely = 0.0 if evidence.between_others else model.judge_fit(evidence)
+        return JudgedFit(likely, model.rate(likely, evidence), fit)
+
+    def _choose(self, candidates: Sequence[Candidate], view: ScanView) -> list[tuple[Candidate, float]]:
+        """Return the candidates that are worth a fit with their probabilities by shape, the likeliest first."""
+        shape = describe_candidates(list(candidates), view.scene, view.rays.viewpoint)
+        probability = PersonModel.load(POSED).trees.predict(shape)
+        return [
+            (candidates[number], float(probability[number]))
+            for number in np.argsort(-probability, kind="stable")
+            if probability[number] >= self._min_filter
+            and not (view.remember and self._rejected.contains(candidates[number], view.stamp))
+        ]
