@@ -8,15 +8,17 @@ the fitted body are the person's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flowing_puppet_ros.body.bank.body_bank import stature_cost
+from flowing_puppet_ros.body.bank.posed_bank import is_posed
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.segmentation.candidates import Candidate
 from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
-from flowing_puppet_ros.body.upright.found_body import JudgedFit, ScanView
+from flowing_puppet_ros.body.upright.found_body import FitBudget, JudgedFit, ScanView
 from flowing_puppet_ros.body.upright.person_model import POSED, PersonModel
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate, RejectedPlaces
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
@@ -29,6 +31,10 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 REACH_M, CLAIM_M, MIN_CLAIM_HEIGHT_M = 1.0, 0.1, 0.06
 """Distance from a candidate's middle up to which points may be the person's, from the body up to which they are, and
 their height over the floor."""
+MAX_FITS, MAX_STREAM_FITS, MAX_LIVE_FITS = 12, 4, 1
+"""Bodies that are fitted in a scan by itself, of a recording, and of a live stream."""
+MAX_SEATED_TOP_M, MIN_GAIN_M = 1.55, 0.003
+"""Height of the top up to which somebody who seems to stand may sit, and by how much closer such a body has to be."""
 MAX_OWNED_SHARE = 0.3  # of a candidate's points that somebody else may have
 
 
@@ -103,9 +109,8 @@ class PosedSearch:
         candidates: Sequence[Candidate],
         view: ScanView,
         owned: np.ndarray,
-        fits: int,
+        budget: FitBudget,
         min_points: int,
-        quick: bool,
     ) -> tuple[list[tuple[JudgedFit, Candidate]], list[RejectedCandidate]]:
         """Return posed people with their points, and what was fitted and is nobody.
 
@@ -113,14 +118,14 @@ class PosedSearch:
             candidates: in the scan.
             view: the scan.
             owned: (N,) which of its points somebody has.
-            fits: bodies to fit, the likeliest first.
+            budget: of the upright bodies, by which the number of these goes.
             min_points: of a person.
-            quick: whether fewer bodies are compared.
         """
         chosen = self._choose([each for each in candidates if owned[each.rows].mean() < MAX_OWNED_SHARE], view)
         found, rejected = [], []
+        fits = MAX_LIVE_FITS if budget.quick else MAX_FITS if budget.max_misses is None else MAX_STREAM_FITS
         for candidate, likely in chosen[:fits]:
-            fitted = fit_posed(self._upright, self._body_model, candidate, view, ~owned, min_points, quick)
+            fitted = fit_posed(self._upright, self._body_model, candidate, view, ~owned, min_points, budget.quick)
             judged = None if fitted is None else self.weigh(fitted.found.fit, fitted.evidence)
             if fitted is not None and judged is not None and judged.probability >= self._min_probability:
                 found.append((judged, fitted.claimed))
@@ -130,6 +135,36 @@ class PosedSearch:
             if view.remember:
                 self._rejected.add(candidate, view.stamp)
         return found, rejected
+
+    def improve(
+        self, judged: JudgedFit, candidate: Candidate, view: ScanView, free: np.ndarray, min_points: int, quick: bool
+    ) -> tuple[JudgedFit, Candidate]:
+        """Return an upright body with its candidate, or a posed one that is closer to what is too low for an adult.
+
+        `free` (N,) tells which points of the scan nobody else has.
+        """
+        if candidate.top > MAX_SEATED_TOP_M or not self._choose([candidate], replace(view, remember=False)):
+            return judged, candidate
+        fitted = fit_posed(self._upright, self._body_model, candidate, view, free, min_points, quick)
+        seen = see_candidate(self._upright, view.scene.points[candidate.rows], view.rays)
+        if fitted is None or seen is None:
+            return judged, candidate
+        posed = self.weigh(fitted.found.fit, fitted.evidence)
+        upright = self._upright.rate(judged.fit, seen[0])
+        # A child costs more than an adult who sits, but is as likely there.
+        gain = upright.cost - _cost_stature(upright) - (fitted.found.cost - _cost_stature(fitted.found))
+        if gain < MIN_GAIN_M or posed.probability < self._min_probability:
+            return judged, candidate
+        return posed, fitted.claimed
+
+    def judge(
+        self, fit: BodyFit, cloud: SingleViewCloud, candidate: Candidate, view: ScanView, window: np.ndarray
+    ) -> JudgedFit | None:
+        """Return what a scan says about a body that is tracked; None where it stands or walks."""
+        if not is_posed(dict(zip(self._body_model.joint_names, fit.joints, strict=True))):
+            return None
+        found = self._upright.rate(fit, cloud)
+        return self.weigh(fit, weigh_fit(found, cloud, candidate, view.scene, view.rays, window, self._body_model))
 
     def weigh(self, fit: BodyFit, evidence: FitEvidence) -> JudgedFit:
         """Return what the evidence says about a body."""
@@ -147,3 +182,7 @@ class PosedSearch:
             if probability[number] >= self._min_filter
             and not (view.remember and self._rejected.contains(candidates[number], view.stamp))
         ]
+
+
+def _cost_stature(found: UprightFit) -> float:
+    return float(stature_cost(np.array(found.stature)))
