@@ -50,6 +50,7 @@ COME_ODDS, COME_FILTER = 1.5, 0.3
 limit that is asked of it. Cars and doors move too."""
 COLUMN_FILTER = 0.7  # the same of a column of a larger cluster: who stands close to others has a part of their shape
 MIN_QUICK_BESIDE = 0.5  # probability of who is found beside a quick body
+MIN_STEP = 0.6  # probability of who is found on a step only
 BESIDE_M, CONTEXT_M, OWN_M = 1.0, 1.0, 0.10
 """Distance from a person within which others are looked for in what that person leaves, of their surroundings beyond,
 and from a body, up to which points are its own."""
@@ -240,7 +241,8 @@ class PersonFinder:
         if raised is None or first is None:
             return None
         higher = self._try_others(first, *raised)
-        is_better = self._is_proven(higher) and higher.probability > judged.probability
+        least = judged.probability if self._is_proven(judged) else MIN_STEP
+        is_better = higher.probability > least
         return (higher, raised[0]) if is_better else None
 
     def _own(self, points: np.ndarray, accepted: Sequence[tuple[JudgedFit, Candidate]]) -> None:
