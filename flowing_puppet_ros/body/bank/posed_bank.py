@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bank of people who sit, crouch, kneel, bend or lift their arms, drawn from the model.
+"""A bank of people who sit, crouch, kneel or bend, drawn from the model.
 
-The model draws hardly anybody who sits. So bodies that it draws are leant, their thighs, shanks or arms are swung to
-where those of such people are, and a few Gauss-Newton steps under the model's priors let the flesh follow.
+The model draws hardly anybody who sits. So bodies that it draws are leant, their thighs and shanks swung to where
+those of such people are, and a few Gauss-Newton steps under the model's priors let the flesh follow.
 """
 
 from __future__ import annotations
@@ -29,21 +29,19 @@ class PosedWay:
     """How some people are, in ranges of degrees.
 
     Attributes:
-        share: of the bank.
+        count: of them in the bank.
         lean: of the trunk ahead.
         thigh: of both thighs, or of the left and of the right one, ahead of straight down.
         aside: of the thighs to their sides.
         shank: of both shanks, or of the left and of the right one, ahead of straight down.
-        lifted: arms that are lifted over the head, none, one or two.
         feet: height of the soles over the floor, metres.
     """
 
-    share: float
+    count: int
     lean: Range
     thigh: tuple[Range, Range]
     aside: Range
     shank: tuple[Range, Range]
-    lifted: int = 0
     feet: Range = (0.0, 0.0)
 
 
@@ -52,24 +50,19 @@ def _alike(low: float, high: float) -> tuple[Range, Range]:
 
 
 WAYS = {
-    "seated": PosedWay(0.36, (-22, 30), _alike(76, 100), (0, 24), _alike(-30, 30)),
-    "seated, feet up": PosedWay(0.06, (-20, 15), _alike(78, 98), (0, 15), _alike(-15, 40), feet=(0.03, 0.2)),
-    "on the floor": PosedWay(0.06, (-25, 20), _alike(80, 98), (0, 25), _alike(60, 95)),
-    "knees up": PosedWay(0.07, (-15, 30), _alike(115, 150), (0, 22), _alike(25, 65)),
-    "squatting": PosedWay(0.08, (5, 50), _alike(85, 125), (0, 30), _alike(-40, -10)),
-    "on the heels": PosedWay(0.05, (-5, 30), _alike(50, 80), (0, 20), _alike(-95, -65)),
-    "on one knee": PosedWay(0.05, (-5, 35), ((75, 95), (-10, 20)), (0, 15), ((-15, 12), (-95, -70))),
-    "on both knees": PosedWay(0.04, (-5, 25), _alike(-10, 15), (0, 15), _alike(-98, -75)),
-    "bent": PosedWay(0.13, (28, 90), _alike(-12, 15), (0, 15), _alike(-22, 8)),
-    "one arm up": PosedWay(0.05, (-6, 10), _alike(-10, 12), (0, 10), _alike(-15, 5), lifted=1),
-    "both arms up": PosedWay(0.05, (-6, 10), _alike(-10, 12), (0, 10), _alike(-15, 5), lifted=2),
+    "seated": PosedWay(45, (-22, 30), _alike(76, 100), (0, 24), _alike(-30, 30)),
+    "seated, feet up": PosedWay(8, (-20, 15), _alike(78, 98), (0, 15), _alike(-15, 40), feet=(0.03, 0.2)),
+    "on the floor": PosedWay(8, (-25, 20), _alike(80, 98), (0, 25), _alike(60, 95)),
+    "knees up": PosedWay(9, (-15, 30), _alike(115, 150), (0, 22), _alike(25, 65)),
+    "squatting": PosedWay(10, (5, 50), _alike(85, 125), (0, 30), _alike(-40, -10)),
+    "on the heels": PosedWay(6, (-5, 30), _alike(50, 80), (0, 20), _alike(-95, -65)),
+    "on one knee": PosedWay(6, (-5, 35), ((75, 95), (-10, 20)), (0, 15), ((-15, 12), (-95, -70))),
+    "on both knees": PosedWay(5, (-5, 25), _alike(-10, 15), (0, 15), _alike(-98, -75)),
+    "bent": PosedWay(16, (28, 90), _alike(-12, 15), (0, 15), _alike(-22, 8)),
 }
-POSES = 140
 KNEELING_RAD = -np.radians(60.0)  # of a shank, from which on the foot lies as it does
 MIN_STRETCHED, MAX_LEAN_RAD = 0.75, np.radians(35.0)
 """Height of the hips over the lower ankle, for each of the legs' length, and lean of the trunk, of who stands."""
-ARM_RAD = np.radians(45.0)  # of the parts of lifted arms, from straight up
-MAX_HAND_M = 0.0  # of hands that are not lifted, over the neck
 SOFTEN = RefineWeights(stitch=0.1, pose=1e-6, shape=1e-3, pairwise=5e-7, iterations=8)
 TARGET_WEIGHT = 0.02  # of the joints, against the priors
 SIDES = ("left", "right")
@@ -80,13 +73,12 @@ SIDES = ("left", "right")
 def make_posed_bank(model: StitchedPuppet) -> BodyBank:
     """Draw the bank; made once for a model."""
     rng = np.random.default_rng(0)
-    counts = np.round(POSES * np.array([way.share for way in WAYS.values()])).astype(np.int64)
     bodies: list[tuple[BodyState, np.ndarray]] = []
     gauss_newton = GaussNewton(model)
-    for way, count in zip(WAYS.values(), counts, strict=True):
-        drawn = _draw_plain(model, rng, int(count))
+    for way in WAYS.values():
+        drawn = _draw_plain(model, rng, way.count)
         targets = [_swing(model, body, way, rng) for body in drawn]
-        feet = rng.uniform(*way.feet, count)
+        feet = rng.uniform(*way.feet, way.count)
 
         def soften(pair: tuple[BodyState, JointTargets]) -> BodyState:
             return gauss_newton.run(pair[0], None, pair[1], SOFTEN)
@@ -111,9 +103,8 @@ def is_posed(joints: Mapping[str, np.ndarray]) -> bool:
         for side in SIDES
     ]
     stretched = (hips[2] - min(joints[f"{side}_ankle"][2] for side in SIDES)) / max(legs)
-    lifted = max(joints[f"{side}_wrist"][2] for side in SIDES) > joints["head_top"][2]
     leans = trunk[2] < np.cos(MAX_LEAN_RAD) * np.linalg.norm(trunk)
-    return bool(stretched < MIN_STRETCHED or leans or lifted)
+    return bool(stretched < MIN_STRETCHED or leans)
 
 
 def _draw_plain(model: StitchedPuppet, rng: np.random.Generator, count: int) -> list[BodyState]:
@@ -124,7 +115,7 @@ def _draw_plain(model: StitchedPuppet, rng: np.random.Generator, count: int) -> 
         many = model.sample_many(rng, 2 * count, shape_scale=SHAPE_SCALE)
         for arrays in zip(many.center, many.rotation, many.pose, many.shape, model.vertices(many), strict=True):
             joints = model.joints(arrays[4])
-            if joints[wrists, 2].max() < joints[neck, 2] + MAX_HAND_M:
+            if joints[wrists, 2].max() < joints[neck, 2]:
                 found.append(BodyState(*arrays[:4]))
     return found[:count]
 
@@ -141,10 +132,6 @@ def _swing(
         limbs.aim(f"{side}_lower_leg", f"{side}_knee", f"{side}_ankle", _point(below, 0.3 * aside))
         if below < KNEELING_RAD:
             limbs.aim(f"{side}_foot", f"{side}_ankle", f"{side}_toe", _point(below, 0.0))
-    for side in rng.permutation(np.array(SIDES))[: way.lifted]:
-        for part, near, far in (("upper_arm", "shoulder", "elbow"), ("lower_arm", "elbow", "wrist")):
-            ahead, aside = rng.uniform(-ARM_RAD, ARM_RAD, 2)
-            limbs.aim(f"{side}_{part}", f"{side}_{near}", f"{side}_{far}", -_point(-ahead, -aside))
     weight = np.zeros(len(model.joint_names))
     chosen = (
         "pelvis",

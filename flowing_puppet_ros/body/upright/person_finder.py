@@ -95,12 +95,11 @@ class PersonFinder:
         self.upright = UprightFitter(fitter)
         self._threads = usable_threads(fitter.settings.threads)
         self._rejected = RejectedPlaces(settings.rejected_time)
-        self._posed = PosedSearch(
-            self.upright, fitter.model, settings.min_filter, settings.min_probability, settings.rejected_time
-        )
+        self._posed = PosedSearch(self.upright, fitter.model, settings.min_filter, settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
         self.left_over = False
         self._view: ScanView | None = None
+        self._is_stream = False
         self._owned = np.empty(0, dtype=bool)
 
     def warm_up(self) -> None:
@@ -129,7 +128,7 @@ class PersonFinder:
         """
         self.last_rejected = []
         self.left_over = False
-        self._view = None
+        self._view, self._is_stream = None, remember
         scene, viewpoint, known, expected = scan.scene, scan.viewpoint, scan.known, scan.expected
         if scene is None or len(scene.points) < self._settings.min_points:
             return []
@@ -211,7 +210,7 @@ class PersonFinder:
                     continue
                 likely += budget.quick
                 judged = self._try_others(first, candidate, view)
-            stepped = None if view.remember else self._fit_on_step(candidate, view, judged)
+            stepped = None if self._is_stream else self._fit_on_step(candidate, view, judged)
             if stepped is not None:
                 found.append(stepped)
                 continue

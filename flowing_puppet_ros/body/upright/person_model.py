@@ -14,7 +14,7 @@ from flowing_puppet_ros.body.upright.verification import EVIDENCE_NAMES, FitEvid
 from flowing_puppet_ros.model import weights
 
 UPRIGHT, POSED = "clouds", "posed"
-"""Names of the shipped files: of people who stand or walk, and of those who sit, bend, crouch or lift their arms."""
+"""Names of the shipped files: of people who stand or walk, and of those who sit, bend or crouch."""
 MIN_ODDS, MAX_ODDS = 0.02, 0.98  # of each forest
 ACCURACY_NAMES = (
     "cost", "distance", "supported", "explained", "hidden", "log_points", "confidence", "stature", "foreign", "lowest",

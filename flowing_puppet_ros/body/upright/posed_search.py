@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""People who sit, bend, crouch or lift their arms, where no upright body explains what is seen.
+"""People who sit, bend or crouch, where no upright body explains what is seen.
 
 What they sit on is part of the candidate. So the best bodies are placed by what is highest, and only the points beside
 the fitted body are the person's.
@@ -33,8 +33,12 @@ REACH_M, CLAIM_M, MIN_CLAIM_HEIGHT_M = 1.0, 0.1, 0.06
 their height over the floor."""
 MAX_FITS, MAX_STREAM_FITS, MAX_LIVE_FITS = 12, 4, 1
 """Bodies that are fitted in a scan by itself, of a recording, and of a live stream."""
-MAX_SEATED_TOP_M, MIN_GAIN_M = 1.55, 0.003
-"""Height of the top up to which somebody who seems to stand may sit, and by how much closer such a body has to be."""
+STARTS = 4  # bodies of the bank that are refined
+MAX_POSED_TOP_M, MIN_GAIN_M = 1.55, 0.006
+"""Height of the top up to which somebody may sit, bend or crouch, and by how much closer than an upright body such a
+body has to be."""
+MIN_POSED, MIN_STREAM_POSED = 0.7, 0.8
+"""Probability of who is found in a scan by itself, and of a stream, in which others follow."""
 MAX_OWNED_SHARE = 0.3  # of a candidate's points that somebody else may have
 
 
@@ -65,7 +69,7 @@ def fit_posed(
     if seen is None:
         return None
     starts = upright.find_posed(seen[0], candidate.floor, quick)
-    found = upright.refine(starts[: 1 if quick else None], seen[0], candidate.floor)
+    found = upright.refine(starts[: 1 if quick else STARTS], seen[0], candidate.floor)
     near = scene.index.find_near(scene.points, candidate.middle, REACH_M)[0]
     near = np.sort(near[free[near] & (scene.height[near] > MIN_CLAIM_HEIGHT_M)])
     rows = near[find_beside(scene.points[near], found.fit.vertices, CLAIM_M)]
@@ -92,12 +96,10 @@ def see_candidate(
 class PosedSearch:
     """Finds posed people among candidates, and remembers what was none."""
 
-    def __init__(
-        self, upright: UprightFitter, model: StitchedPuppet, min_filter: float, min_probability: float, keep: float
-    ) -> None:
-        """Fit with `upright`; limits as in `PersonFinderSettings`, what was nobody is kept for `keep` seconds."""
+    def __init__(self, upright: UprightFitter, model: StitchedPuppet, min_filter: float, keep: float) -> None:
+        """Fit with `upright`; `min_filter` as in `PersonFinderSettings`, what was nobody is kept for `keep` s."""
         self._upright, self._body_model = upright, model
-        self._min_filter, self._min_probability = min_filter, min_probability
+        self._min_filter = min_filter
         self._rejected = RejectedPlaces(keep)
 
     def clear(self) -> None:
@@ -121,13 +123,15 @@ class PosedSearch:
             budget: of the upright bodies, by which the number of these goes.
             min_points: of a person.
         """
-        chosen = self._choose([each for each in candidates if owned[each.rows].mean() < MAX_OWNED_SHARE], view)
+        left = [each for each in candidates if owned[each.rows].mean() < MAX_OWNED_SHARE]
+        chosen = self._choose([each for each in left if each.top < MAX_POSED_TOP_M], view)
         found, rejected = [], []
+        least = MIN_STREAM_POSED if view.remember else MIN_POSED
         fits = MAX_LIVE_FITS if budget.quick else MAX_FITS if budget.max_misses is None else MAX_STREAM_FITS
         for candidate, likely in chosen[:fits]:
             fitted = fit_posed(self._upright, self._body_model, candidate, view, ~owned, min_points, budget.quick)
             judged = None if fitted is None else self.weigh(fitted.found.fit, fitted.evidence)
-            if fitted is not None and judged is not None and judged.probability >= self._min_probability:
+            if fitted is not None and judged is not None and judged.probability >= least:
                 found.append((judged, fitted.claimed))
                 continue
             probability = likely if judged is None else judged.probability
@@ -143,7 +147,7 @@ class PosedSearch:
 
         `free` (N,) tells which points of the scan nobody else has.
         """
-        if candidate.top > MAX_SEATED_TOP_M or not self._choose([candidate], replace(view, remember=False)):
+        if candidate.top > MAX_POSED_TOP_M or not self._choose([candidate], replace(view, remember=False)):
             return judged, candidate
         fitted = fit_posed(self._upright, self._body_model, candidate, view, free, min_points, quick)
         seen = see_candidate(self._upright, view.scene.points[candidate.rows], view.rays)
@@ -153,7 +157,7 @@ class PosedSearch:
         upright = self._upright.rate(judged.fit, seen[0])
         # A child costs more than an adult who sits, but is as likely there.
         gain = upright.cost - _cost_stature(upright) - (fitted.found.cost - _cost_stature(fitted.found))
-        if gain < MIN_GAIN_M or posed.probability < self._min_probability:
+        if gain < MIN_GAIN_M or posed.probability < MIN_POSED:
             return judged, candidate
         return posed, fitted.claimed
 

@@ -127,7 +127,7 @@ class UprightFitter:
         return sorted([*starts, *children], key=lambda start: start[0])[:STARTS]
 
     def find_posed(self, cloud: SingleViewCloud, floor: float, quick: bool = False) -> list[tuple[float, BodyState]]:
-        """Return the best bodies of those who sit, bend, crouch or lift arms, with costs in metres; as `find_rough`."""
+        """Return the best bodies of those who sit, bend or crouch, with costs in metres; as `find_rough`."""
         return make_posed_bank(self._fitter.model).find_best(cloud, floor, STARTS, every=2 if quick else 1, by_top=True)
 
     def fit(

@@ -30,9 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keep-forests", action="store_true", help="learn only how close joints are, to the shipped forests"
     )
-    parser.add_argument(
-        "--posed", action="store_true", help="learn people who sit, bend, crouch or lift their arms, a model of its own"
-    )
+    parser.add_argument("--posed", action="store_true", help="learn people who sit, bend or crouch, a model of its own")
     parser.add_argument("--seed", type=int, default=0, help="of all random draws [0]")
     parser.add_argument("--out", type=Path, required=True, help="folder for the weights and their model card")
 

@@ -17,7 +17,7 @@ from flowing_puppet_ros.body.scans.scene_labels import LabelledScene, label_scen
 from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights, find_candidates
 from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
 from flowing_puppet_ros.body.upright.found_body import ScanView
-from flowing_puppet_ros.body.upright.posed_search import fit_posed, see_candidate
+from flowing_puppet_ros.body.upright.posed_search import MAX_POSED_TOP_M, fit_posed, see_candidate
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
 from flowing_puppet_ros.body.upright.upright_fit import UprightFit, UprightFitter
 from flowing_puppet_ros.body.upright.verification import EVIDENCE_NAMES, FitEvidence, weigh_fit
@@ -87,7 +87,7 @@ def collect_examples(
     """Make the examples of scans; of each, people are fitted, and at most `max_fits` others that look like people.
 
     How much something looks like a person is what forests say that have not seen its scan. With `posed`, bodies are
-    those of people who sit, bend, crouch or lift their arms.
+    those of people who sit, bend or crouch.
     """
     upright = UprightFitter(fitter)
     seen: list[_SeenScan] = [_SeenScan.of(points, truth, posed) for points, truth in scenes]
@@ -131,6 +131,7 @@ class _SeenScan:
         viewpoint = np.zeros(3)
         scene = SceneHeights.of(points, viewpoint)
         candidates, _ = find_candidates(scene, viewpoint, MIN_POINTS, low=posed)
+        candidates = [each for each in candidates if not posed or each.top < MAX_POSED_TOP_M]
         limits = (POSED_PERSON_M, POSED_NOBODY_M) if posed else (PERSON_M, NOBODY_M)
         own = np.array([_label(candidate, truth, *limits) for candidate in candidates], dtype=np.int64)
         shape = describe_candidates(candidates, scene, viewpoint)
