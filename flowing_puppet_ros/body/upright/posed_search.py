@@ -37,7 +37,14 @@ STARTS = 4  # bodies of the bank that are refined
 MAX_POSED_TOP_M, MIN_GAIN_M = 1.55, 0.006
 """Height of the top up to which somebody may sit, bend or crouch, and by how much closer than an upright body such a
 body has to be."""
-MIN_POSED, MIN_STREAM_POSED = 0.7, 0.8
+MIN_POSED = 0.9  # probability of who is posed: seats and what lies on them are people soon
+MAX_FITS, MAX_STREAM_FITS, MAX_LIVE_FITS = 12, 4, 1
+"""Bodies that are fitted in a scan by itself, of a recording, and of a live stream."""
+STARTS = 4  # bodies of the bank that are refined
+MAX_POSED_TOP_M, MIN_GAIN_M = 1.55, 0.006
+"""Height of the top up to which somebody may sit, bend or crouch, and by how much closer than an upright body such a
+body has to be."""
+MIN_POSED, MIN_STREAM_POSED = 0.8, 0.9
 """Probability of who is found in a scan by itself, and of a stream, in which others follow."""
 MAX_OWNED_SHARE = 0.3  # of a candidate's points that somebody else may have
 
@@ -126,12 +133,11 @@ class PosedSearch:
         left = [each for each in candidates if owned[each.rows].mean() < MAX_OWNED_SHARE]
         chosen = self._choose([each for each in left if each.top < MAX_POSED_TOP_M], view)
         found, rejected = [], []
-        least = MIN_STREAM_POSED if view.remember else MIN_POSED
         fits = MAX_LIVE_FITS if budget.quick else MAX_FITS if budget.max_misses is None else MAX_STREAM_FITS
         for candidate, likely in chosen[:fits]:
             fitted = fit_posed(self._upright, self._body_model, candidate, view, ~owned, min_points, budget.quick)
             judged = None if fitted is None else self.weigh(fitted.found.fit, fitted.evidence)
-            if fitted is not None and judged is not None and judged.probability >= least:
+            if fitted is not None and judged is not None and judged.probability >= MIN_POSED:
                 found.append((judged, fitted.claimed))
                 continue
             probability = likely if judged is None else judged.probability
