@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import stages
+from flowing_puppet_ros.body.bank.upright_bank import make_upright_bank
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
 from flowing_puppet_ros.body.segmentation import candidates as segmentation
@@ -21,7 +22,6 @@ from flowing_puppet_ros.body.upright import person_finder
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder
 from flowing_puppet_ros.body.upright.person_model import DecisionTrees
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
-from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank
 from flowing_puppet_ros.evaluate.scene.scene_meshes import MAKERS
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import scan_scene
 from flowing_puppet_ros.evaluate.tables import Row

@@ -6,8 +6,9 @@ import pytest
 
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
 from flowing_puppet_ros.evaluate.props.furniture import CUSHION_M, Place, make_chair, make_desk
+from flowing_puppet_ros.evaluate.props.people import PROPS
 from flowing_puppet_ros.evaluate.props.poses import draw_seated
-from flowing_puppet_ros.evaluate.props.scenes import PROPS, draw_props
+from flowing_puppet_ros.evaluate.props.scenes import draw_props
 from flowing_puppet_ros.evaluate.rgbd.views import RgbdPair, RgbdStudio, make_camera
 
 pytest.importorskip("body_models")

@@ -36,6 +36,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     },
     "bag.storage": set(),
     "body": set(),
+    "body.bank": {"body.cloud", "body.refine", "body.search", "evidence.cloud", "model"},
     "body.cloud": {"evidence.cloud"},
     "body.fit": {"body", "body.cloud", "body.refine", "body.scans", "body.search", "evidence.cloud", "model"},
     "body.measurements": {"model"},
@@ -57,6 +58,7 @@ MAY_IMPORT: dict[str, set[str]] = {
         "model",
     },
     "body.upright": {
+        "body.bank",
         "body.cloud",
         "body.fit",
         "body.refine",
@@ -303,15 +305,7 @@ MAY_IMPORT: dict[str, set[str]] = {
     "learn.detector": {"evidence.image", "image.detector", "image.formats", "learn", "model", "model.ds"},
     "learn.ds": {"learn.anny", "model", "model.ds"},
     "learn.likelihood": {"evidence.image", "image.formats", "learn", "model", "model.ds"},
-    "learn.people": {
-        "body",
-        "body.cloud",
-        "body.fit",
-        "body.scans",
-        "body.segmentation",
-        "body.upright",
-        "model",
-    },
+    "learn.people": {"body", "body.fit", "body.scans", "body.segmentation", "body.upright", "model"},
     "learn.sp": {"learn.anny", "model"},
     "learn.thesis_loop": {
         "evidence.image",

@@ -23,8 +23,10 @@ from flowing_puppet_ros.body.segmentation.people import assign_to_known
 
 HEIGHT_LIMITS_M = (0.12, 2.2)  # over the floor, of points that may be a person's
 TOP_LIMITS_M = (1.05, 2.1)  # over the floor, of the topmost point of a person
+MIN_LOW_TOP_M = 0.6  # the same of somebody who sits on the floor, crouches or bends
 MIN_VISIBLE_HEIGHT_M = 0.35
 MAX_PERSON_WIDTH_M, COLUMN_RADIUS_M = 1.25, 0.42
+MAX_LOW_WIDTH_M = 1.5  # of who is low: straight legs on the floor reach far
 MIN_PIECE_SHARE, PIECE_RADIUS_M, PIECE_GAP_M = 0.5, 0.35, 0.45
 """Share of a person's points that the largest piece has of somebody half hidden, distance of the other pieces from its
 middle, and height above it up to which they belong to it."""
@@ -46,6 +48,7 @@ class Candidate:
         floor: metres, z of the floor there.
         top: metres, height of the topmost point over the floor.
         whole: whether it is a whole cluster, not a column of one.
+        low: whether its top is too low for somebody who stands.
     """
 
     rows: np.ndarray
@@ -53,6 +56,7 @@ class Candidate:
     floor: float
     top: float
     whole: bool
+    low: bool = False
 
     @classmethod
     def of(cls, scene: SceneHeights, rows: np.ndarray) -> Candidate:
@@ -103,6 +107,7 @@ def find_candidates(
     min_points: int,
     known: Sequence[np.ndarray] = (),
     only_known: bool = False,
+    low: bool = False,
 ) -> tuple[list[Candidate], dict[int, np.ndarray]]:
     """Find where people may be, and the points of those who are known.
 
@@ -112,6 +117,7 @@ def find_candidates(
         min_points: points that a candidate needs.
         known: points (K, 3) in metres on each body that is expected in the cloud, at its predicted position.
         only_known: look near the known bodies only, and find no candidates.
+        low: find also what is too low for somebody who stands; the others are the same.
 
     Returns:
         The candidates, and by the index of a known body the rows (N,) of its points, ascending.
@@ -140,6 +146,9 @@ def find_candidates(
         return [], owned
     groups = [group for cluster in _list_clusters(thin, label, weight, min_points) for group in cluster]
     found = [_make_candidate(scene, members.gather(chosen), whole, min_points) for chosen, whole in groups]
+    if low:
+        clusters = _list_low_clusters(thin, label, weight, min_points)
+        found += [_make_candidate(scene, members.gather(chosen), True, min_points, low) for chosen in clusters]
     return _filter_by_surroundings([candidate for candidate in found if candidate is not None], scene), owned
 
 
@@ -192,6 +201,18 @@ def _list_clusters(
         yield groups
 
 
+def _list_low_clusters(thin: np.ndarray, label: np.ndarray, weight: np.ndarray, min_points: int) -> list[np.ndarray]:
+    """Return the voxels (V,) of each cluster of voxels (M, 3) that is as wide as a person and too low to stand."""
+    order = np.argsort(label, kind="stable")
+    starts = np.append(np.flatnonzero(np.diff(label[order], prepend=-2)), len(order))
+    tops, sizes = np.maximum.reduceat(thin[order, 2], starts[:-1]), np.add.reduceat(weight[order], starts[:-1])
+    chosen = (
+        (label[order[starts[:-1]]] >= 0) & (tops >= MIN_LOW_TOP_M) & (tops < TOP_LIMITS_M[0]) & (sizes >= min_points)
+    )
+    clusters = [order[starts[number] : starts[number + 1]] for number in np.flatnonzero(chosen)]
+    return [own for own in clusters if np.hypot(*np.ptp(thin[own, :2], axis=0)) < MAX_LOW_WIDTH_M]
+
+
 class _Pieces(NamedTuple):
     """The `voxels` (P,) of what is too small or too low for a person, their `places` (P, 3), and an index of these."""
 
@@ -220,15 +241,18 @@ class _Pieces(NamedTuple):
         return np.append(group, self.voxels[near[(height < low) | ((height > top) & (height < top + PIECE_GAP_M))]])
 
 
-def _make_candidate(scene: SceneHeights, rows: np.ndarray, whole: bool, min_points: int) -> Candidate | None:
+def _make_candidate(
+    scene: SceneHeights, rows: np.ndarray, whole: bool, min_points: int, is_low: bool = False
+) -> Candidate | None:
     """Make a candidate of rows (N,), unless it is too small or its top is not where people's are."""
     if len(rows) < min_points:
         return None
     low, top = _find_ends(scene.height, rows)
-    if not TOP_LIMITS_M[0] < top < TOP_LIMITS_M[1] or top - low < MIN_VISIBLE_HEIGHT_M:
+    least, most = (MIN_LOW_TOP_M, TOP_LIMITS_M[0]) if is_low else TOP_LIMITS_M
+    if not least < top < most or top - low < MIN_VISIBLE_HEIGHT_M:
         return None
     middle = _find_middle(scene.points, rows)
-    return Candidate(rows, middle, scene.floor.locate(*middle), top, whole)
+    return Candidate(rows, middle, scene.floor.locate(*middle), top, whole, is_low)
 
 
 def _filter_by_surroundings(candidates: list[Candidate], scene: SceneHeights) -> list[Candidate]:

@@ -17,6 +17,7 @@ from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter, Progress
 from flowing_puppet_ros.body.scene.rig_scene import shows_person
 from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.scene.sensor_height import SensorHeight
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights, find_candidates
 from flowing_puppet_ros.body.segmentation.floor_grid import describe_problem
 from flowing_puppet_ros.body.segmentation.people import segment_people
@@ -29,7 +30,6 @@ from flowing_puppet_ros.body.upright.found_body import ExpectedPerson, FitBudget
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
-from flowing_puppet_ros.body.upright.sensor_height import SensorHeight
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.process.threads import usable_threads

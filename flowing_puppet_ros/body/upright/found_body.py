@@ -6,13 +6,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
+from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit
 from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
+from flowing_puppet_ros.body.upright.upright_fit import UprightFit
+from flowing_puppet_ros.model.sp import BodyState
 
 MIN_COME_SHARE = 0.15
 """Share of the points, where the sensor once saw through, from which on something has come there."""
@@ -92,6 +96,16 @@ class JudgedFit:
     confidence: float
     fit: BodyFit
     turned: tuple[BodyFit, float] | None = None
+
+
+class FirstFit(NamedTuple):
+    """The bank's best body on a candidate: its cloud, the rays about it, other bodies to start from, and the result."""
+
+    cloud: SingleViewCloud
+    window: np.ndarray
+    others: list[tuple[float, BodyState]]
+    found: UprightFit
+    judged: JudgedFit
 
 
 @dataclass(frozen=True, slots=True, eq=False)

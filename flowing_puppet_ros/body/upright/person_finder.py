@@ -6,7 +6,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from flowing_puppet_ros.body.segmentation.people import person_score
 from flowing_puppet_ros.body.upright.candidate_shape import describe_candidates
 from flowing_puppet_ros.body.upright.found_body import (
     SAME_PERSON_M,
+    FirstFit,
     FitBudget,
     FoundBody,
     JudgedFit,
@@ -27,14 +27,14 @@ from flowing_puppet_ros.body.upright.found_body import (
     pop_nearest,
     take_apart,
 )
-from flowing_puppet_ros.body.upright.person_model import PersonModel
+from flowing_puppet_ros.body.upright.person_model import POSED, UPRIGHT, PersonModel
+from flowing_puppet_ros.body.upright.posed_search import PosedSearch, see_candidate
 from flowing_puppet_ros.body.upright.rejected_places import RejectedCandidate, RejectedPlaces
 from flowing_puppet_ros.body.upright.scan_rays import ScanRays
+from flowing_puppet_ros.body.upright.step import find_step
 from flowing_puppet_ros.body.upright.upright_fit import MIN_MANY_POINTS, UprightFit, UprightFitter
 from flowing_puppet_ros.body.upright.verification import weigh_fit
-from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evidence.cloud.nearest import find_beside
-from flowing_puppet_ros.model.sp import BodyState
 from flowing_puppet_ros.process.threads import one_blas_thread, parallel_map, usable_threads
 from flowing_puppet_ros.settings import Settings, setting
 
@@ -50,6 +50,7 @@ COME_ODDS, COME_FILTER = 1.5, 0.3
 limit that is asked of it. Cars and doors move too."""
 COLUMN_FILTER = 0.7  # the same of a column of a larger cluster: who stands close to others has a part of their shape
 MIN_QUICK_BESIDE = 0.5  # probability of who is found beside a quick body
+MIN_STEP = 0.6  # probability of who is found on a step only
 BESIDE_M, CONTEXT_M, OWN_M = 1.0, 1.0, 0.10
 """Distance from a person within which others are looked for in what that person leaves, of their surroundings beyond,
 and from a body, up to which points are its own."""
@@ -94,19 +95,23 @@ class PersonFinder:
         self.upright = UprightFitter(fitter)
         self._threads = usable_threads(fitter.settings.threads)
         self._rejected = RejectedPlaces(settings.rejected_time)
+        self._posed = PosedSearch(self.upright, fitter.model, settings.min_filter, settings.rejected_time)
         self.last_rejected: list[RejectedCandidate] = []
         self.left_over = False
         self._view: ScanView | None = None
+        self._is_stream = False
         self._owned = np.empty(0, dtype=bool)
 
     def warm_up(self) -> None:
         """Do beforehand what the first scan would wait for."""
         self.upright.warm_up()
-        PersonModel.load()
+        for name in (UPRIGHT, POSED):
+            PersonModel.load(name)
 
     def reset(self) -> None:
         """Forget what was no person."""
         self._rejected.clear()
+        self._posed.clear()
         self._view = None
 
     @one_blas_thread()
@@ -123,7 +128,7 @@ class PersonFinder:
         """
         self.last_rejected = []
         self.left_over = False
-        self._view = None
+        self._view, self._is_stream = None, remember
         scene, viewpoint, known, expected = scan.scene, scan.viewpoint, scan.known, scan.expected
         if scene is None or len(scene.points) < self._settings.min_points:
             return []
@@ -132,9 +137,9 @@ class PersonFinder:
         if expected:
             known = [body if each.claims else body[:0] for body, each in zip(known, expected, strict=True)]
             only_known = only_known and all(each.claims for each in expected)
-        candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known)
+        candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, only_known, low=True)
         if only_known and len(owned) < sum(len(body) > 0 for body in known):
-            candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known)
+            candidates, owned = find_candidates(scene, viewpoint, self._settings.min_points, known, low=True)
         make = scan.make_person
         people = [
             FoundBody(make(rows, owner=owner), None)
@@ -149,22 +154,25 @@ class PersonFinder:
         unseen = {owner: middle for owner, middle in enumerate(middles) if owner not in seen}
         taken = [middle for owner, middle in enumerate(middles) if owner in seen]
         budget = FitBudget(self._settings.max_fits) if budget is None else budget
-        offered = self._choose(candidates, view)
+        offered = self._choose([candidate for candidate in candidates if not candidate.low], view)
         for number, owner in sorted(find_only_reached(offered, unseen, expected).items(), reverse=True):
             people.append(FoundBody(make(offered.pop(number)[0].rows, owner=owner), None))
             self._owned[people[-1].person.rows] = True
             taken.append(unseen.pop(owner))
-        found, bent = self._fit_offered(offered, view, budget)
+        found, bent = self._fit_offered(offered, view, budget, ~self._owned)
         accepted: list[tuple[JudgedFit, Candidate]] = []
         fresh = take_apart(found, taken)
         while fresh:
             self._own(points, fresh)
             accepted += fresh
             fresh = take_apart(self._look_beside(fresh, view, budget), taken)
+        posed, rejected = self._posed.find(candidates, view, self._owned, budget, self._settings.min_points)
+        accepted += take_apart(posed, taken)
+        self.last_rejected += rejected
         for judged, candidate in accepted:
             # Who stands at a wall may have no points by the prediction: the candidate there is that person.
             near = pop_nearest(unseen, judged.fit.vertices[:, :2].mean(axis=0))
-            person = make(candidate.rows, score=judged.probability, owner=near)
+            person = replace(make(candidate.rows, score=judged.probability, owner=near), floor=candidate.floor)
             people.append(FoundBody(person, replace(judged.fit, confidence=judged.confidence)))
         for candidate in bent:
             if all(np.hypot(*(candidate.middle - other)) > 2 * SAME_PERSON_M for other in taken):
@@ -173,11 +181,14 @@ class PersonFinder:
         return people
 
     def _fit_offered(
-        self, offered: Sequence[tuple[Candidate, float]], view: ScanView, budget: FitBudget
+        self, offered: Sequence[tuple[Candidate, float]], view: ScanView, budget: FitBudget, free: np.ndarray
     ) -> tuple[list[tuple[JudgedFit, Candidate]], list[Candidate]]:
-        """Fit candidates with their probabilities by shape, and return who is a person, and who may be a bent one."""
+        """Fit candidates with their probabilities by shape, and return who is a person, and who may be a bent one.
+
+        `free` (N,) tells which points of the scan nobody has.
+        """
         found, bent = [], []
-        started: dict[int, _FirstFit | None] = {}
+        started: dict[int, FirstFit | None] = {}
         if budget.quick:
             some = [candidate for candidate, _ in offered[: budget.fits]]
             start = partial(self._start, view=view, quick=True)
@@ -199,8 +210,13 @@ class PersonFinder:
                     continue
                 likely += budget.quick
                 judged = self._try_others(first, candidate, view)
+            stepped = None if self._is_stream else self._fit_on_step(candidate, view, judged)
+            if stepped is not None:
+                found.append(stepped)
+                continue
             if self._is_proven(judged):
-                found.append((judged, candidate))
+                limits = self._settings.min_points, budget.quick
+                found.append(self._posed.improve(judged, candidate, view, free, *limits))
                 budget.misses = 0
                 continue
             self.last_rejected.append(
@@ -211,6 +227,22 @@ class PersonFinder:
             if self._may_be_bent(candidate, view.scene, probability):
                 bent.append(candidate)
         return found, bent
+
+    def _fit_on_step(
+        self, candidate: Candidate, view: ScanView, judged: JudgedFit
+    ) -> tuple[JudgedFit, Candidate] | None:
+        """Return who stands on a step there, if that is likelier than what was `judged` on the floor.
+
+        Not in a stream, in which they may come down.
+        """
+        raised = find_step(candidate, view, self._settings.min_points)
+        first = None if raised is None else self._start(*raised)
+        if raised is None or first is None:
+            return None
+        higher = self._try_others(first, *raised)
+        least = judged.probability if self._is_proven(judged) else MIN_STEP
+        is_better = higher.probability > least
+        return (higher, raised[0]) if is_better else None
 
     def _own(self, points: np.ndarray, accepted: Sequence[tuple[JudgedFit, Candidate]]) -> None:
         """Note that people have the points of the scan (N, 3) m that lie on their bodies."""
@@ -238,7 +270,7 @@ class PersonFinder:
             for candidate in candidates
             if any(np.hypot(*(candidate.middle - middle)) < BESIDE_M for middle in middles)
         ]
-        found, _ = self._fit_offered(self._choose(fresh, left), left, budget)
+        found, _ = self._fit_offered(self._choose(fresh, left), left, budget, np.ones(len(rows), dtype=bool))
         if budget.quick:  # such a body leaves points of its own person, too
             found = [each for each in found if each[0].probability >= MIN_QUICK_BESIDE]
         return [(judged, replace(candidate, rows=rows[candidate.rows])) for judged, candidate in found]
@@ -276,13 +308,14 @@ class PersonFinder:
         if self._view is None or not len(rows):
             return JudgedFit(0.0, 0.0, fit)
         view, rows = self._view.leave_to(rows, self._owned)
-        rays, candidate = view.rays, Candidate.of(view.scene, rows)
-        window = rays.find_window(person.points)
-        try:
-            cloud = self.upright.make_cloud(person.points, rays.viewpoint, rays.find_unknown(person.points, window))
-        except InputError:  # the sensor stands in it
+        candidate, seen = Candidate.of(view.scene, rows), see_candidate(self.upright, person.points, view.rays)
+        if seen is None:
             return JudgedFit(0.0, 0.0, fit)
+        cloud, window = seen
         judged = self._weigh(self.upright.rate(fit, cloud), cloud, candidate, view, window)
+        posed = self._posed.judge(fit, cloud, candidate, view, window)
+        if posed is not None:
+            judged = max(judged, posed, key=lambda each: each.probability)
         if judged.probability < MIN_TRACKED and len(rows) < MIN_MANY_POINTS:
             other = self.upright.fit(cloud, candidate.floor, fit.state.rotation[0, :2, 0], quick)
             again = self._weigh(other, cloud, candidate, view, window)
@@ -343,20 +376,17 @@ class PersonFinder:
     def _is_proven(self, judged: JudgedFit) -> bool:
         return judged.probability >= self._settings.min_probability
 
-    def _start(self, candidate: Candidate, view: ScanView, quick: bool = False) -> _FirstFit | None:
+    def _start(self, candidate: Candidate, view: ScanView, quick: bool = False) -> FirstFit | None:
         """Fit the bank's best body, and judge it; None where no body can be fitted."""
-        rays, points = view.rays, view.scene.points[candidate.rows]
-        window = rays.find_window(points)
-        try:
-            cloud = self.upright.make_cloud(points, rays.viewpoint, rays.find_unknown(points, window))
-        except InputError:  # the sensor stands in it
+        seen = see_candidate(self.upright, view.scene.points[candidate.rows], view.rays)
+        if seen is None:
             return None
-
+        cloud, window = seen
         starts = self.upright.find_rough(cloud, candidate.floor, quick=quick)
         found = self.upright.refine(starts[:1], cloud, candidate.floor)
-        return _FirstFit(cloud, window, starts[1:], found, self._weigh(found, cloud, candidate, view, window))
+        return FirstFit(cloud, window, starts[1:], found, self._weigh(found, cloud, candidate, view, window))
 
-    def _try_others(self, first: _FirstFit, candidate: Candidate, view: ScanView) -> JudgedFit:
+    def _try_others(self, first: FirstFit, candidate: Candidate, view: ScanView) -> JudgedFit:
         """Return the best of the bank's other bodies where it is better than the first, else the first."""
         if not first.others:
             return first.judged
@@ -367,13 +397,3 @@ class PersonFinder:
             if other.probability >= min(first.judged.probability, self._settings.min_probability):
                 return other
         return first.judged
-
-
-class _FirstFit(NamedTuple):
-    """The bank's best body on a candidate: its cloud, the rays about it, other bodies to start from, and the result."""
-
-    cloud: SingleViewCloud
-    window: np.ndarray
-    others: list[tuple[float, BodyState]]
-    found: UprightFit
-    judged: JudgedFit

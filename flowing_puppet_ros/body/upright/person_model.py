@@ -13,7 +13,8 @@ from numba import njit
 from flowing_puppet_ros.body.upright.verification import EVIDENCE_NAMES, FitEvidence
 from flowing_puppet_ros.model import weights
 
-MODEL = "clouds"  # name of the shipped file
+UPRIGHT, POSED = "clouds", "posed"
+"""Names of the shipped files: of people who stand or walk, and of those who sit, bend or crouch."""
 MIN_ODDS, MAX_ODDS = 0.02, 0.98  # of each forest
 ACCURACY_NAMES = (
     "cost", "distance", "supported", "explained", "hidden", "log_points", "confidence", "stature", "foreign", "lowest",
@@ -81,10 +82,10 @@ class PersonModel:
     accuracy: np.ndarray
 
     @classmethod
-    @lru_cache(maxsize=1)
-    def load(cls) -> PersonModel:
-        """Load the shipped model."""
-        return cls.from_arrays(weights.load("people", MODEL))
+    @lru_cache(maxsize=2)
+    def load(cls, name: str = UPRIGHT) -> PersonModel:
+        """Load a shipped model."""
+        return cls.from_arrays(weights.load("people", name))
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> PersonModel:

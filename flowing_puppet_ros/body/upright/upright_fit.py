@@ -9,6 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from flowing_puppet_ros.body.bank.body_bank import stature_cost
+from flowing_puppet_ros.body.bank.posed_bank import make_posed_bank
+from flowing_puppet_ros.body.bank.upright_bank import (
+    CHILD_TOP_M,
+    make_child_bank,
+    make_upright_bank,
+)
 from flowing_puppet_ros.body.cloud.correspondence import VertexQuadratic
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.cloud.normals import downsample
@@ -19,12 +26,6 @@ from flowing_puppet_ros.body.fit.pose_bank import CoarseCloud
 from flowing_puppet_ros.body.fit.visibility import BodyVisibility, Visibility
 from flowing_puppet_ros.body.refine.gauss_newton import RefineWeights
 from flowing_puppet_ros.body.search.energy import JointTargets
-from flowing_puppet_ros.body.upright.upright_bank import (
-    CHILD_TOP_M,
-    make_child_bank,
-    make_upright_bank,
-    stature_cost,
-)
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.evidence.cloud.sensor_field import SensorField
 from flowing_puppet_ros.evidence.cloud.sensor_rig import SensorRig
@@ -87,8 +88,9 @@ class UprightFitter:
         self._threads = usable_threads(min(fitter.settings.threads, max_threads))
 
     def warm_up(self) -> None:
-        """Make the bank beforehand, children included."""
+        """Make the banks beforehand."""
         make_child_bank(self._fitter.model)
+        make_posed_bank(self._fitter.model)
 
     def make_cloud(
         self,
@@ -124,10 +126,14 @@ class UprightFitter:
         children = make_child_bank(model).find_best(cloud, floor, STARTS, facing, every**2)
         return sorted([*starts, *children], key=lambda start: start[0])[:STARTS]
 
+    def find_posed(self, cloud: SingleViewCloud, floor: float, quick: bool = False) -> list[tuple[float, BodyState]]:
+        """Return the best bodies of those who sit, bend or crouch, with costs in metres; as `find_rough`."""
+        return make_posed_bank(self._fitter.model).find_best(cloud, floor, STARTS, every=2 if quick else 1, by_top=True)
+
     def fit(
         self, cloud: SingleViewCloud, floor: float, facing: np.ndarray | None = None, quick: bool = False
     ) -> UprightFit:
-        """Fit the best upright body to a cloud; `floor` is z of the floor, m; `facing` (2,) as in `UprightBank`.
+        """Fit the best upright body to a cloud; `floor` is z of the floor, m; `facing` (2,) as in `BodyBank`.
 
         A `quick` one is that of the best of a part of the bank, in a tenth of the time.
         """

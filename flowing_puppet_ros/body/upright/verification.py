@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flowing_puppet_ros.body.bank.body_bank import stature_cost
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.cloud.single_view import SingleViewCloud
 from flowing_puppet_ros.body.segmentation.candidates import Candidate, SceneHeights
 from flowing_puppet_ros.body.upright.candidate_shape import SHAPE_NAMES, describe_candidates
 from flowing_puppet_ros.body.upright.scan_rays import BANDS, ScanRays
-from flowing_puppet_ros.body.upright.upright_bank import stature_cost
 from flowing_puppet_ros.body.upright.upright_fit import UprightFit
 from flowing_puppet_ros.evidence.cloud.nearest import NearestPoints
 from flowing_puppet_ros.model.sp import StitchedPuppet

@@ -62,7 +62,12 @@ class GhostScore:
 
 
 def score_scene(
-    name: str, truth: LabelledScene, found: Sequence[ReportedPerson], min_points: int, sector: float
+    name: str,
+    truth: LabelledScene,
+    found: Sequence[ReportedPerson],
+    min_points: int,
+    sector: float,
+    min_top: float = MIN_TOP_M,
 ) -> tuple[list[PersonScore], list[GhostScore]]:
     """Match the found people to the labels of a scan.
 
@@ -72,6 +77,7 @@ def score_scene(
         found: the bodies.
         min_points: points that a person needs to count; others may be found or missed.
         sector: half angle in radians about x, beyond which nobody was labelled.
+        min_top: metres over the floor of the topmost point that a person needs to count.
     """
     found = [body for body in found if abs(_bearing(body.vertices, truth.sensor)) <= sector]
     middles = np.array([body.vertices.mean(axis=0)[:2] for body in found]).reshape(-1, 2)
@@ -82,7 +88,7 @@ def score_scene(
     people = []
     for row, person in enumerate(truth.people):
         away = float(np.hypot(*(person.middle - truth.sensor[:2])))
-        counts = person.points >= min_points and person.top >= MIN_TOP_M
+        counts = person.points >= min_points and person.top >= min_top
         body = found[match[row]] if row in match else None
         gap = float(distance[row, match[row]]) if row in match else np.nan
         people.append(_score_person(name, row, person, away, counts, body, gap))

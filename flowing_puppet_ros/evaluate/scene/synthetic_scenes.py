@@ -7,7 +7,7 @@ prisms that are as large as people, or as thin, or as close together, because th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -61,6 +61,10 @@ class SyntheticScene:
     floor: float
 
 
+type Draw = Callable[[BodySource, np.random.Generator], tuple[list[TrueBody], list[Mesh]]]
+"""Draws people about x = y = 0 on the floor, and what they sit or stand on."""
+
+
 @dataclass(frozen=True, slots=True)
 class SceneKind:
     """What makes a scene harder, beside what every place has; without it the same random numbers follow.
@@ -70,12 +74,16 @@ class SceneKind:
         covered: share of the people before whom something as high as a table or a car stands.
         rain: share of the rays that end on a drop, unless something nearer stops them.
         height: metres, of the sensor over the floor; None: drawn.
+        draw: draws a person; None: one who stands or walks.
+        empty: number of things more, and what draws each, such as seats on which nobody sits.
     """
 
     lookalikes: int = 0
     covered: float = 0.0
     rain: float = 0.0
     height: float | None = None
+    draw: Draw | None = None
+    empty: tuple[int, Draw] | None = None
 
 
 def draw_scene(
@@ -86,10 +94,14 @@ def draw_scene(
     people: int,
     kind: SceneKind = SceneKind(),
 ) -> SyntheticScene:
-    """Draw a scene with `people` standing or walking people and scan it; as many as find a free place are in it."""
+    """Draw a scene with `people` people, who stand or walk or are as `kind` says, and scan it.
+
+    As many as find a free place are in it.
+    """
     height = draw_height(rng, place, scanner, kind.height)
     meshes, blocked = make_place(rng, place, kind.lookalikes)
-    bodies = place_people(source, rng, place, people, blocked, find_view(scanner))
+    bodies, beneath = place_people(source, rng, place, people, blocked, find_view(scanner), kind)
+    meshes += beneath
     if kind.covered:
         meshes += cover_people(rng.spawn(1)[0], bodies, kind.covered)
     visible = [(body.vertices, source.triangles) for body in bodies]
@@ -133,11 +145,21 @@ def cover_people(rng: np.random.Generator, people: Sequence[TrueBody], share: fl
 
 
 def place_people(
-    source: BodySource, rng: np.random.Generator, place: str, count: int, blocked: Sequence[Disc], view: float
-) -> list[TrueBody]:
-    """Draw people who stand or walk, at free places, `view` radians to either side of x; `blocked` are taken places."""
+    source: BodySource,
+    rng: np.random.Generator,
+    place: str,
+    count: int,
+    blocked: Sequence[Disc],
+    view: float,
+    kind: SceneKind = SceneKind(),
+) -> tuple[list[TrueBody], list[Mesh]]:
+    """Draw people at free places, `view` radians to either side of x, and what they sit or stand on.
+
+    `blocked` are taken places.
+    """
     taken = list(blocked)
     bodies: list[TrueBody] = []
+    meshes: list[Mesh] = []
     half, distance = HALF_SIZE_M[place], DISTANCE_M[place]
     for _ in range(MAX_TRIES):
         if len(bodies) == count:
@@ -152,9 +174,54 @@ def place_people(
             continue
         if any(np.hypot(x - a, y - b) < radius for a, b, radius in taken):
             continue
-        bodies.append(draw_upright(source, rng).translate(np.array([x, y, 0.0])))
-        taken.append((x, y, MIN_PERSON_GAP_M))
-    return bodies
+        if kind.draw is None:
+            bodies.append(draw_upright(source, rng).translate(np.array([x, y, 0.0])))
+            taken.append((x, y, MIN_PERSON_GAP_M))
+            continue
+        drawn = kind.draw(source, rng)
+        if _has_room(drawn, half, (x, y), taken):
+            _add(drawn, (x, y), bodies, meshes, taken)
+    if kind.empty is not None:
+        number, draw = kind.empty
+        aside = rng.spawn(1)[0]
+        for _ in range(MAX_TRIES):
+            x, y = aside.uniform(-half[0], half[0]), aside.uniform(-half[1], half[1])
+            drawn = draw(source, aside)
+            if np.hypot(x, y) > distance[0] and _has_room(drawn, half, (x, y), taken):
+                _add(drawn, (x, y), bodies, meshes, taken)
+                number -= 1
+            if number <= 0:
+                break
+    return bodies, meshes
+
+
+def _measure_reach(drawn: tuple[list[TrueBody], list[Mesh]]) -> float:
+    """Return how far people and things reach from x = y = 0, metres."""
+    every = [body.vertices for body in drawn[0]] + [vertices for vertices, _ in drawn[1]]
+    return max(float(np.hypot(*vertices[:, :2].T).max()) for vertices in every)
+
+
+def _has_room(
+    drawn: tuple[list[TrueBody], list[Mesh]], half: Sequence[float], at: tuple[float, float], taken: Sequence[Disc]
+) -> bool:
+    """Return whether people and things fit at (x, y) m, in a place of `half` a size, beside what is `taken`."""
+    reach = _measure_reach(drawn)
+    inside = abs(at[0]) < half[0] - reach and abs(at[1]) < half[1] - reach
+    return inside and all(np.hypot(at[0] - a, at[1] - b) > radius - 0.3 + reach for a, b, radius in taken)
+
+
+def _add(
+    drawn: tuple[list[TrueBody], list[Mesh]],
+    at: tuple[float, float],
+    bodies: list[TrueBody],
+    meshes: list[Mesh],
+    taken: list[Disc],
+) -> None:
+    """Put people and things at (x, y) m, and note that the place is taken."""
+    step = np.array([*at, 0.0])
+    bodies += [body.translate(step) for body in drawn[0]]
+    meshes += [(vertices + step, triangles) for vertices, triangles in drawn[1]]
+    taken.append((*at, _measure_reach(drawn) + 0.3))
 
 
 def draw_upright(source: BodySource, rng: np.random.Generator) -> TrueBody:

@@ -11,7 +11,7 @@ import numpy as np
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.scans.scan_frame import UP_AXES, parse_axis, rotation_to_z_up
 from flowing_puppet_ros.body.settings import FitterSettings
-from flowing_puppet_ros.body.upright.person_model import MODEL, PersonModel
+from flowing_puppet_ros.body.upright.person_model import POSED, UPRIGHT, PersonModel
 from flowing_puppet_ros.learn.people.examples import CandidateExamples, collect_examples, read_scenes
 from flowing_puppet_ros.learn.people.forest import learn_model
 from flowing_puppet_ros.model.sp import StitchedPuppet
@@ -30,8 +30,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--keep-forests", action="store_true", help="learn only how close joints are, to the shipped forests"
     )
+    parser.add_argument("--posed", action="store_true", help="learn people who sit, bend or crouch, a model of its own")
     parser.add_argument("--seed", type=int, default=0, help="of all random draws [0]")
-    parser.add_argument("--out", type=Path, required=True, help=f"folder for people_{MODEL}.npz and its model card")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the weights and their model card")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -39,9 +40,10 @@ def run(arguments: argparse.Namespace) -> int:
     make_out_folder(arguments.out)
     fitter = BodyFitter(StitchedPuppet.load(), FitterSettings())
     scenes = read_scenes(arguments.scenes, rotation_to_z_up(parse_axis(arguments.up)))
-    examples = collect_examples(fitter, scenes, arguments.max_fits, arguments.seed)
-    model = learn_model(examples, arguments.seed, PersonModel.load() if arguments.keep_forests else None)
-    path = arguments.out / f"people_{MODEL}.npz"
+    examples = collect_examples(fitter, scenes, arguments.max_fits, arguments.seed, arguments.posed)
+    name = POSED if arguments.posed else UPRIGHT
+    model = learn_model(examples, arguments.seed, PersonModel.load(name) if arguments.keep_forests else None)
+    path = arguments.out / f"people_{name}.npz"
     np.savez_compressed(path, **model.to_arrays())  # type: ignore[arg-type]
     path.with_suffix(".md").write_text(format_card(examples, model, arguments), encoding="utf-8")
     print(path)

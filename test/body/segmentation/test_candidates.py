@@ -220,3 +220,14 @@ def test_near_known_people_alone_nobody_else_is_looked_for() -> None:
     assert len(everywhere[0]) == 1 and not found
     for rows in (owned[0], everywhere[1][0]):
         assert (rows >= 60_400).mean() > 0.9 and (rows >= 60_400).sum() > 350
+
+
+def test_who_sits_on_the_floor_is_a_candidate_only_where_low_ones_are_wanted() -> None:
+    rng = np.random.default_rng(2)
+    people = [figure(6.0, 0.0, -0.12, rng), figure(6.0, 2.0, -0.12, rng, height=0.9)]
+    scene = SceneHeights.of(np.concatenate([ground(rng), *people]))
+    standing = find_candidates(scene, SENSOR, 25)[0]
+    every = find_candidates(scene, SENSOR, 25, low=True)[0]
+    assert len(standing) == 1 and len(every) == 2
+    assert (every[0].rows == standing[0].rows).all() and not every[0].low
+    assert every[1].low and abs(every[1].middle[1] - 2.0) < 0.2 and every[1].top < 1.05

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
+from flowing_puppet_ros.body.bank.upright_bank import make_upright_bank
 from flowing_puppet_ros.body.cloud.person_cloud import PersonCloud
 from flowing_puppet_ros.body.fit.fitter import BodyFit, BodyFitter
 from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
@@ -15,7 +16,6 @@ from flowing_puppet_ros.body.settings import FitterSettings
 from flowing_puppet_ros.body.track.scene_tracker import MAX_FIRST_FITS, SceneSettings, SceneTracker
 from flowing_puppet_ros.body.upright.found_body import SearchedScan
 from flowing_puppet_ros.body.upright.person_finder import PersonFinder, PersonFinderSettings
-from flowing_puppet_ros.body.upright.upright_bank import make_upright_bank
 from flowing_puppet_ros.evaluate.body.synthetic_scans import make_box
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import scan_scene
 from flowing_puppet_ros.model.sp import StitchedPuppet

@@ -4,11 +4,11 @@
 import numpy as np
 import pytest
 
+from flowing_puppet_ros.body.bank.upright_bank import make_child_bank
 from flowing_puppet_ros.body.cloud.mesh_geometry import vertex_normals
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.fit.visibility import Visibility
 from flowing_puppet_ros.body.settings import FitterSettings
-from flowing_puppet_ros.body.upright.upright_bank import make_child_bank
 from flowing_puppet_ros.body.upright.upright_fit import (
     FLOOR_WEIGHT,
     SOLE_VERTICES,

@@ -22,7 +22,8 @@ from flowing_puppet_ros.evaluate.moving.fitter_run import run_fitter
 from flowing_puppet_ros.evaluate.moving.lost_depth import LOSSES, lose_depth
 from flowing_puppet_ros.evaluate.moving.ring_evidence import compare_evidence
 from flowing_puppet_ros.evaluate.moving.robot_view import SENSINGS, RobotView
-from flowing_puppet_ros.evaluate.props.scenes import PROPS, draw_props
+from flowing_puppet_ros.evaluate.props.people import PROPS
+from flowing_puppet_ros.evaluate.props.scenes import draw_props
 from flowing_puppet_ros.evaluate.rgbd.depth_sensor import SENSORS
 from flowing_puppet_ros.evaluate.rgbd.methods import FusionMethod, RgbdMethod, SearchMethod
 from flowing_puppet_ros.evaluate.rgbd.scores import RgbdScore, score_body, summarise_rgbd, tabulate_calibration

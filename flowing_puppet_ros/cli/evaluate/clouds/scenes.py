@@ -11,8 +11,9 @@ import argparse
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from itertools import cycle
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,8 +31,10 @@ from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTrac
 from flowing_puppet_ros.body.track.tracked_body import TrackedBody
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.evaluate.body.synthetic_bodies import BodySource
+from flowing_puppet_ros.evaluate.props.scene_people import POSES, draw_empty_seat, draw_posed
 from flowing_puppet_ros.evaluate.scene.reliability import tabulate_reliability
 from flowing_puppet_ros.evaluate.scene.scene_score import (
+    MIN_TOP_M,
     GhostScore,
     PersonScore,
     ReportedPerson,
@@ -40,7 +43,14 @@ from flowing_puppet_ros.evaluate.scene.scene_score import (
     tabulate_bins,
 )
 from flowing_puppet_ros.evaluate.scene.scene_sequences import draw_sequence
-from flowing_puppet_ros.evaluate.scene.synthetic_scenes import PLACES, SCANNERS, SceneKind, SyntheticScene, draw_scene
+from flowing_puppet_ros.evaluate.scene.synthetic_scenes import (
+    PLACES,
+    SCANNERS,
+    Draw,
+    SceneKind,
+    SyntheticScene,
+    draw_scene,
+)
 from flowing_puppet_ros.evaluate.tables import format_json, format_table, write_csv, write_json
 from flowing_puppet_ros.model.sp import StitchedPuppet
 from flowing_puppet_ros.settings import make_out_folder
@@ -86,6 +96,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--rain", type=float, default=0.0, metavar="SHARE", help="share of the rays that meet a drop [%(default)s]"
     )
+    parser.add_argument(
+        "--poses", nargs="+", choices=POSES, default=(), help="of the people in turn; without it, they stand or walk"
+    )
+    parser.add_argument("--seats", type=int, default=0, help="empty chairs, sofas and the like, a scene [%(default)s]")
     parser.add_argument("--sensor-height", type=float, metavar="M", help="over the floor; without it, drawn")
     parser.add_argument(
         "--tell-height", action="store_true", help="the sensor's height is known, whether a floor is seen or not"
@@ -126,7 +140,9 @@ def run(arguments: argparse.Namespace) -> int:
         bodies = _find(tracker, scan, number, sequence)
         seconds.append(time.process_time() - started)
         found = [_describe(model, body, scan.truth.sensor) for body in bodies]
-        scored = score_scene(scan.name, scan.truth, found, arguments.min_labelled_points, np.radians(arguments.sector))
+        limits = arguments.min_labelled_points, np.radians(arguments.sector)
+        # Who stands in view shows the head; of who is low, nobody is left out.
+        scored = score_scene(scan.name, scan.truth, found, *limits, 0.0 if arguments.poses else MIN_TOP_M)
         people += scored[0]
         ghosts += scored[1]
     figures = summarise_scenes(people, ghosts, len(scans)) | {"seconds_per_scan": float(np.mean(seconds))}
@@ -187,7 +203,14 @@ def _draw(arguments: argparse.Namespace) -> Iterator[tuple[str, SyntheticScene, 
         place = arguments.places[number % len(arguments.places)]
         scanner = arguments.scanners[(number // len(arguments.places)) % len(arguments.scanners)]
         rng = np.random.default_rng([arguments.scene_seed, number])
-        kind = SceneKind(arguments.lookalikes, arguments.covered, arguments.rain, arguments.sensor_height)
+        kind = SceneKind(
+            arguments.lookalikes,
+            arguments.covered,
+            arguments.rain,
+            arguments.sensor_height,
+            _draw_in_turn(arguments.poses, number),
+            (arguments.seats, draw_empty_seat) if arguments.seats else None,
+        )
         drawn = (
             draw_sequence(source, rng, place, scanner, arguments.people, arguments.length, kind)
             if arguments.length > 1
@@ -196,6 +219,14 @@ def _draw(arguments: argparse.Namespace) -> Iterator[tuple[str, SyntheticScene, 
         for step, scene in enumerate(drawn):
             suffix = f"-{step:03d}" if arguments.length > 1 else ""
             yield f"{number:03d}-{place}-{scanner}{suffix}", scene, source
+
+
+def _draw_in_turn(poses: Sequence[str], first: int) -> Draw | None:
+    """Return what draws people in these poses, one after the other; None where there are none."""
+    if not poses:
+        return None
+    turn = cycle([*poses[first % len(poses) :], *poses[: first % len(poses)]])
+    return lambda source, rng: draw_posed(source, rng, next(turn))
 
 
 def _as_scan(name: str, scene: SyntheticScene, source: BodySource, tell_height: bool) -> _Scan:

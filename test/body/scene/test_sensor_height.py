@@ -8,10 +8,10 @@ import pytest
 
 from flowing_puppet_ros.body.fit.fitter import BodyFitter
 from flowing_puppet_ros.body.scene.scene_cloud import SceneCloud
+from flowing_puppet_ros.body.scene.sensor_height import ASKED, INTERVAL_NS, SensorHeight
 from flowing_puppet_ros.body.segmentation.candidates import SceneHeights
 from flowing_puppet_ros.body.settings import FitterSettings, SegmentationSettings
 from flowing_puppet_ros.body.track.scene_tracker import SceneSettings, SceneTracker
-from flowing_puppet_ros.body.upright.sensor_height import ASKED, INTERVAL_NS, SensorHeight
 from flowing_puppet_ros.evaluate.body.synthetic_scans import make_box
 from flowing_puppet_ros.evaluate.scene.synthetic_scenes import scan_scene
 from flowing_puppet_ros.model.sp import StitchedPuppet
