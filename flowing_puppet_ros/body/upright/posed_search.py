@@ -37,15 +37,7 @@ STARTS = 4  # bodies of the bank that are refined
 MAX_POSED_TOP_M, MIN_GAIN_M = 1.55, 0.006
 """Height of the top up to which somebody may sit, bend or crouch, and by how much closer than an upright body such a
 body has to be."""
-MIN_POSED = 0.9  # probability of who is posed: seats and what lies on them are people soon
-MAX_FITS, MAX_STREAM_FITS, MAX_LIVE_FITS = 12, 4, 1
-"""Bodies that are fitted in a scan by itself, of a recording, and of a live stream."""
-STARTS = 4  # bodies of the bank that are refined
-MAX_POSED_TOP_M, MIN_GAIN_M = 1.55, 0.006
-"""Height of the top up to which somebody may sit, bend or crouch, and by how much closer than an upright body such a
-body has to be."""
-MIN_POSED, MIN_STREAM_POSED = 0.8, 0.9
-"""Probability of who is found in a scan by itself, and of a stream, in which others follow."""
+MIN_POSED = 0.8  # probability of who is posed: seats and what lies on them are people soon
 MAX_OWNED_SHARE = 0.3  # of a candidate's points that somebody else may have
 
 
