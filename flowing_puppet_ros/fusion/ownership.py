@@ -24,8 +24,9 @@ MIN_SURE_CONFIDENCE = 0.5
 """Of a joint that tells whether a mask is the person's."""
 PERSON_SIDE_M = 0.75
 """Side of a square as large as what one sees of a person: it tells how long a metre is in a mask."""
-JOINT_MARGIN_M, LIMB_RADIUS_M = 0.06, 0.08
-"""Outside of a mask, up to which a joint may be beside its limb, and around the bones of a limb that a mask lacks."""
+JOINT_MARGIN_M, MIDDLE_MARGIN_M, LIMB_RADIUS_M, HAND_RADIUS_M = 0.06, 0.01, 0.08, 0.15
+"""Outside of a mask, up to which a joint may be beside its limb and the middle between two; around the bones of a limb
+that a mask lacks, and around its joints, of which one may be a wrist or an ankle."""
 MAX_OUTSIDE_SHARE = 0.3
 """Of the sure joints, outside of a mask that is still the person's."""
 EDGE_PX = 1.5
@@ -35,7 +36,8 @@ EDGE_PX = 1.5
 def find_shown(cloud: SeenCloud, puppet: PuppetJoints, bones: Sequence[tuple[int, int]]) -> I8 | None:
     """Return what a person's mask says of the points (N,): OUTSIDE, UNSEEN or SHOWN; None where it is not to believe.
 
-    Networks see a neighbour in place of somebody, or leave a foot out: a mask that lacks sure joints is not believed
+    Networks see a neighbour in place of somebody, or leave a foot or a raised forearm out, and a mask that was carried
+    along the flow misses a fast hand: a mask that lacks sure joints is not believed
     around their `bones` (pairs of joints), and not at all if it lacks many.
     """
     mask, sure = puppet.mask, np.flatnonzero(puppet.known & ~puppet.hidden & (puppet.confidence >= MIN_SURE_CONFIDENCE))
@@ -43,15 +45,23 @@ def find_shown(cloud: SeenCloud, puppet: PuppetJoints, bones: Sequence[tuple[int
         return None
     metre = np.sqrt(mask.area) / PERSON_SIDE_M
     near = mask.find_near(cloud.pixels, mask.slack + EDGE_PX)
-    distance = mask.measure_distance(np.concatenate([puppet.pixels[sure], cloud.pixels[near]])) - mask.slack
-    lacking = sure[distance[: len(sure)] > JOINT_MARGIN_M * metre]
+    whole = [(first, last) for first, last in bones if first in sure and last in sure]
+    middles = np.array([puppet.pixels[list(ends)].mean(axis=0) for ends in whole]).reshape(-1, 2)
+    places = np.concatenate([puppet.pixels[sure], middles, cloud.pixels[near]])
+    distance, middle, beside = np.split(mask.measure_distance(places) - mask.slack, [len(sure), len(sure) + len(whole)])
+    broken = {ends for ends, away in zip(whole, middle, strict=True) if away > MIDDLE_MARGIN_M * metre}
+    lacking = sure[distance > JOINT_MARGIN_M * metre]
     if len(lacking) > MAX_OUTSIDE_SHARE * len(sure):
         return None
     shown = np.where(cloud.seen, np.int8(OUTSIDE), np.int8(UNSEEN))
-    shown[near[distance[len(sure) :] <= EDGE_PX]] = SHOWN
+    shown[near[beside <= EDGE_PX]] = SHOWN
     with np.errstate(invalid="ignore"):
+        for joint in lacking:
+            around = np.hypot(*(cloud.pixels - puppet.pixels[joint]).T) < HAND_RADIUS_M * metre
+            shown[around & (shown == OUTSIDE)] = UNSEEN
         for first, last in bones:
-            if not (puppet.known[first] and puppet.known[last] and (first in lacking or last in lacking)):
+            misses = first in lacking or last in lacking or (first, last) in broken
+            if not (misses and puppet.known[first] and puppet.known[last]):
                 continue
             start, along = puppet.pixels[first], puppet.pixels[last] - puppet.pixels[first]
             share = np.clip((cloud.pixels - start) @ along / max(float(along @ along), 1e-9), 0.0, 1.0)

@@ -16,6 +16,8 @@ INSIDE = 128
 EDGE_CELLS, REACH_CELLS = 5, 21
 """Sides of the squares by which a mask is narrowed where its flow is measured, and over which that is averaged."""
 
+CARRIED_PX, CARRIED_SHARE = 0.5, 0.25
+"""By which a carried mask may be off, in pixels and as a share of how far it has moved."""
 EXACT_CELLS = 8
 """Beside a mask, within which distances from it are exact."""
 
@@ -88,7 +90,10 @@ class PersonMask:
         row, column = np.indices(near.shape, dtype=np.float32)
         moved = np.zeros_like(values)
         moved[place] = cv2.remap(near, column - step[..., 0], row - step[..., 1], cv2.INTER_LINEAR)
-        return replace(PersonMask.of_grid(moved, image_size), slack=self.slack)
+        made = PersonMask.of_grid(moved, image_size)
+        inner = step[weight > 0]
+        far = float(np.median(np.hypot(inner[:, 0], inner[:, 1]))) * made.cell if len(inner) else 0.0
+        return replace(made, slack=self.slack + CARRIED_PX + CARRIED_SHARE * far)
 
     def move(self, step: F64, slack: float) -> PersonMask:
         """Return the mask of a person who has moved by `step` (2,) px, and in places by up to `slack` px more."""
@@ -119,14 +124,25 @@ class PersonMask:
 
 
 def label_people(masks: Sequence[PersonMask | None], size: tuple[int, int], image_size: tuple[int, int]) -> U8:
-    """Return a label image (h, w) of `size` (width, height): 0 is nobody, k + 1 whom the k-th mask shows surest."""
+    """Return a label image (h, w) of `size` (width, height): 0 is nobody, k + 1 whom the k-th mask shows surest.
+
+    Masks are as wide as their slack lets them be.
+    """
     labels, best = np.zeros(size[::-1], dtype=np.uint8), np.full(size[::-1], INSIDE - 1, dtype=np.uint8)
     for number, mask in enumerate(masks[:255]):
         if mask is not None:
-            values = mask.draw(size, image_size)
+            values = _widen(mask.draw(size, image_size), mask.slack * size[0] / image_size[0])
             labels[values > best] = number + 1
             best = np.maximum(best, values)
     return labels
+
+
+def _widen(values: U8, cells: float) -> U8:
+    """Return values (h, w) widened by so many cells: what may be the person's is not somebody else's."""
+    if round(cells) < 1:
+        return values
+    side = 2 * round(cells) + 1
+    return np.asarray(cv2.dilate(values, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side))))
 
 
 def _find_box(values: Array, margin: int) -> tuple[slice, slice]:

@@ -118,13 +118,23 @@ def test_points_beside_a_mask_are_not_the_persons() -> None:
 
 
 def test_a_leg_that_a_mask_lacks_may_still_have_points() -> None:
-    seen = see((320, 320), (320, 358), (400, 358))
-    found = find_shown(seen, standing(mask_of(270, 60, 400, 270)), [])
+    seen = see((320, 310), (320, 358), (400, 358))
+    found = find_shown(seen, standing(mask_of(270, 60, 400, 310)), [])
     assert found is not None
-    assert found.tolist() == [OUTSIDE, OUTSIDE, OUTSIDE]
+    assert found.tolist() == [SHOWN, UNSEEN, OUTSIDE]
+    seen = see((320, 318), (320, 358), (400, 358))
     found = find_shown(seen, standing(mask_of(270, 60, 400, 270)), BONES)
     assert found is not None
     assert found.tolist() == [UNSEEN, UNSEEN, OUTSIDE]
+
+
+def test_a_shin_that_a_mask_lacks_between_knee_and_ankle_may_have_points() -> None:
+    values = np.zeros((480, 640), dtype=np.uint8)
+    values[60:290, 270:400] = values[355:370, 300:340] = 255
+    seen = see((320, 322), (400, 322), (320, 362))
+    found = find_shown(seen, standing(PersonMask.of_grid(values, (640, 480))), BONES)
+    assert found is not None
+    assert found.tolist() == [UNSEEN, OUTSIDE, SHOWN]
 
 
 def test_a_neighbours_mask_is_not_believed() -> None:
