@@ -24,7 +24,7 @@ MIN_SURE_CONFIDENCE = 0.5
 """Of a joint that tells whether a mask is the person's."""
 PERSON_SIDE_M = 0.75
 """Side of a square as large as what one sees of a person: it tells how long a metre is in a mask."""
-JOINT_MARGIN_M, MIDDLE_MARGIN_M, LIMB_RADIUS_M, HAND_RADIUS_M = 0.06, 0.01, 0.08, 0.15
+JOINT_MARGIN_M, MIDDLE_MARGIN_M, LIMB_RADIUS_M, HAND_RADIUS_M = 0.06, 0.03, 0.08, 0.15
 """Outside of a mask, up to which a joint may be beside its limb and the middle between two; around the bones of a limb
 that a mask lacks, and around its joints, of which one may be a wrist or an ankle."""
 MAX_OUTSIDE_SHARE = 0.3
