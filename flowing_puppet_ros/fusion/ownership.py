@@ -20,8 +20,6 @@ GROWTH_STEP_M, MASKED_STEP_M, MAX_GROWTH_STEPS = 0.03, 0.05, 6
 
 OUTSIDE, UNSEEN, SHOWN = 0, 1, 2
 """What a mask says of a point: it is not the person's, the camera does not tell, or it is the person's by its pixel."""
-MIN_SURE_CONFIDENCE = 0.5
-"""Of a joint that tells whether a mask is the person's."""
 PERSON_SIDE_M = 0.75
 """Side of a square as large as what one sees of a person: it tells how long a metre is in a mask."""
 JOINT_MARGIN_M, MIDDLE_MARGIN_M, LIMB_RADIUS_M, HAND_RADIUS_M = 0.06, 0.03, 0.08, 0.15
@@ -40,7 +38,7 @@ def find_shown(cloud: SeenCloud, puppet: PuppetJoints, bones: Sequence[tuple[int
     along the flow misses a fast hand: a mask that lacks sure joints is not believed
     around their `bones` (pairs of joints), and not at all if it lacks many.
     """
-    mask, sure = puppet.mask, np.flatnonzero(puppet.known & ~puppet.hidden & (puppet.confidence >= MIN_SURE_CONFIDENCE))
+    mask, sure = puppet.mask, np.flatnonzero(puppet.sure)
     if mask is None or not len(sure) or mask.area <= 0:
         return None
     metre = np.sqrt(mask.area) / PERSON_SIDE_M

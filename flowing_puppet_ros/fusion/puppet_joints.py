@@ -17,6 +17,8 @@ from flowing_puppet_ros.model.sp import StitchedPuppet
 
 # From a network's ankle to the model's, which lies lower: share of the way from the knee to the ankle.
 ANKLE_DROP = 0.10
+MIN_SURE_CONFIDENCE = 0.5
+"""Of a joint that tells where the person is: whose mask it is, and whether colour and depth fit."""
 MIN_PUPPET_JOINTS = 4
 """Known joints of a puppet that is believed to be a person."""
 LONG_BONES = (
@@ -52,6 +54,11 @@ class PuppetJoints:
     def known(self) -> Bools:
         """Which joints (J,) have a place, however doubtful."""
         return np.isfinite(self.pixels).all(axis=1)
+
+    @property
+    def sure(self) -> Bools:
+        """Which joints (J,) the image surely shows where they are."""
+        return self.known & ~self.hidden & (self.confidence >= MIN_SURE_CONFIDENCE)
 
     def move_to(self, pixels: F64) -> PuppetJoints:
         """Return the puppet with its joints at `pixels` (J, 2); its mask moves with most of them."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flowing_puppet_ros.arrays import F64, U8, Bools
+from flowing_puppet_ros.arrays import F64, U8, Bools, Flow
 from flowing_puppet_ros.errors import InputError
 from flowing_puppet_ros.flow.estimate import MIN_SIDE_PX, FlowPair, OpticalFlow, resize_flow, working_size
 from flowing_puppet_ros.flow.puppet_flow import PuppetFlow
@@ -184,8 +184,6 @@ class FlowingPuppetTracker:
                 warnings.append("the picture changes as at a cut between shots: tracking restarts")
                 self.tracks, pair, restarted = [], None, True
             else:
-                for track in self.tracks:
-                    track.carry_mask(pair[0], frame.grid.image)
                 propagation = propagate_tracks(self.model, self.tracks, pair, frame.grid, self.settings)
         self._count_image()
         if detect is not None:
@@ -203,6 +201,8 @@ class FlowingPuppetTracker:
                     if (mask := detections[track.detection].mask) is not None:
                         track.mask, track.mask_age = mask, 0
         self.tracks = [track for track in self.tracks if self._is_alive(track, frame.grid.image)]
+        if pair is not None:
+            self._carry_masks(pair[0], frame.grid.image, detections or ())
         for track in self.tracks:
             track.complete_and_redraw(self.model)
         return TrackResult(
@@ -317,6 +317,12 @@ class FlowingPuppetTracker:
                 continue
             self.tracks[-1].detection = index
             self._started += 1
+
+    def _carry_masks(self, forward: Flow, size: tuple[int, int], detections: Sequence[Keypoints]) -> None:
+        """Move the masks of the image before along the flow; those that came with this image's detections are there."""
+        for track in self.tracks:
+            if track.detection is None or detections[track.detection].mask is None:
+                track.carry_mask(forward, size)
 
     def _is_alive(self, track: Track, size: tuple[int, int]) -> bool:
         """Return whether a track was seen recently enough and is still inside the image (width, height)."""

@@ -24,7 +24,7 @@ from flowing_puppet_ros.reporting import Report
 from flowing_puppet_ros.stream.pairing.puppet_pairs import PairedPuppets
 from flowing_puppet_ros.stream.sensor_places import SensorPlace
 
-OFFSET_BODIES, MIN_OFFSET_JOINTS, SURE_CONFIDENCE = 20, 6, 0.5
+OFFSET_BODIES, MIN_OFFSET_JOINTS = 20, 6
 """Bodies of which the mean offset of their puppets tells whether colour and depth fit, and sure joints of each."""
 MAX_OFFSET_RAD = 0.015
 """Of the mean; a network's joints are 0.005 beside a body's at most, in the median of a body."""
@@ -65,7 +65,7 @@ class OffsetCheck:
         """Take the bodies of a cloud with their puppets; return what is to be said, or ""."""
         fits = {body.id: body.fit for body in bodies}
         for puppet in paired.puppets:
-            sure = puppet.known & ~puppet.hidden & (puppet.confidence >= SURE_CONFIDENCE)
+            sure = puppet.sure
             if puppet.id in fits and np.count_nonzero(sure) >= MIN_OFFSET_JOINTS:
                 pixels, _ = paired.camera.project(fits[puppet.id].joints[sure])
                 self._offsets.append(np.median(puppet.pixels[sure] - pixels, axis=0))
